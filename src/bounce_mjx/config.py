@@ -1,0 +1,390 @@
+"""Every number that a user may change: the task, its reward, the trainer, the run.
+
+The models are immutable and reject unknown keys and values out of range. The comments beside a
+field (its docstring) give the unit; they are also the help text of the command line.
+"""
+
+import difflib
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import pydantic
+import yaml
+from pydantic import Field
+
+from bounce_mjx.errors import UserError
+
+ArmVector = tuple[float, float, float, float, float, float]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class _Config(pydantic.BaseModel):
+    """An immutable, strict group of settings."""
+
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
+    )
+
+
+class PositionReward(_Config):
+    """Horizontal position: stay above the target point, most of all when the ball is near."""
+
+    weight: Finite = 2.0
+    """Weight of the term."""
+    vertical_scale: Positive = 0.15
+    """Decay of the proximity weight with the vertical distance ball-paddle, m."""
+    base_scale: Positive = 0.1
+    """Width of the Gaussian far from the paddle, m."""
+    proximity_gain: NonNegative = 3.0
+    """How much wider the Gaussian is at the paddle, as a factor."""
+
+
+class OutOfPositionReward(_Config):
+    """Out of position: a smooth penalty for a large horizontal error."""
+
+    weight: Finite = 1.0
+    """Weight of the term."""
+    magnitude: NonNegative = 2.0
+    """Largest penalty."""
+    threshold: NonNegative = 0.05
+    """Horizontal error at half the penalty, m."""
+    scale: Positive = 0.03
+    """Width of the sigmoid, m."""
+
+
+class VelocityMatchingReward(_Config):
+    """Velocity matching: pass the target height at the desired speed."""
+
+    weight: Finite = 2.0
+    """Weight of the term."""
+    desired_velocity: Finite = 0.5
+    """Vertical velocity wanted at the target height, m/s."""
+    near_distance: Positive = 0.05
+    """Height error under which the current velocity counts, m."""
+    rising_scale: Positive = 0.2
+    """Width of the sigmoid between falling and rising, m/s."""
+    below_scale: Positive = 0.02
+    """Width of the sigmoid between above and below the target, m."""
+    near_scale: Positive = 0.01
+    """Width of the Gaussian around the target height, m."""
+    error_scale: Positive = 0.8
+    """Width of the Gaussian of the velocity error, m/s."""
+
+
+class HeightReward(_Config):
+    """Height: be near the target height."""
+
+    weight: Finite = 4.5
+    """Weight of the term."""
+    scale: Positive = 0.15
+    """Width of the Gaussian of the height error, m."""
+
+
+class HeightProgressReward(_Config):
+    """Height progress: be high at all, so that hitting is found early."""
+
+    weight: Finite = 1.0
+    """Weight of the term."""
+    base_height: Finite = 0.2
+    """Ball height above which the term grows, m."""
+    gain: NonNegative = 2.0
+    """Reward per metre above the base height."""
+
+
+class ControlledUpwardReward(_Config):
+    """Controlled upward velocity: rise at the speed that reaches the target, in position."""
+
+    weight: Finite = 1.5
+    """Weight of the term."""
+    position_scale: Positive = 0.02
+    """Width of the Gaussian of the horizontal error, m."""
+    min_ideal_velocity: NonNegative = 0.5
+    """Lower limit of the ideal launch velocity, m/s."""
+    max_ideal_velocity: NonNegative = 3.0
+    """Upper limit of the ideal launch velocity, m/s."""
+    velocity_scale: Positive = 0.5
+    """Width of the Gaussian of the velocity error, m/s."""
+    rising_scale: Positive = 0.1
+    """Width of the sigmoid between falling and rising, m/s."""
+    velocity_limit: Positive = 1.5
+    """Upward velocity above which the term grows no more, m/s."""
+
+
+class ConsecutiveBouncesReward(_Config):
+    """Consecutive bounces: the logarithm of the count, in position."""
+
+    weight: Finite = 0.8
+    """Weight of the term."""
+    gain: NonNegative = 0.5
+    """Factor of the logarithm."""
+    position_scale: Positive = 0.05
+    """Width of the Gaussian of the horizontal error, m."""
+
+
+class HighBounceCountReward(_Config):
+    """High bounce count: proportional to the count once it passes the threshold, in position."""
+
+    weight: Finite = 0.3
+    """Weight of the term."""
+    gain: NonNegative = 0.15
+    """Reward per bounce."""
+    position_scale: Positive = 0.05
+    """Width of the Gaussian of the horizontal error, m."""
+    threshold: Finite = 2.0
+    """Number of bounces at half the activation."""
+    scale: Positive = 0.5
+    """Width of the sigmoid, bounces."""
+
+
+class AlignmentReward(_Config):
+    """Alignment: keep the paddle under the ball, most of all at the hit."""
+
+    weight: Finite = 0.6
+    """Weight of the term."""
+    vertical_scale: Positive = 0.1
+    """Decay of the proximity weight with the vertical distance ball-paddle, m."""
+    scale: Positive = 0.03
+    """Width of the Gaussian of the horizontal distance ball-paddle, m."""
+    proximity_gain: NonNegative = 2.0
+    """Factor of the proximity weight."""
+    bounce_boost: NonNegative = 3.0
+    """Factor on the step of a bounce."""
+    gain: NonNegative = 0.3
+    """Overall factor."""
+
+
+class PaddleHomeReward(_Config):
+    """Paddle home: return to the home height while the ball is away."""
+
+    weight: Finite = 1.5
+    """Weight of the term."""
+    scale: Positive = 0.05
+    """Width of the Gaussian of the paddle's height error, m."""
+    distance_gain: NonNegative = 0.5
+    """Extra reward while the ball is far."""
+    distance_threshold: Finite = 0.15
+    """Vertical distance ball-paddle at half the extra reward, m."""
+    distance_scale: Positive = 0.03
+    """Width of the sigmoid, m."""
+
+
+class ExcessiveUpwardReward(_Config):
+    """Excessive upward velocity: a smooth penalty for a ball hit too hard."""
+
+    weight: Finite = 1.0
+    """Weight of the term."""
+    magnitude: NonNegative = 1.0
+    """Largest penalty."""
+    threshold: Finite = 3.5
+    """Upward velocity at half the penalty, m/s."""
+    scale: Positive = 0.3
+    """Width of the sigmoid, m/s."""
+
+
+class DownwardVelocityReward(_Config):
+    """Downward velocity: positive for a falling ball as the seed's formula stands, though its
+    text calls the term a penalty; a negative weight makes it one."""
+
+    weight: Finite = 1.0
+    """Weight of the term; its sign chooses between the seed's formula and the seed's text."""
+    gain: NonNegative = 0.3
+    """Slope of the clipped factor, s/m."""
+    limit: NonNegative = 0.5
+    """Upper limit of the clipped factor."""
+    threshold: Finite = 0.2
+    """Downward speed at half the activation, m/s."""
+    scale: Positive = 0.2
+    """Width of the sigmoid, m/s."""
+
+
+class PaddleHeightViolationReward(_Config):
+    """Paddle height violation: a linear penalty beyond the tolerance around home."""
+
+    weight: Finite = 1.0
+    """Weight of the term."""
+    gain: NonNegative = 20.0
+    """Penalty per metre beyond the tolerance."""
+    tolerance: NonNegative = 0.1
+    """Height error of the paddle that costs nothing, m."""
+
+
+class ActionRateReward(_Config):
+    """Action rate: minus the squared change of the action."""
+
+    weight: Finite = 1e-4
+    """Weight of the term."""
+
+
+class JointVelocityReward(_Config):
+    """Joint velocity: minus the sum of the squared joint velocities."""
+
+    weight: Finite = 1e-4
+    """Weight of the term."""
+
+
+class RewardConfig(_Config):
+    """The fifteen reward terms: each a weight and the constants of its formula."""
+
+    position: PositionReward = PositionReward()
+    out_of_position: OutOfPositionReward = OutOfPositionReward()
+    velocity_matching: VelocityMatchingReward = VelocityMatchingReward()
+    height: HeightReward = HeightReward()
+    height_progress: HeightProgressReward = HeightProgressReward()
+    controlled_upward: ControlledUpwardReward = ControlledUpwardReward()
+    consecutive_bounces: ConsecutiveBouncesReward = ConsecutiveBouncesReward()
+    high_bounce_count: HighBounceCountReward = HighBounceCountReward()
+    alignment: AlignmentReward = AlignmentReward()
+    paddle_home: PaddleHomeReward = PaddleHomeReward()
+    excessive_upward: ExcessiveUpwardReward = ExcessiveUpwardReward()
+    downward_velocity: DownwardVelocityReward = DownwardVelocityReward()
+    paddle_height_violation: PaddleHeightViolationReward = PaddleHeightViolationReward()
+    action_rate: ActionRateReward = ActionRateReward()
+    joint_velocity: JointVelocityReward = JointVelocityReward()
+    target_x: Finite = 0.58856
+    """Target point of the ball, x, m."""
+    target_y: Finite = 0.0
+    """Target point of the ball, y, m."""
+    paddle_home_height: Finite = 0.05
+    """Home height of the paddle, m."""
+    gravity: Positive = 9.81
+    """Gravity in the ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
+
+
+class EnvConfig(_Config):
+    """The task: the model, its time steps, the resets, the bounces, the ends and the reward."""
+
+    physics: Literal["auto", "fused", "mjx"] = "auto"
+    """Physics engine: fused (straight-line, fast), mjx (any MJCF), auto (fused where it can)."""
+    mjcf: Path | None = None
+    """MJCF file to simulate; the project's own robot where it is left out."""
+    physics_dt: Positive = 0.001
+    """Physics time step, s."""
+    control_dt: Positive = 0.01
+    """Time between two actions, s; a whole number of physics steps."""
+    episode_seconds: Positive = 20.0
+    """Length of an episode before it is truncated, s."""
+    action_scale: Positive = 0.02
+    """Change of the servo target that the action 1 asks for, rad."""
+    default_joint_angles: ArmVector = tuple(math.radians(a) for a in (0, 40, 110, 0, -60, 0))
+    """Joint angles of a reset before noise, rad."""
+    joint_angle_noise: NonNegative = 0.1
+    """Half-width of the uniform noise of the joint angles at a reset, rad."""
+    joint_velocity_noise: NonNegative = 0.01
+    """Half-width of the uniform noise of the joint velocities at a reset, rad/s."""
+    ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.45)
+    """Ball position of a reset before noise, m."""
+    ball_position_noise: NonNegative = 0.01
+    """Half-width of the uniform noise of each ball coordinate at a reset, m."""
+    target_height_range: tuple[float, float] = (0.4, 0.6)
+    """Range from which a reset draws the target height, m; equal ends fix it."""
+    bounce_min_velocity: NonNegative = 0.01
+    """Vertical velocity above which the ball counts as rising, m/s."""
+    bounce_max_distance: Positive = 0.12
+    """Vertical distance ball-paddle within which a reversal is a bounce, m."""
+    apex_tolerance: NonNegative = 0.1
+    """How far below the target an apex may stay and still continue the bounce count, m."""
+    min_ball_height: Finite = 0.05
+    """The episode ends when the ball is below this height, m."""
+    max_height_above_target: Positive = 1.0
+    """The episode ends when the ball is higher than this above the target height, m."""
+    max_horizontal_distance: Positive = 1.5
+    """The episode ends when |x| or |y| of the ball exceeds this, m."""
+    max_joint_velocity: Positive = 2.0 * math.pi
+    """The episode ends when a joint is faster than this, rad/s."""
+    reward: RewardConfig = RewardConfig()
+    """The reward terms."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_times_and_ranges(self):
+        substeps = self.control_dt / self.physics_dt
+        if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
+            raise ValueError(
+                f"control_dt {self.control_dt} is not a whole number of physics steps of "
+                f"{self.physics_dt} s; choose a multiple of physics_dt"
+            )
+        if self.episode_seconds < self.control_dt:
+            raise ValueError(
+                f"episode_seconds {self.episode_seconds} is shorter than one control step of "
+                f"{self.control_dt} s; choose a longer episode"
+            )
+        low, high = self.target_height_range
+        if not 0.0 < low <= high < math.inf:
+            raise ValueError(
+                f"target_height_range {self.target_height_range} is not 0 < low <= high; "
+                "give two heights in metres, the lower first"
+            )
+        return self
+
+    @property
+    def num_substeps(self) -> int:
+        """Physics steps in one control step."""
+        return round(self.control_dt / self.physics_dt)
+
+    @property
+    def episode_steps(self) -> int:
+        """Control steps in one episode."""
+        return round(self.episode_seconds / self.control_dt)
+
+
+class PPOConfig(_Config):
+    """Proximal policy optimisation (Schulman et al. 2017) with a KL-adaptive learning rate."""
+
+    num_envs: Count = 4096
+    """Environments that run in parallel."""
+    rollout_length: Count = 32
+    """Control steps of each environment in one iteration."""
+    num_epochs: Count = 4
+    """Passes over the data of one iteration."""
+    num_minibatches: Count = 8
+    """Minibatches in one epoch; must divide num_envs * rollout_length."""
+    learning_rate: Positive = 3e-4
+    """Learning rate at the start."""
+    min_learning_rate: Positive = 1e-5
+    """Lower limit of the learning rate."""
+    max_learning_rate: Positive = 3e-3
+    """Upper limit of the learning rate at the start of the training."""
+    final_max_learning_rate: Positive = 1e-4
+    """Upper limit of the learning rate at and after decay_steps."""
+    decay_steps: Count = 20_000_000
+    """Environment steps over which the upper limit goes down, in equal ratios."""
+    target_kl: NonNegative = 0.01
+    """KL divergence of one update that the learning rate is steered to; 0 leaves it as it is."""
+    discount: UnitInterval = 0.99
+    """Discount factor of a control step."""
+    gae_lambda: UnitInterval = 0.95
+    """Lambda of the generalised advantage estimation."""
+    clip_epsilon: Positive = 0.2
+    """Clipping range of the probability ratio."""
+    entropy_cost: NonNegative = 0.0
+    """Weight of the entropy bonus."""
+    value_cost: NonNegative = 0.5
+    """Weight of the squared value error."""
+    max_grad_norm: Positive = 1.0
+    """Global norm to which a gradient is clipped."""
+    reward_scale: Positive = 0.1
+    """Factor of the reward that the trainer sees."""
+    init_noise_std: Positive = 0.6
+    """Standard deviation of the action noise at the start."""
+    hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
+    """Widths of the hidden layers of the policy and of the value network."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_batch(self):
+        batch = self.num_envs * self.rollout_length
+        if batch % self.num_minibatches:
+            raise ValueError(
+                f"num_minibatches {self.num_minibatches} does not divide the batch of "
+                f"{batch} samples (num_envs {self.num_envs} * rollout_length "
+                f"{self.rollout_length}); choose a divisor of {batch}"
+            )
+        return self
+
+    @property
+    def batch_steps(self) -> int:
+        """Environment steps in one iteration."""
+        return self.num_envs * self.rollout_length

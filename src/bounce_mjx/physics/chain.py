@@ -1,0 +1,227 @@
+"""Rigid-body dynamics of a serial chain of hinges, unrolled into scalar arithmetic.
+
+Every quantity of link i is expressed in the frame of link i, whose origin lies on the axis of
+joint i, unless its name says `world`. Featherstone, Rigid Body Dynamics Algorithms (2008), is the
+source: table 5.1 (recursive Newton-Euler) and table 6.2 (composite rigid bodies), in their
+three-dimensional form.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.physics.scalars import (
+    IDENTITY3,
+    ZERO3,
+    Mat3,
+    Scalar,
+    Vec3,
+    add,
+    axis_rotation,
+    congruence,
+    cross,
+    dot,
+    matmul,
+    matvec,
+    mul,
+    scale,
+    sub,
+    transpose,
+    vadd,
+    vsub,
+)
+
+SquareMatrix = list[list[Scalar]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """Constants of one hinge and the link that it carries."""
+
+    offset: tuple[float, float, float]
+    """Origin of the link in the frame of its parent, m."""
+    rotation: tuple[tuple[float, float, float], ...]
+    """Orientation of the link in the frame of its parent at the joint angle `zero_angle`."""
+    axis: tuple[float, float, float]
+    """Unit axis of the hinge."""
+    zero_angle: float
+    """Joint angle at which the link stands at `rotation`, rad."""
+    mass: float
+    """kg."""
+    first_moment: tuple[float, float, float]
+    """Mass times centre of mass, kg m."""
+    inertia: tuple[tuple[float, float, float], ...]
+    """Rotational inertia about the origin of the link, kg m^2."""
+    armature: float
+    """Inertia of the rotor, seen at the joint, kg m^2."""
+    damping: float
+    """Viscous damping of the joint, N m s/rad."""
+
+
+class Pose(NamedTuple):
+    """Where the links are."""
+
+    rotation: list[Mat3]
+    """Orientation of each link in its parent."""
+    world_rotation: list[Mat3]
+    """Orientation of each link in the world."""
+    world_origin: list[Vec3]
+    """Origin of each link in the world, m."""
+
+
+def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
+    """Pose of every link at the joint angles q (rad)."""
+    rotation, world_rotation, world_origin = [], [], []
+    parent_rotation, parent_origin = IDENTITY3, ZERO3
+    for link, angle in zip(links, q, strict=True):
+        turned = sub(angle, link.zero_angle)
+        joint = axis_rotation(link.axis, jnp.cos(turned), jnp.sin(turned))
+        rotation.append(matmul(link.rotation, joint))
+        parent_origin = vadd(parent_origin, matvec(parent_rotation, link.offset))
+        parent_rotation = matmul(parent_rotation, rotation[-1])
+        world_origin.append(parent_origin)
+        world_rotation.append(parent_rotation)
+    return Pose(rotation, world_rotation, world_origin)
+
+
+def bias_force(
+    links: Sequence[Link], pose: Pose, v: Sequence[Scalar], gravity: Vec3
+) -> list[Scalar]:
+    """Joint torques (N m) that gravity, Coriolis and centrifugal effects ask for at zero joint
+    acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
+    omega, alpha, acceleration = ZERO3, ZERO3, scale(gravity, -1.0)
+    forces, moments = [], []
+    for link, rotation, speed in zip(links, pose.rotation, v, strict=True):
+        to_link = transpose(rotation)
+        at_origin = vadd(
+            acceleration, vadd(cross(alpha, link.offset), cross(omega, cross(omega, link.offset)))
+        )
+        spin = scale(link.axis, speed)
+        omega_of_parent = matvec(to_link, omega)
+        alpha = vadd(matvec(to_link, alpha), cross(omega_of_parent, spin))
+        omega = vadd(omega_of_parent, spin)
+        acceleration = matvec(to_link, at_origin)
+        about_origin = vadd(
+            cross(alpha, link.first_moment), cross(omega, cross(omega, link.first_moment))
+        )
+        forces.append(vadd(scale(acceleration, link.mass), about_origin))
+        turning = vadd(
+            matvec(link.inertia, alpha), cross(omega, matvec(link.inertia, omega))
+        )
+        moments.append(vadd(turning, cross(link.first_moment, acceleration)))
+
+    torques: list[Scalar] = [0.0] * len(links)
+    force, moment = ZERO3, ZERO3
+    for i in reversed(range(len(links))):
+        force, moment = vadd(forces[i], force), vadd(moments[i], moment)
+        torques[i] = dot(links[i].axis, moment)
+        force, moment = _to_parent(links[i], pose.rotation[i], force, moment)
+    return torques
+
+
+def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
+    """Joint-space inertia matrix [n, n] (kg m^2), armature included: composite rigid bodies."""
+    n = len(links)
+    matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
+    mass, first_moment, inertia = 0.0, ZERO3, ((0.0,) * 3,) * 3
+    for i in reversed(range(n)):
+        link = links[i]
+        mass += link.mass
+        first_moment = vadd(first_moment, link.first_moment)
+        inertia = tuple(vadd(a, b) for a, b in zip(inertia, link.inertia, strict=True))
+
+        force, moment = cross(link.axis, first_moment), matvec(inertia, link.axis)
+        matrix[i][i] = add(dot(link.axis, moment), link.armature)
+        for j in range(i, 0, -1):
+            force, moment = _to_parent(links[j], pose.rotation[j], force, moment)
+            matrix[i][j - 1] = matrix[j - 1][i] = dot(links[j - 1].axis, moment)
+        if i > 0:
+            first_moment, inertia = _inertia_to_parent(
+                link, pose.rotation[i], mass, first_moment, inertia
+            )
+    return matrix
+
+
+def point_jacobian(
+    links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3
+) -> list[Scalar]:
+    """Velocity along a world direction, per unit joint velocity, of a world point fixed to the
+    last link."""
+    row = []
+    for link, rotation, origin in zip(links, pose.world_rotation, pose.world_origin, strict=True):
+        arm = vsub(point, origin)
+        row.append(dot(direction, cross(matvec(rotation, link.axis), arm)))
+    return row
+
+
+def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
+    """Lower Cholesky factor of a symmetric positive definite matrix; its diagonal comes as its
+    reciprocal, in the second value."""
+    n = len(matrix)
+    lower: SquareMatrix = [[0.0] * n for _ in range(n)]
+    inverse_diagonal = []
+    for j in range(n):
+        pivot = matrix[j][j]
+        for k in range(j):
+            pivot = pivot - lower[j][k] * lower[j][k]
+        inverse_diagonal.append(jax.lax.rsqrt(pivot))
+        for i in range(j + 1, n):
+            entry = matrix[i][j]
+            for k in range(j):
+                entry = sub(entry, mul(lower[i][k], lower[j][k]))
+            lower[i][j] = mul(entry, inverse_diagonal[j])
+    return lower, inverse_diagonal
+
+
+def solve_lower(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
+    """L^-1 b for the factor L of `cholesky`."""
+    lower, inverse_diagonal = factor
+    x: list[Scalar] = []
+    for i, entry in enumerate(b):
+        for k in range(i):
+            entry = sub(entry, mul(lower[i][k], x[k]))
+        x.append(mul(entry, inverse_diagonal[i]))
+    return x
+
+
+def solve_upper(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
+    """L^-T b for the factor L of `cholesky`."""
+    lower, inverse_diagonal = factor
+    n = len(b)
+    x: list[Scalar] = [0.0] * n
+    for i in reversed(range(n)):
+        entry = b[i]
+        for k in range(i + 1, n):
+            entry = sub(entry, mul(lower[k][i], x[k]))
+        x[i] = mul(entry, inverse_diagonal[i])
+    return x
+
+
+def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
+    """A force and its moment about the link's origin, seen in the parent's frame about its own."""
+    force = matvec(rotation, force)
+    return force, vadd(matvec(rotation, moment), cross(link.offset, force))
+
+
+def _inertia_to_parent(
+    link: Link, rotation: Mat3, mass: float, first_moment: Vec3, inertia: Mat3
+) -> tuple[Vec3, Mat3]:
+    """First moment and inertia of the composite body, seen in the parent's frame about its origin
+    (the parallel-axis theorem with the offset p of the link's origin)."""
+    p = link.offset
+    h = matvec(rotation, first_moment)
+    rotated = congruence(rotation, inertia)
+    diagonal = add(mul(2.0, dot(p, h)), mass * sum(x * x for x in p))
+
+    def entry(i: int, j: int) -> Scalar:
+        off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mass * p[i] * p[j])
+        return sub(add(rotated[i][j], diagonal if i == j else 0.0), off)
+
+    xx, xy, xz, yy, yz, zz = (
+        entry(i, j) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    )
+    shifted = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    return vadd(h, scale(p, mass)), shifted

@@ -1,0 +1,129 @@
+"""Three-dimensional algebra on scalars, folded at trace time.
+
+A scalar is a Python float (known while tracing) or a JAX array (known when running). The products
+with 0 and 1 that a robot's fixed rotations bring vanish here, so that what XLA gets is
+straight-line arithmetic without them.
+"""
+
+import jax
+
+Scalar = float | jax.Array
+Vec3 = tuple[Scalar, Scalar, Scalar]
+Mat3 = tuple[Vec3, Vec3, Vec3]
+
+ZERO3: Vec3 = (0.0, 0.0, 0.0)
+IDENTITY3: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def is_constant(a: Scalar) -> bool:
+    """Whether the scalar is known while tracing."""
+    return isinstance(a, float)
+
+
+def neg(a: Scalar) -> Scalar:
+    """-a."""
+    return -a
+
+
+def add(a: Scalar, b: Scalar) -> Scalar:
+    """a + b."""
+    if is_constant(a) and a == 0.0:
+        return b
+    if is_constant(b) and b == 0.0:
+        return a
+    return a + b
+
+
+def sub(a: Scalar, b: Scalar) -> Scalar:
+    """a - b."""
+    if is_constant(a) and a == 0.0:
+        return neg(b)
+    if is_constant(b) and b == 0.0:
+        return a
+    return a - b
+
+
+def mul(a: Scalar, b: Scalar) -> Scalar:
+    """a * b."""
+    if is_constant(a) and not is_constant(b):
+        a, b = b, a
+    if is_constant(b) and not is_constant(a):
+        if b == 0.0:
+            return 0.0
+        if b == 1.0:
+            return a
+        if b == -1.0:
+            return neg(a)
+    return a * b
+
+
+def vadd(a: Vec3, b: Vec3) -> Vec3:
+    """a + b."""
+    return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
+
+
+def vsub(a: Vec3, b: Vec3) -> Vec3:
+    """a - b."""
+    return (sub(a[0], b[0]), sub(a[1], b[1]), sub(a[2], b[2]))
+
+
+def scale(a: Vec3, s: Scalar) -> Vec3:
+    """s * a."""
+    return (mul(a[0], s), mul(a[1], s), mul(a[2], s))
+
+
+def dot(a: Vec3, b: Vec3) -> Scalar:
+    """Inner product."""
+    return add(add(mul(a[0], b[0]), mul(a[1], b[1])), mul(a[2], b[2]))
+
+
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    """Cross product."""
+    return (
+        sub(mul(a[1], b[2]), mul(a[2], b[1])),
+        sub(mul(a[2], b[0]), mul(a[0], b[2])),
+        sub(mul(a[0], b[1]), mul(a[1], b[0])),
+    )
+
+
+def transpose(m: Mat3) -> Mat3:
+    """Transposed matrix."""
+    return tuple(zip(*m, strict=True))
+
+
+def matvec(m: Mat3, v: Vec3) -> Vec3:
+    """m @ v."""
+    return (dot(m[0], v), dot(m[1], v), dot(m[2], v))
+
+
+def matmul(a: Mat3, b: Mat3) -> Mat3:
+    """a @ b."""
+    columns = transpose(b)
+    return tuple(tuple(dot(row, column) for column in columns) for row in a)
+
+
+def congruence(r: Mat3, s: Mat3) -> Mat3:
+    """r @ s @ r.T for a symmetric s, each entry of the symmetric result computed once."""
+    rs = matmul(r, s)
+    xx, xy, xz = dot(rs[0], r[0]), dot(rs[0], r[1]), dot(rs[0], r[2])
+    yy, yz, zz = dot(rs[1], r[1]), dot(rs[1], r[2]), dot(rs[2], r[2])
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) -> Mat3:
+    """Rotation about a constant unit axis by an angle given as its cosine and sine (Rodrigues)."""
+    x, y, z = axis
+    one_minus_cos = sub(1.0, cos)
+
+    def entry(i: int, j: int, skew: float) -> Scalar:
+        along = axis[i] * axis[j]
+        symmetric = cos if along == 0.0 else add(cos, mul(one_minus_cos, along))
+        if i == j:
+            return 1.0 if along == 1.0 else symmetric
+        return add(mul(one_minus_cos, along), mul(sin, skew))
+
+    return (
+        (entry(0, 0, 0.0), entry(0, 1, -z), entry(0, 2, y)),
+        (entry(1, 0, z), entry(1, 1, 0.0), entry(1, 2, -x)),
+        (entry(2, 0, -y), entry(2, 1, x), entry(2, 2, 0.0)),
+    )

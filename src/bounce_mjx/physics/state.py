@@ -1,0 +1,14 @@
+"""The state that every physics engine takes and returns."""
+
+from typing import NamedTuple
+
+import jax
+
+
+class PhysicsState(NamedTuple):
+    """Generalised coordinates in MuJoCo's order."""
+
+    qpos: jax.Array
+    """Positions [nq]: joint angles in rad; the ball's position in m and quaternion [w, x, y, z]."""
+    qvel: jax.Array
+    """Velocities [nv]: joints in rad/s; the ball in m/s (world) and rad/s (ball's frame)."""

@@ -1,0 +1,65 @@
+"""The policy and the value network: brax's networks, distribution and running statistics."""
+
+from typing import Any, NamedTuple
+
+import jax
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo.networks import PPONetworks, make_ppo_networks
+
+from bounce_mjx.config import PPOConfig
+
+# A normalised observation beyond this many standard deviations is clipped.
+MAX_NORMALIZED = 10.0
+# Least variance of an observation. The ball does not spin in the fused physics, so the variance of
+# its spin is 0 there; another engine's rounding must not be magnified to a signal.
+MIN_VARIANCE = 1e-6
+
+
+class Policy(NamedTuple):
+    """What acting needs of a training: a pytree of arrays."""
+
+    normalizer: running_statistics.RunningStatisticsState
+    params: Any
+    """Parameters of the policy network."""
+
+
+def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
+    """Networks on normalised observations: a Gaussian with a learned, state-independent standard
+    deviation, and a value."""
+    return make_ppo_networks(
+        observation_size,
+        action_size,
+        policy_hidden_layer_sizes=config.hidden_layers,
+        value_hidden_layer_sizes=config.hidden_layers,
+        activation=jax.nn.silu,
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=config.init_noise_std,
+        policy_network_kernel_init_fn=jax.nn.initializers.orthogonal,
+        policy_network_kernel_init_kwargs={"scale": 2**0.5},
+        value_network_kernel_init_fn=jax.nn.initializers.orthogonal,
+        value_network_kernel_init_kwargs={"scale": 2**0.5},
+        mean_kernel_init_fn=jax.nn.initializers.orthogonal,
+        mean_kernel_init_kwargs={"scale": 0.01},
+    )
+
+
+def init_normalizer(observation_size: int) -> running_statistics.RunningStatisticsState:
+    """Running statistics of observations [observation_size], before any were seen."""
+    template = jax.ShapeDtypeStruct((observation_size,), jax.numpy.float32)
+    return running_statistics.init_state(template, std_eps=MIN_VARIANCE)
+
+
+def normalize(
+    observation: jax.Array, normalizer: running_statistics.RunningStatisticsState
+) -> jax.Array:
+    """Observations [..., 29] in standard deviations from their mean, clipped."""
+    return running_statistics.normalize(observation, normalizer, max_abs_value=MAX_NORMALIZED)
+
+
+def act(networks: PPONetworks, policy: Policy, observation: jax.Array) -> jax.Array:
+    """The most likely actions [..., 6] for observations [..., 29], clipped to [-1, 1]."""
+    logits = networks.policy_network.apply(
+        None, policy.params, normalize(observation, policy.normalizer)
+    )
+    return jax.numpy.clip(networks.parametric_action_distribution.mode(logits), -1.0, 1.0)

@@ -1,0 +1,380 @@
+"""Proximal policy optimisation, read from top to bottom: collect -> advantages -> update.
+
+`make_trainer` gives two pure functions over one pytree of state: `init(key)` and
+`run(state, num_iterations)`. Inside `run` everything is a `scan`; nothing returns to Python.
+Sources: Schulman et al., Proximal Policy Optimization Algorithms (2017); Schulman et al.,
+High-Dimensional Continuous Control Using Generalized Advantage Estimation (2016).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.envs.base import Env
+from brax.training.acme import running_statistics
+
+from bounce_mjx import vector
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.errors import UserError
+from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
+
+# Factor by which one update may change the learning rate.
+_LEARNING_RATE_FACTOR = 1.1
+
+Metrics = dict[str, jax.Array]
+
+
+class Params(NamedTuple):
+    """Parameters of the two networks."""
+
+    policy: Any
+    value: Any
+
+
+class TrainingState(NamedTuple):
+    """Everything that training goes on from."""
+
+    params: Params
+    optimizer: optax.OptState
+    normalizer: running_statistics.RunningStatisticsState
+    learning_rate: jax.Array
+    """Current learning rate []."""
+    env: vector.VectorState
+    key: jax.Array
+    """Random key of the next iteration."""
+    iteration: jax.Array
+    """Iterations done [], int."""
+
+
+class Rollout(NamedTuple):
+    """T steps of B environments."""
+
+    observation: jax.Array
+    """Normalised [T, B, 29]."""
+    action: jax.Array
+    """As drawn, before clipping [T, B, 6]."""
+    log_prob: jax.Array
+    """Of the action [T, B]."""
+    reward: jax.Array
+    """Scaled [T, B]."""
+    terminated: jax.Array
+    """[T, B], bool."""
+    truncated: jax.Array
+    """[T, B], bool."""
+
+
+class Samples(NamedTuple):
+    """What the update learns from; N samples."""
+
+    observation: jax.Array
+    """Normalised [N, 29]."""
+    action: jax.Array
+    """[N, 6]."""
+    log_prob: jax.Array
+    """[N]."""
+    advantage: jax.Array
+    """[N]."""
+    value_target: jax.Array
+    """[N]."""
+
+
+class Trainer(NamedTuple):
+    """Training as pure functions; `jax.jit` them (the second argument of `run` is static)."""
+
+    init: Callable[[jax.Array], TrainingState]
+    """key -> state; consumes the key."""
+    run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
+    """(state, number of iterations I) -> (state, metrics, each [I])."""
+
+
+def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
+    """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
+
+    Raises:
+      UserError: a rollout is longer than an episode.
+    """
+    if config.rollout_length > episode_steps:
+        raise UserError(
+            f"rollout_length {config.rollout_length} is longer than an episode of {episode_steps} "
+            "control steps; choose a shorter rollout or longer episodes"
+        )
+    networks = make_networks(config, env.observation_size, env.action_size)
+    distribution = networks.parametric_action_distribution
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
+    )
+
+    def policy_apply(params: Params, observation: jax.Array):
+        return networks.policy_network.apply(None, params.policy, observation)
+
+    def value_apply(params: Params, observation: jax.Array) -> jax.Array:
+        return networks.value_network.apply(None, params.value, observation)
+
+    def init(key: jax.Array) -> TrainingState:
+        key, policy_key, value_key, env_key, steps_key = jax.random.split(key, 5)
+        params = Params(
+            networks.policy_network.init(policy_key), networks.value_network.init(value_key)
+        )
+        env_state = vector.reset(env, env_key, config.num_envs)
+        # Episodes that all began together would all time out together.
+        steps = jax.random.randint(steps_key, (config.num_envs,), 0, episode_steps)
+        return TrainingState(
+            params=params,
+            optimizer=optimizer.init(params),
+            normalizer=init_normalizer(env.observation_size),
+            learning_rate=jnp.float32(config.learning_rate),
+            env=env_state._replace(steps=steps),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    def collect(state: TrainingState, key: jax.Array):
+        """Runs the policy for T steps.
+
+        Returns the new environment states, the rollout, the statistics of the observations with
+        the new ones, the observations that follow the last step [B, 29] and those that preceded
+        each environment's time-out [B, 29] (both normalised), and metrics.
+        """
+
+        def one_step(carry, step_key):
+            env_state, timeout_observation = carry
+            action_key, reset_key = jax.random.split(step_key)
+            raw_observation = vector.observe(env_state)
+            observation = normalize(raw_observation, state.normalizer)
+            logits = policy_apply(state.params, observation)
+            action = distribution.sample_no_postprocessing(logits, action_key)
+            env_state, result = vector.step(env, env_state, action, reset_key, episode_steps)
+            timeout_observation = jnp.where(
+                result.truncated[:, None], result.final_observation, timeout_observation
+            )
+            step_of_rollout = Rollout(
+                observation=observation,
+                action=action,
+                log_prob=distribution.log_prob(logits, action),
+                reward=config.reward_scale * result.reward,
+                terminated=result.terminated,
+                truncated=result.truncated,
+            )
+            return (env_state, timeout_observation), (
+                step_of_rollout,
+                raw_observation,
+                step_metrics(result),
+            )
+
+        # An environment times out at most once in a rollout, as no episode is shorter than it.
+        (env_state, timeout_observation), (rollout, raw_observations, metrics) = jax.lax.scan(
+            one_step,
+            (state.env, vector.observe(state.env)),
+            jax.random.split(key, config.rollout_length),
+        )
+        normalizer = running_statistics.update(state.normalizer, raw_observations)
+        last_observation = normalize(vector.observe(env_state), state.normalizer)
+        timeout_observation = normalize(timeout_observation, state.normalizer)
+        return (
+            env_state,
+            rollout,
+            normalizer,
+            last_observation,
+            timeout_observation,
+            rollout_metrics(metrics),
+        )
+
+    def prepare(
+        params: Params,
+        rollout: Rollout,
+        last_observation: jax.Array,
+        timeout_observation: jax.Array,
+    ) -> Samples:
+        """Values the rollout and turns it into samples."""
+        observations = jnp.concatenate([rollout.observation, last_observation[None]])
+        values = value_apply(params, observations)
+        timeout_values = value_apply(params, timeout_observation)
+        advantage = generalized_advantages(
+            rollout.reward,
+            values[:-1],
+            jnp.where(rollout.truncated, timeout_values, values[1:]),
+            rollout.terminated,
+            rollout.truncated,
+            config.discount,
+            config.gae_lambda,
+        )
+        samples = Samples(
+            observation=rollout.observation,
+            action=rollout.action,
+            log_prob=rollout.log_prob,
+            advantage=advantage,
+            value_target=advantage + values[:-1],
+        )
+        return jax.tree.map(
+            lambda x: x.reshape((config.batch_steps,) + x.shape[2:]), samples
+        )
+
+    def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
+        logits = policy_apply(params, samples.observation)
+        log_ratio = distribution.log_prob(logits, samples.action) - samples.log_prob
+        ratio = jnp.exp(log_ratio)
+        advantage = (samples.advantage - samples.advantage.mean()) / (
+            samples.advantage.std() + 1e-8
+        )
+        clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+        value_error = value_apply(params, samples.observation) - samples.value_target
+        value_loss = jnp.mean(jnp.square(value_error))
+        standard_deviation = logits[1]
+        entropy = jnp.mean(
+            jnp.sum(jnp.log(standard_deviation) + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
+        )
+        total = policy_loss + config.value_cost * value_loss - config.entropy_cost * entropy
+        return total, {
+            "loss/policy": policy_loss,
+            "loss/value": value_loss,
+            "policy/entropy": entropy,
+            # Schulman's low-variance estimate of KL(old || new).
+            "policy/kl": jnp.mean(ratio - 1.0 - log_ratio),
+            "policy/action_std": jnp.mean(standard_deviation),
+        }
+
+    def update(state: TrainingState, samples: Samples, key: jax.Array):
+        """Several epochs of minibatch steps."""
+        limit = max_learning_rate(config, state.iteration)
+
+        def minibatch(carry, batch: Samples):
+            params, optimizer_state, learning_rate = carry
+            gradient, metrics = jax.grad(loss, has_aux=True)(params, batch)
+            direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+            params = optax.apply_updates(
+                params, jax.tree.map(lambda d: -learning_rate * d, direction)
+            )
+            learning_rate = adapt_learning_rate(
+                config, learning_rate, metrics["policy/kl"], limit
+            )
+            return (params, optimizer_state, learning_rate), metrics
+
+        def epoch(carry, epoch_key):
+            order = jax.random.permutation(epoch_key, config.batch_steps)
+            batches = jax.tree.map(
+                lambda x: x[order].reshape((config.num_minibatches, -1) + x.shape[1:]), samples
+            )
+            return jax.lax.scan(minibatch, carry, batches)
+
+        carry = (state.params, state.optimizer, state.learning_rate)
+        carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.num_epochs))
+        means = {name: jnp.mean(value) for name, value in metrics.items()}
+        return carry, means | {"policy/kl": jnp.mean(metrics["policy/kl"][-1])}
+
+    def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
+        key, collect_key, update_key = jax.random.split(state.key, 3)
+        env_state, rollout, normalizer, last, timeout, metrics = collect(state, collect_key)
+        samples = prepare(state.params, rollout, last, timeout)
+        (params, optimizer_state, learning_rate), losses = update(state, samples, update_key)
+        state = TrainingState(
+            params=params,
+            optimizer=optimizer_state,
+            normalizer=normalizer,
+            learning_rate=learning_rate,
+            env=env_state,
+            key=key,
+            iteration=state.iteration + 1,
+        )
+        return state, metrics | losses | {"policy/learning_rate": learning_rate}
+
+    def run(state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
+        return jax.lax.scan(iteration, state, length=num_iterations)
+
+    return Trainer(init, run)
+
+
+def policy_of(state: TrainingState) -> Policy:
+    """What acting needs of a training state."""
+    return Policy(state.normalizer, state.params.policy)
+
+
+def generalized_advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    discount: float,
+    gae_lambda: float,
+) -> jax.Array:
+    """Generalised advantage estimation (Schulman et al. 2016, equation 16), all arrays [T, B].
+
+    Args:
+      next_value: value of the state that the step led to; at a time-out that of the old episode's
+        last state, never of the new episode's first.
+      terminated: no value follows the step.
+      truncated: the value that follows counts, but no advantage flows back over the step.
+    """
+    delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
+    carried = discount * gae_lambda * (~(terminated | truncated))
+
+    def backward(advantage, step):
+        delta, carried = step
+        advantage = delta + carried * advantage
+        return advantage, advantage
+
+    _, advantages = jax.lax.scan(
+        backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True
+    )
+    return advantages
+
+
+def max_learning_rate(config: PPOConfig, iteration: jax.Array) -> jax.Array:
+    """Upper limit of the learning rate []: from max_learning_rate to final_max_learning_rate in
+    equal ratios over decay_steps. Without it the KL rule lets the rate grow when the policy
+    hardly changes any more, and a late large step ruins it."""
+    progress = jnp.minimum(1.0, iteration * (config.batch_steps / config.decay_steps))
+    ratio = config.final_max_learning_rate / config.max_learning_rate
+    return config.max_learning_rate * ratio**progress
+
+
+def adapt_learning_rate(
+    config: PPOConfig, learning_rate: jax.Array, kl: jax.Array, limit: jax.Array
+) -> jax.Array:
+    """Steers the KL divergence of an update towards target_kl (the adaptive rule of Schulman et
+    al. 2017, section 4, applied to the learning rate)."""
+    if config.target_kl > 0.0:
+        learning_rate = jnp.where(
+            kl > 2.0 * config.target_kl,
+            learning_rate / _LEARNING_RATE_FACTOR,
+            jnp.where(
+                kl < 0.5 * config.target_kl, learning_rate * _LEARNING_RATE_FACTOR, learning_rate
+            ),
+        )
+    return jnp.clip(learning_rate, config.min_learning_rate, limit)
+
+
+def step_metrics(result: vector.StepResult) -> Metrics:
+    """Means over the batch of one step, and sums over the episodes that ended on it."""
+    ended = result.terminated | result.truncated
+    means = {name: jnp.mean(value) for name, value in result.metrics.items()}
+    return means | {
+        "reward": jnp.mean(result.reward),
+        "ended": jnp.sum(ended),
+        "return": jnp.sum(jnp.where(ended, result.episode_return, 0.0)),
+        "length": jnp.sum(jnp.where(ended, result.episode_length, 0)),
+        "bounces": jnp.sum(jnp.where(ended, result.metrics["n_bounces"], 0.0)),
+        "apex_error": jnp.sum(result.metrics["apex_error"]),
+        "bounced": jnp.sum(result.metrics["bounced"]),
+        "non_finite": jnp.sum(result.metrics["non_finite"]),
+    }
+
+
+def rollout_metrics(steps: Metrics) -> Metrics:
+    """Metrics of a rollout from those of its steps [T]. Where no episode ended (or no bounce
+    happened), its means are not a number."""
+    ended, bounced = jnp.sum(steps["ended"]), jnp.sum(steps["bounced"])
+    rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
+    return rewards | {
+        "episode/return": jnp.sum(steps["return"]) / ended,
+        "episode/length": jnp.sum(steps["length"]) / ended,
+        "episode/bounces": jnp.sum(steps["bounces"]) / ended,
+        "episode/ended": ended,
+        "task/apex_error": jnp.sum(steps["apex_error"]) / bounced,
+        "task/ball_xy_error": jnp.mean(steps["ball_xy_error"]),
+        "task/n_bounces": jnp.mean(steps["n_bounces"]),
+        "task/non_finite": jnp.sum(steps["non_finite"]),
+    }

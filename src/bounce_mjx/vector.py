@@ -1,0 +1,96 @@
+"""Many environments at once: batching, time-outs and a fresh reset at every end.
+
+Inside, the batch is the last axis of every array, so that the physics works on contiguous
+coordinates; observations and actions face the learner with the batch first.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+
+class VectorState(NamedTuple):
+    """State of a batch of B environments."""
+
+    env: State
+    """brax states, the batch last in every array."""
+    steps: jax.Array
+    """Steps since the reset [B], int."""
+    episode_return: jax.Array
+    """Sum of the rewards since the reset [B]."""
+
+
+class StepResult(NamedTuple):
+    """What one step of a batch of B environments gave."""
+
+    observation: jax.Array
+    """What to act on next [B, 29]: after an end, the first of the new episode."""
+    final_observation: jax.Array
+    """What the step itself led to [B, 29]: at an end, the last of the old episode."""
+    reward: jax.Array
+    """[B]."""
+    terminated: jax.Array
+    """Whether the task ended the episode [B], bool."""
+    truncated: jax.Array
+    """Whether only the time limit ended the episode [B], bool."""
+    metrics: dict[str, jax.Array]
+    """The environment's metrics, each [B]."""
+    episode_return: jax.Array
+    """Return of the episode up to this step [B]."""
+    episode_length: jax.Array
+    """Length of the episode up to this step [B], int."""
+
+
+def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
+    """Starts `num_envs` episodes; consumes `key`."""
+    states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+    return VectorState(
+        env=states,
+        steps=jnp.zeros(num_envs, jnp.int32),
+        episode_return=jnp.zeros_like(states.reward),
+    )
+
+
+def observe(state: VectorState) -> jax.Array:
+    """Observations [B, 29]."""
+    return state.env.obs.T
+
+
+def step(
+    env: Env, state: VectorState, action: jax.Array, key: jax.Array, episode_steps: int
+) -> tuple[VectorState, StepResult]:
+    """Advances every environment, and resets those that ended with a new draw.
+
+    Args:
+      action: [B, 6].
+      key: consumed by the resets.
+      episode_steps: length at which an episode is truncated.
+    """
+    num_envs = state.steps.shape[0]
+    stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
+    steps = state.steps + 1
+    episode_return = state.episode_return + stepped.reward
+    terminated = stepped.done > 0
+    truncated = (steps >= episode_steps) & ~terminated
+    ended = terminated | truncated
+
+    fresh = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+    env_state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, stepped)
+    result = StepResult(
+        observation=env_state.obs.T,
+        final_observation=stepped.obs.T,
+        reward=stepped.reward,
+        terminated=terminated,
+        truncated=truncated,
+        metrics=stepped.metrics,
+        episode_return=episode_return,
+        episode_length=steps,
+    )
+    next_state = VectorState(
+        env=env_state,
+        steps=jnp.where(ended, 0, steps),
+        episode_return=jnp.where(ended, 0.0, episode_return),
+    )
+    return next_state, result

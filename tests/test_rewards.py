@@ -1,0 +1,392 @@
+"""The fifteen reward terms: against the seed's transcription, and against values by hand."""
+
+import math
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from reward_reference import REFERENCE_WEIGHTS, reference_terms
+
+from bounce_mjx.config import EnvConfig, RewardConfig
+from bounce_mjx.rewards import TERM_NAMES, RewardInputs, weighted_terms
+
+SPEC_NAMES = (
+    "position",
+    "out_of_position",
+    "velocity_matching",
+    "height",
+    "height_progress",
+    "controlled_upward",
+    "consecutive_bounces",
+    "high_bounce_count",
+    "alignment",
+    "paddle_home",
+    "excessive_upward",
+    "downward_velocity",
+    "paddle_height_violation",
+    "action_rate",
+    "joint_velocity",
+)
+N_STATES = 10_000
+X_TARGET = 0.58856
+
+
+def evaluate(config: RewardConfig, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the package's weighted terms `[N]` of a batch of states, in float64."""
+    with jax.enable_x64(True):
+        terms = jax.jit(jax.vmap(partial(weighted_terms, config)))(RewardInputs(**states))
+        return {name: np.asarray(term) for name, term in terms.items()}
+
+
+def state(
+    *,
+    dx=0.0,
+    dy=0.0,
+    z=0.5,
+    vz=0.0,
+    target=0.5,
+    paddle_z=0.05,
+    paddle_dx=0.0,
+    paddle_dy=0.0,
+    n_bounces=0,
+    bounced=False,
+    action=0.0,
+    last_action=0.0,
+    joint_velocity=0.0,
+) -> dict[str, np.ndarray]:
+    """One state as a batch of one; `dx`, `dy` and `paddle_dx`, `paddle_dy` are off the target."""
+    return {
+        "ball_position": np.array([[X_TARGET + dx, dy, z]]),
+        "ball_velocity": np.array([[0.3, -0.2, vz]]),
+        "paddle_position": np.array([[X_TARGET + paddle_dx, paddle_dy, paddle_z]]),
+        "target_height": np.array([target]),
+        "n_bounces": np.array([n_bounces]),
+        "bounced": np.array([bounced]),
+        "action": np.broadcast_to(np.float64(action), (1, 6)),
+        "last_action": np.broadcast_to(np.float64(last_action), (1, 6)),
+        "joint_velocity": np.broadcast_to(np.float64(joint_velocity), (1, 6)),
+    }
+
+
+def stack(states: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Join batches of states into one."""
+    return {name: np.concatenate([s[name] for s in states]) for name in states[0]}
+
+
+def random_states(seed: int) -> dict[str, np.ndarray]:
+    """Draw `N_STATES` states on both sides of every condition and clip of the seed's formulas."""
+    rng = np.random.default_rng(seed)
+
+    def offsets(low: float, high: float) -> np.ndarray:
+        # Log-uniform radii: the terms' widths run from 0.02 m to 0.4 m.
+        radius = np.exp(rng.uniform(np.log(low), np.log(high), N_STATES))
+        angle = rng.uniform(-np.pi, np.pi, N_STATES)
+        return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    target = rng.uniform(0.3, 0.8, N_STATES)
+    kind = rng.random(N_STATES)
+    near_target, launched = kind < 0.4, kind > 0.8
+    z = np.select(
+        [near_target, launched],
+        [target + rng.uniform(-0.08, 0.08, N_STATES), rng.uniform(0.02, 0.2, N_STATES)],
+        rng.uniform(0.02, 1.6, N_STATES),
+    )
+    slow = rng.random(N_STATES) < 0.4
+    vz = np.select(
+        [launched, slow],
+        [rng.uniform(0.0, 5.0, N_STATES), rng.uniform(-1.0, 1.0, N_STATES)],
+        rng.uniform(-5.0, 5.0, N_STATES),
+    )
+    ball_xy = np.array([X_TARGET, 0.0]) + offsets(1e-3, 1.5)
+    paddle_xy = ball_xy + offsets(1e-3, 0.5)
+    paddle_z = rng.uniform(-0.15, 0.35, N_STATES)
+    return {
+        "ball_position": np.column_stack([ball_xy, z]),
+        "ball_velocity": np.column_stack([rng.normal(size=(N_STATES, 2)), vz]),
+        "paddle_position": np.column_stack([paddle_xy, paddle_z]),
+        "target_height": target,
+        "n_bounces": np.where(
+            rng.random(N_STATES) < 0.5,
+            rng.integers(0, 5, N_STATES),
+            rng.integers(0, 61, N_STATES),
+        ),
+        "bounced": rng.random(N_STATES) < 0.5,
+        "action": rng.uniform(-1.0, 1.0, (N_STATES, 6)),
+        "last_action": rng.uniform(-1.0, 1.0, (N_STATES, 6)),
+        "joint_velocity": rng.uniform(-2 * np.pi, 2 * np.pi, (N_STATES, 6)),
+    }
+
+
+def branches(states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return, for each branch and each side of each clip, which states `[N]` take it."""
+    z, vz = states["ball_position"][:, 2], states["ball_velocity"][:, 2]
+    paddle_z = states["paddle_position"][:, 2]
+    dh = states["target_height"] - z
+    err_xy = np.hypot(states["ball_position"][:, 0] - X_TARGET, states["ball_position"][:, 1])
+    err_align = np.linalg.norm((states["ball_position"] - states["paddle_position"])[:, :2], axis=1)
+    err_home = np.abs(paddle_z - 0.05)
+    n = states["n_bounces"]
+    rising, falling, below, above = vz > 0, vz < 0, dh > 0, dh < 0
+    near = np.abs(dh) < 0.05
+    reaches = vz**2 > 2 * 9.81 * dh
+    v_ideal = np.sqrt(2 * 9.81 * np.maximum(0, dh))
+    on_target = err_xy < 0.04
+    # Where the Gaussian factors are not vanishingly small, so that the clips can be seen.
+    paced = rising & on_target & (np.abs(vz - np.clip(v_ideal, 0.5, 3.0)) < 1.0)
+    return {
+        "rising below, reaches the target": rising & below & ~near & reaches,
+        "rising below, does not reach the target": rising & below & ~near & ~reaches,
+        "rising above": rising & above & ~near,
+        "falling above": falling & above & ~near,
+        "falling below": falling & below & ~near,
+        "near, rising, below": near & rising & below,
+        "near, rising, above": near & rising & above,
+        "near, falling, below": near & falling & below,
+        "near, falling, above": near & falling & above,
+        "near, within the near weight": np.abs(dh) < 0.01,
+        "just inside near": near & (np.abs(dh) > 0.045),
+        "just outside near": ~near & (np.abs(dh) < 0.055),
+        "no height progress": z < 0.2,
+        "height progress": z > 0.2,
+        "ideal velocity raised to 0.5": paced & (v_ideal < 0.5),
+        "ideal velocity free": paced & (v_ideal > 0.5) & (v_ideal < 3.0),
+        "ideal velocity cut to 3": paced & (v_ideal > 3.0),
+        "upward velocity raised to 0": on_target & falling,
+        "upward velocity free": paced & (vz < 1.5),
+        "upward velocity cut to 1.5": paced & (vz > 1.5),
+        "no bounces": n == 0,
+        "one bounce": n == 1,
+        "two bounces": n == 2,
+        "many bounces, on target": (n >= 3) & on_target,
+        "on target": on_target,
+        "off target": err_xy > 0.1,
+        "bounced, aligned": states["bounced"] & (err_align < 0.06),
+        "not bounced, aligned": ~states["bounced"] & (err_align < 0.06),
+        "ball above the paddle, close": (z > paddle_z) & (z < paddle_z + 0.15),
+        "ball above the paddle, far": z > paddle_z + 0.15,
+        "ball below the paddle": z < paddle_z,
+        "paddle below home": paddle_z < 0.05,
+        "paddle too low": (paddle_z < 0.05) & (err_home > 0.1),
+        "paddle too high": (paddle_z > 0.05) & (err_home > 0.1),
+        "paddle near home": err_home < 0.1,
+        "excessive upward velocity": vz > 3.5,
+        "downward magnitude raised to 0": -0.3 * vz < 0,
+        "downward magnitude free": (-0.3 * vz > 0) & (-0.3 * vz < 0.5),
+        "downward magnitude cut to 0.5": -0.3 * vz > 0.5,
+    }
+
+
+@pytest.fixture(scope="module")
+def random_comparison():
+    """The package's and the reference's weighted terms of the same random states."""
+    states = random_states(seed=0)
+    reference = {
+        name: REFERENCE_WEIGHTS[name] * term for name, term in reference_terms(**states).items()
+    }
+    return evaluate(EnvConfig().reward, states), reference
+
+
+def test_random_states_take_every_branch():
+    hits = {name: int(taken.sum()) for name, taken in branches(random_states(seed=0)).items()}
+    assert {name: count for name, count in hits.items() if count < 100} == {}
+
+
+@pytest.mark.parametrize("name", SPEC_NAMES)
+def test_term_equals_reference(name, random_comparison):
+    package, reference = random_comparison
+    assert package[name].dtype == np.float64
+    # atol only excuses Gaussian tails, 1e-12 and less of a term of order one.
+    np.testing.assert_allclose(package[name], reference[name], rtol=1e-6, atol=1e-12)
+
+
+def test_names_are_those_of_the_spec(random_comparison):
+    package, reference = random_comparison
+    assert tuple(TERM_NAMES) == SPEC_NAMES
+    assert tuple(REFERENCE_WEIGHTS) == SPEC_NAMES
+    assert set(package) == set(reference) == set(SPEC_NAMES)
+
+
+def test_weights_are_the_seeds():
+    config = EnvConfig().reward
+    assert {name: getattr(config, name).weight for name in SPEC_NAMES} == REFERENCE_WEIGHTS
+    assert config == RewardConfig()
+
+
+E = math.exp
+HALF = math.exp(-0.5)  # a Gaussian one width from its centre
+
+
+# Each row: term, state, weight * term worked out from the seed's formula.
+PINNED = [
+    # err_xy = 0: exp(0) = 1
+    ("position", state(), 2.0),
+    # d_vert = 0: w = 1, sigma = 0.1 * (1 + 3) = 0.4 = err_xy
+    ("position", state(dx=0.4, z=0.05), 2.0 * HALF),
+    # err_xy = hypot(0.06, 0.08) = 0.1; d_vert = 0.15: w = 1/e, sigma = 0.1 (1 + 3/e)
+    ("position", state(dx=0.06, dy=-0.08, z=0.2), 2.0 * E(-0.5 / (1 + 3 * E(-1)) ** 2)),
+    # the sigmoid's midpoint: err_xy = 0.05, -2 / 2
+    ("out_of_position", state(dx=0.03, dy=0.04), -1.0),
+    # err_xy = 0: (0 - 0.05) / 0.03 = -5/3
+    ("out_of_position", state(), -2.0 / (1 + E(5 / 3))),
+    # err_xy = 0.08: (0.08 - 0.05) / 0.03 = 1
+    ("out_of_position", state(dy=-0.08), -2.0 / (1 + E(-1))),
+    # dh = 0: neither above nor below, so v = v_z * 1 = 0.5, err = 0
+    ("velocity_matching", state(vz=0.5), 2.0),
+    # dh = 0, at rest: v = 0, err = 0.5, 0.25 / 1.28
+    ("velocity_matching", state(), 2.0 * E(-0.25 / 1.28)),
+    # case 1: dh = 0.1, v^2 = 4 - 1.962 = 2.038; sigmoids at 2 / 0.2 = 10 and 0.1 / 0.02 = 5
+    (
+        "velocity_matching",
+        state(z=0.4, vz=2.0),
+        2.0 * E(-((math.sqrt(2.038) / (1 + E(-10)) / (1 + E(-5)) - 0.5) ** 2) / 1.28),
+    ),
+    # case 1 short of the target: dh = 0.3, 1 - 5.886 < 0, so v = 0, err = 0.5
+    ("velocity_matching", state(z=0.2, vz=1.0), 2.0 * E(-0.25 / 1.28)),
+    # case 2: dh = -0.1, v = -sqrt(1 + 1.962); 1 - sigmoid(-5) = sigmoid(5), twice
+    (
+        "velocity_matching",
+        state(z=0.6, vz=-1.0),
+        2.0 * E(-((-math.sqrt(2.962) / (1 + E(-5)) ** 2 - 0.5) ** 2) / 1.28),
+    ),
+    # no case: falling at dh = 0.2, or rising at dh = -0.2: v = 0, err = 0.5
+    ("velocity_matching", state(z=0.3, vz=-1.0), 2.0 * E(-0.25 / 1.28)),
+    ("velocity_matching", state(z=0.7, vz=1.0), 2.0 * E(-0.25 / 1.28)),
+    # cases 1 and 3 at dh = 0.01: sqrt(1 - 0.1962) sigmoid(5) sigmoid(0.5) + 1 * exp(-1/2)
+    (
+        "velocity_matching",
+        state(z=0.49, vz=1.0),
+        2.0 * E(-((math.sqrt(0.8038) / (1 + E(-5)) / (1 + E(-0.5)) + HALF - 0.5) ** 2) / 1.28),
+    ),
+    # case 3 alone, falling at dh = 0.02: v = -0.4 * exp(-0.0004 / 0.0002) = -0.4 / e^2
+    ("velocity_matching", state(z=0.48, vz=-0.4), 2.0 * E(-((0.4 * E(-2) + 0.5) ** 2) / 1.28)),
+    ("height", state(), 4.5),
+    # err_h = 0.15, above and below
+    ("height", state(z=0.65), 4.5 * HALF),
+    ("height", state(z=0.35), 4.5 * HALF),
+    # (0.5 - 0.2) * 2; nothing below 0.2
+    ("height_progress", state(), 0.6),
+    ("height_progress", state(z=0.1), 0.0),
+    # dh = 0: v_ideal = 0 raised to 0.5 = v_z; sigmoid(5) * 0.5
+    ("controlled_upward", state(vz=0.5), 1.5 * 0.5 / (1 + E(-5))),
+    # q_pos = HALF (err_xy = 0.02); dh = 0.2, v_ideal = sqrt(3.924); v_z = 1.2; sigmoid(12)
+    (
+        "controlled_upward",
+        state(dx=0.02, z=0.3, vz=1.2),
+        1.5 * HALF * E(-((1.2 - math.sqrt(3.924)) ** 2) / 0.5) / (1 + E(-12)) * 1.2,
+    ),
+    # dh = 0.5: v_ideal = sqrt(9.81) cut to 3; v_z = 2.5 is 0.5 off and cut to 1.5; sigmoid(25)
+    ("controlled_upward", state(z=0.1, target=0.6, vz=2.5), 1.5 * HALF / (1 + E(-25)) * 1.5),
+    ("controlled_upward", state(vz=-0.1), 0.0),
+    ("consecutive_bounces", state(), 0.0),
+    # 0.8 * 0.5 * ln 2
+    ("consecutive_bounces", state(n_bounces=1), 0.4 * math.log(2)),
+    # 0.8 * 0.5 * ln 10, err_xy = 0.05
+    ("consecutive_bounces", state(dx=-0.03, dy=0.04, n_bounces=9), 0.4 * math.log(10) * HALF),
+    ("high_bounce_count", state(), 0.0),
+    # the sigmoid's midpoint: 0.3 * 2 * 0.15 / 2
+    ("high_bounce_count", state(n_bounces=2), 0.045),
+    # 0.3 * 5 * 0.15 = 0.225, err_xy = 0.05, (5 - 2) / 0.5 = 6
+    ("high_bounce_count", state(dy=0.05, n_bounces=5), 0.225 * HALF / (1 + E(-6))),
+    # err_align = 0, d_vert = 0: 0.6 * (1 + 2) * 0.3, three times that at a bounce
+    ("alignment", state(z=0.05), 0.54),
+    ("alignment", state(z=0.05, bounced=True), 1.62),
+    # ball and paddle 0.03 apart in x (0.1 - 0.07), d_vert = 0.1: 0.18 * (1 + 2/e)
+    ("alignment", state(dx=0.1, paddle_dx=0.07, z=0.15), 0.18 * HALF * (1 + 2 * E(-1))),
+    # 0.03 apart in y, from below the paddle
+    ("alignment", state(paddle_dy=0.03, z=0.05, paddle_z=0.15), 0.18 * HALF * (1 + 2 * E(-1))),
+    # at home, the distance factor's midpoint d_vert = 0.15: 1.5 * 1.25
+    ("paddle_home", state(z=0.2), 1.875),
+    # err_home = 0.05, d_vert = 0.18: (0.18 - 0.15) / 0.03 = 1
+    ("paddle_home", state(z=0.28, paddle_z=0.1), 1.5 * HALF * (1 + 0.5 / (1 + E(-1)))),
+    # the sigmoid's midpoint, then (3.8 - 3.5) / 0.3 = 1
+    ("excessive_upward", state(vz=3.5), -0.5),
+    ("excessive_upward", state(vz=3.8), -1.0 / (1 + E(-1))),
+    # the sigmoid's midpoint: 0.2 * (0.2 * 0.3) / 2
+    ("downward_velocity", state(vz=-0.2), 0.006),
+    # 1 * 0.3, sigmoid(0.8 / 0.2)
+    ("downward_velocity", state(vz=-1.0), 0.3 / (1 + E(-4))),
+    # 2 * 0.6 cut to 2 * 0.5, sigmoid(1.8 / 0.2)
+    ("downward_velocity", state(vz=-2.0), 1.0 / (1 + E(-9))),
+    ("downward_velocity", state(vz=1.0), 0.0),
+    # err_home = 0, 0.09, then 0.2 above and below: -20 * 0.1
+    ("paddle_height_violation", state(), 0.0),
+    ("paddle_height_violation", state(paddle_z=0.14), 0.0),
+    ("paddle_height_violation", state(paddle_z=0.25), -2.0),
+    ("paddle_height_violation", state(paddle_z=-0.15), -2.0),
+    # six differences of 1, then 0.25 + 0.01 + 0 + 0 + 0 + 1
+    ("action_rate", state(action=0.5, last_action=-0.5), -6e-4),
+    (
+        "action_rate",
+        state(action=[0.5, 0.1, 0.2, 0, 0, -1], last_action=[0, 0, 0.2, 0, 0, 0]),
+        -1.26e-4,
+    ),
+    # 1 + 4 + 9 + 16 + 25 + 36 = 91
+    ("joint_velocity", state(joint_velocity=[1, -2, 3, -4, 5, -6]), -91e-4),
+]
+PINNED_IDS = [f"{name}-{i}" for i, (name, _, _) in enumerate(PINNED)]
+
+
+@pytest.fixture(scope="module")
+def pinned_terms():
+    """The package's terms of all pinned states, from one compilation."""
+    return evaluate(RewardConfig(), stack([inputs for _, inputs, _ in PINNED]))
+
+
+def test_every_term_is_pinned():
+    assert {name for name, _, _ in PINNED} == set(SPEC_NAMES)
+
+
+@pytest.mark.parametrize("row", range(len(PINNED)), ids=PINNED_IDS)
+def test_term_equals_hand_value(row, pinned_terms):
+    name, _, expected = PINNED[row]
+    assert pinned_terms[name][row] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(("name", "inputs", "expected"), PINNED, ids=PINNED_IDS)
+def test_reference_equals_hand_value(name, inputs, expected):
+    value = REFERENCE_WEIGHTS[name] * reference_terms(**inputs)[name][0]
+    assert value == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_downward_velocity_takes_its_sign_from_the_weight():
+    falling = state(vz=-1.0)
+    negated = RewardConfig(downward_velocity={"weight": -1.0})
+    rewarded = evaluate(RewardConfig(), falling)["downward_velocity"]
+    penalised = evaluate(negated, falling)["downward_velocity"]
+    assert rewarded > 0
+    assert penalised == -rewarded
+
+
+# No single state makes all fifteen non-zero: a ball can not rise and fall at once.
+TWO_STATES = stack(
+    [
+        state(
+            dx=0.02,
+            paddle_dx=0.01,
+            z=z,
+            vz=vz,
+            n_bounces=4,
+            paddle_z=0.2,
+            action=0.3,
+            joint_velocity=0.5,
+        )
+        for z, vz in ((0.4, 1.2), (0.6, -1.0))
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def default_terms():
+    """The default configuration's terms of `TWO_STATES`."""
+    return evaluate(RewardConfig(), TWO_STATES)
+
+
+@pytest.mark.parametrize("name", SPEC_NAMES)
+def test_weight_scales_only_its_term(name, default_terms):
+    assert np.any(default_terms[name] != 0)
+    scaled = RewardConfig(**{name: {"weight": -3.0 * REFERENCE_WEIGHTS[name]}})
+    terms = evaluate(scaled, TWO_STATES)
+    for other in SPEC_NAMES:
+        factor = -3.0 if other == name else 1.0
+        np.testing.assert_allclose(terms[other], factor * default_terms[other], rtol=1e-12)
