@@ -388,3 +388,100 @@ class PPOConfig(_Config):
     def batch_steps(self) -> int:
         """Environment steps in one iteration."""
         return self.num_envs * self.rollout_length
+
+
+class TrainConfig(_Config):
+    """A training run: the task, the trainer, and how long and how often."""
+
+    env: EnvConfig = EnvConfig()
+    """The task."""
+    ppo: PPOConfig = PPOConfig()
+    """The trainer."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Seed of the whole training."""
+    total_steps: Count = 50_000_000
+    """Environment steps to train for, rounded up to whole blocks."""
+    block_steps: Count = 1_000_000
+    """Environment steps between two progress reports, rounded to whole iterations."""
+    eval_every: Count = 2_000_000
+    """Environment steps between two evaluations, rounded to whole blocks."""
+    eval_episodes: Count = 1024
+    """Episodes of an evaluation of the five results."""
+    screening_episodes: Annotated[int, Field(ge=0)] = 0
+    """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
+    eval_seed: Annotated[int, Field(ge=0, lt=2**31)] = 10_000
+    """Seed of the evaluations during the training."""
+    stop_when_solved: bool = False
+    """End at the first evaluation that meets all five results."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Folder in which the run makes its own, named by the time."""
+
+
+ConfigT = TypeVar("ConfigT", bound=_Config)
+
+
+def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:
+    """Builds a config from plain values.
+
+    Args:
+      source: where the values come from, for the error.
+
+    Raises:
+      UserError: a key is unknown or a value is out of range.
+    """
+    try:
+        return config_class.model_validate(values)
+    except pydantic.ValidationError as error:
+        raise UserError(f"{source}: {describe(error, config_class)}") from error
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Reads a run's config from a YAML file, missing keys at their defaults.
+
+    Raises:
+      UserError: the file is missing, is no YAML mapping, or holds an unknown key or a bad value.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"the config file {path} cannot be read ({reason}); give a YAML file such as "
+            "configs/default.yaml"
+        ) from error
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise UserError(
+            f"the config file {path} holds a {type(values).__name__}, not a mapping of keys to "
+            "values; write it like configs/default.yaml"
+        )
+    return validate(TrainConfig, values, str(path))
+
+
+def dump_config(config: TrainConfig) -> str:
+    """The whole config as YAML, for `load_config`."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def describe(error: pydantic.ValidationError, config_class: type[_Config]) -> str:
+    """The first mistake of a validation error as part of a sentence."""
+    first = error.errors()[0]
+    path = [str(part) for part in first["loc"]]
+    key = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        known = _keys_beside(config_class, path[:-1])
+        near = difflib.get_close_matches(path[-1], known, n=1)
+        advice = f"did you mean {near[0]}?" if near else f"known keys here are {', '.join(known)}"
+        return f"unknown key {key}; {advice}"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    wanted = message[0].lower() + message[1:]
+    return f"{key} is {first['input']!r}, but {wanted.replace('input ', 'the value ', 1)}"
+
+
+def _keys_beside(config_class: type[_Config], path: list[str]) -> list[str]:
+    for part in path:
+        config_class = config_class.model_fields[part].annotation
+    return list(config_class.model_fields)

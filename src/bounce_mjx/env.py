@@ -140,7 +140,9 @@ class BounceBall(Env):
         config, at = self.config, self._addresses
         before = state.pipeline_state
         finite = jnp.all(jnp.isfinite(physics.qpos)) & jnp.all(jnp.isfinite(physics.qvel))
-        physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before.physics)
+        physics = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old), physics, before.physics
+        )
         action = jnp.where(finite, action, before.task.last_action)
 
         ball = jnp.stack([physics.qpos[i] for i in at.ball_qpos[:3]])
@@ -184,9 +186,7 @@ class BounceBall(Env):
             metrics=metrics,
         )
 
-    def _observation(
-        self, physics: PhysicsState, task: TaskState, paddle: jax.Array
-    ) -> jax.Array:
+    def _observation(self, physics: PhysicsState, task: TaskState, paddle: jax.Array) -> jax.Array:
         """[29]: joint angles 6, ball position 3 and quaternion 4, joint velocities 6, ball's
         linear 3 and angular 3 velocity, paddle position 3, target height 1."""
         at = self._addresses

@@ -77,6 +77,12 @@ class Report(NamedTuple):
         """Whether no result failed."""
         return all(result.passed is not False for result in self.results)
 
+    @property
+    def score(self) -> tuple[int, float]:
+        """Order of quality: the number of results met, then the mean return."""
+        met = sum(result.passed is not False for result in self.results)
+        return met, self.details["mean_return"]
+
     def to_dict(self) -> dict:
         """The report as plain data, for JSON."""
         return {
@@ -167,7 +173,7 @@ def judge(env: BounceBall, statistics: Statistics) -> Report:
         Result(
             "consecutive bounces",
             f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row, %",
-            100.0 * enough_bounces,
+            float(100.0 * enough_bounces),
             f">= {100 * MIN_EPISODE_SHARE:g}",
             bool(enough_bounces >= MIN_EPISODE_SHARE),
         ),
@@ -195,7 +201,7 @@ def judge(env: BounceBall, statistics: Statistics) -> Report:
         Result(
             "stable",
             f"episodes of {env.config.episode_seconds:g} s without an end, %",
-            100.0 * stable,
+            float(100.0 * stable),
             f">= {100 * MIN_EPISODE_SHARE:g}",
             bool(stable >= MIN_EPISODE_SHARE),
         ),

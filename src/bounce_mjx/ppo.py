@@ -207,9 +207,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage=advantage,
             value_target=advantage + values[:-1],
         )
-        return jax.tree.map(
-            lambda x: x.reshape((config.batch_steps,) + x.shape[2:]), samples
-        )
+        return jax.tree.map(lambda x: x.reshape((config.batch_steps,) + x.shape[2:]), samples)
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         logits = policy_apply(params, samples.observation)
@@ -247,9 +245,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             params = optax.apply_updates(
                 params, jax.tree.map(lambda d: -learning_rate * d, direction)
             )
-            learning_rate = adapt_learning_rate(
-                config, learning_rate, metrics["policy/kl"], limit
-            )
+            learning_rate = adapt_learning_rate(config, learning_rate, metrics["policy/kl"], limit)
             return (params, optimizer_state, learning_rate), metrics
 
         def epoch(carry, epoch_key):
@@ -316,9 +312,7 @@ def generalized_advantages(
         advantage = delta + carried * advantage
         return advantage, advantage
 
-    _, advantages = jax.lax.scan(
-        backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True
-    )
+    _, advantages = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True)
     return advantages
 
 

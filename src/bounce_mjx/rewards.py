@@ -63,9 +63,7 @@ def out_of_position(config: RewardConfig, inputs: RewardInputs, geometry: _Geome
     return -c.magnitude * jax.nn.sigmoid((geometry.err_xy - c.threshold) / c.scale)
 
 
-def velocity_matching(
-    config: RewardConfig, inputs: RewardInputs, geometry: _Geometry
-) -> jax.Array:
+def velocity_matching(config: RewardConfig, inputs: RewardInputs, geometry: _Geometry) -> jax.Array:
     """The velocity of each case is 0 outside the case's own condition."""
     c = config.velocity_matching
     vz, delta_h = geometry.vz, geometry.delta_h
@@ -93,9 +91,7 @@ def height_progress(config: RewardConfig, inputs: RewardInputs, geometry: _Geome
     return jnp.maximum(0.0, inputs.ball_position[2] - c.base_height) * c.gain
 
 
-def controlled_upward(
-    config: RewardConfig, inputs: RewardInputs, geometry: _Geometry
-) -> jax.Array:
+def controlled_upward(config: RewardConfig, inputs: RewardInputs, geometry: _Geometry) -> jax.Array:
     c = config.controlled_upward
     v_ideal = jnp.sqrt(2.0 * config.gravity * jnp.maximum(0.0, geometry.delta_h))
     v_ideal = jnp.clip(v_ideal, c.min_ideal_velocity, c.max_ideal_velocity)
@@ -113,9 +109,7 @@ def consecutive_bounces(
     return c.gain * jnp.log1p(inputs.n_bounces) * gaussian(geometry.err_xy, c.position_scale)
 
 
-def high_bounce_count(
-    config: RewardConfig, inputs: RewardInputs, geometry: _Geometry
-) -> jax.Array:
+def high_bounce_count(config: RewardConfig, inputs: RewardInputs, geometry: _Geometry) -> jax.Array:
     c = config.high_bounce_count
     s_high = jax.nn.sigmoid((inputs.n_bounces - c.threshold) / c.scale)
     return inputs.n_bounces * c.gain * gaussian(geometry.err_xy, c.position_scale) * s_high
@@ -140,9 +134,7 @@ def excessive_upward(config: RewardConfig, inputs: RewardInputs, geometry: _Geom
     return -c.magnitude * jax.nn.sigmoid((geometry.vz - c.threshold) / c.scale)
 
 
-def downward_velocity(
-    config: RewardConfig, inputs: RewardInputs, geometry: _Geometry
-) -> jax.Array:
+def downward_velocity(config: RewardConfig, inputs: RewardInputs, geometry: _Geometry) -> jax.Array:
     """Positive for a falling ball, as the seed's formula stands, though the seed calls it a
     penalty; the sign of the weight decides."""
     c = config.downward_velocity

@@ -108,9 +108,7 @@ def bias_force(
             cross(alpha, link.first_moment), cross(omega, cross(omega, link.first_moment))
         )
         forces.append(vadd(scale(acceleration, link.mass), about_origin))
-        turning = vadd(
-            matvec(link.inertia, alpha), cross(omega, matvec(link.inertia, omega))
-        )
+        turning = vadd(matvec(link.inertia, alpha), cross(omega, matvec(link.inertia, omega)))
         moments.append(vadd(turning, cross(link.first_moment, acceleration)))
 
     torques: list[Scalar] = [0.0] * len(links)
@@ -145,9 +143,7 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     return matrix
 
 
-def point_jacobian(
-    links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3
-) -> list[Scalar]:
+def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3) -> list[Scalar]:
     """Velocity along a world direction, per unit joint velocity, of a world point fixed to the
     last link."""
     row = []

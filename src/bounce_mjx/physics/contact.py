@@ -43,9 +43,7 @@ class Contact(NamedTuple):
     """World direction from the box to the sphere, of length 1."""
 
 
-def sphere_box(
-    model: ContactModel, centre: Vec3, box_origin: Vec3, box_rotation: Mat3
-) -> Contact:
+def sphere_box(model: ContactModel, centre: Vec3, box_origin: Vec3, box_rotation: Mat3) -> Contact:
     """Nearest point of the box; for a centre inside the box, its nearest face."""
     local = matvec(transpose(box_rotation), vsub(centre, box_origin))
     half = model.half_size
@@ -65,9 +63,7 @@ def sphere_box(
     )
     face_depth = jnp.minimum(jnp.minimum(depth[0], depth[1]), depth[2])
 
-    normal = tuple(
-        jnp.where(outside, x * inverse, f) for x, f in zip(offset, face, strict=True)
-    )
+    normal = tuple(jnp.where(outside, x * inverse, f) for x, f in zip(offset, face, strict=True))
     distance = jnp.where(outside, squared * inverse, -face_depth) - model.radius
     return Contact(distance, matvec(box_rotation, normal))
 

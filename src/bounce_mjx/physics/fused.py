@@ -106,9 +106,7 @@ def step(
 
 def paddle_position(model: FusedModel, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    pose = chain.forward_kinematics(
-        model.links, tuple(qpos[i] for i in model.addresses.arm_qpos)
-    )
+    pose = chain.forward_kinematics(model.links, tuple(qpos[i] for i in model.addresses.arm_qpos))
     return jnp.stack(_paddle_origin(model, pose))
 
 
@@ -157,9 +155,7 @@ def contact_response(
     # The torque of a force along the normal is the same at the contact as at the ball's centre.
     jacobian = [
         -entry
-        for entry in chain.point_jacobian(
-            model.links, pose, motion.ball_position, contact.normal
-        )
+        for entry in chain.point_jacobian(model.links, pose, motion.ball_position, contact.normal)
     ]
     factor = chain.cholesky(inertia)
     half_jacobian = chain.solve_lower(factor, jacobian)
@@ -168,9 +164,7 @@ def contact_response(
     normal_velocity = dot(contact.normal, motion.ball_velocity)
     free_acceleration = dot(contact.normal, model.gravity)
     inverse_inertia = 1.0 / model.ball_mass
-    for j, v, half_j, half_a in zip(
-        jacobian, motion.v, half_jacobian, half_applied, strict=True
-    ):
+    for j, v, half_j, half_a in zip(jacobian, motion.v, half_jacobian, half_applied, strict=True):
         normal_velocity = normal_velocity + j * v
         free_acceleration = free_acceleration + half_j * half_a
         inverse_inertia = inverse_inertia + half_j * half_j
@@ -252,9 +246,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
 
 
 def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:
-    return vadd(
-        pose.world_origin[-1], matvec(pose.world_rotation[-1], model.paddle_origin)
-    )
+    return vadd(pose.world_origin[-1], matvec(pose.world_rotation[-1], model.paddle_origin))
 
 
 def _floats(values: np.ndarray) -> tuple[float, ...]:
@@ -391,9 +383,7 @@ def _check_constraints(m: mujoco.MjModel) -> None:
     _require(not np.any(colliding), "contacts by contype and conaffinity (only the one pair)")
     _require(m.npair == 1, "other than one contact pair")
     _require(m.pair_dim[0] == 1, f"a pair with friction (condim {m.pair_dim[0]}; only condim 1)")
-    _require(
-        m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap"
-    )
+    _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(
         m.nu == len(m.actuator_trnid) and np.all(m.actuator_dyntype == 0) and m.nu == m.njnt - 1,
         "actuators other than one position servo on each joint",

@@ -1,0 +1,125 @@
+"""Measures the five results of a trained policy: `python -m bounce_mjx.eval [CHECKPOINT]`."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import pydantic
+import tyro
+from pydantic import Field
+from rich.console import Console
+
+from bounce_mjx.cli import parse
+from bounce_mjx.config import EnvConfig, TrainConfig, validate
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation import DEFAULT_EPISODES, DEFAULT_SEED, Report, judge, make_evaluator
+from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
+from bounce_mjx.policy import Policy, make_networks
+from bounce_mjx.reporting import details_line, results_table
+from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.train import enable_compilation_cache
+
+
+class EvalCommand(pydantic.BaseModel):
+    """The command line."""
+
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
+    )
+
+    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run."""
+    episodes: Annotated[int, Field(ge=1)] = DEFAULT_EPISODES
+    """Episodes, each from its own reset."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
+    """Seed of the resets."""
+    target_height: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
+    """One target height for all episodes, m; left out: the range of the run's config."""
+    physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
+    """Engine: mujoco is the C engine itself; config is the one that the run was trained on."""
+    json: Path | None = None
+    """File to write the results to."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Where to look for the newest run."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
+    with exit_on_user_error():
+        args = sys.argv[1:] if args is None else args
+        command = parse(
+            EvalCommand,
+            args,
+            prog="python -m bounce_mjx.eval",
+            description="Measures the five results of a trained policy.",
+        )
+        if command.json is not None and not command.json.absolute().parent.is_dir():
+            raise UserError(
+                f"the folder of --json {command.json} does not exist; make it or choose another"
+            )
+        enable_compilation_cache()
+        checkpoint = find_checkpoint(command.checkpoint, command.log_dir)
+        config = load_run_config(checkpoint.run)
+        policy = load_policy(checkpoint, config)
+        report, engine = evaluate_policy(
+            policy,
+            config,
+            episodes=command.episodes,
+            seed=command.seed,
+            target_height=command.target_height,
+            physics=command.physics,
+        )
+        console = Console()
+        console.print(
+            f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        console.print(results_table(report, "the five results"))
+        console.print(details_line(report), highlight=False)
+        if command.json is not None:
+            plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
+            plain |= {"seed": command.seed, "target_height": command.target_height}
+            command.json.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+    sys.exit(0 if report.passed else 1)
+
+
+def evaluate_policy(
+    policy: Policy,
+    config: TrainConfig,
+    *,
+    episodes: int = DEFAULT_EPISODES,
+    seed: int = DEFAULT_SEED,
+    target_height: float | None = None,
+    physics: str = "config",
+) -> tuple[Report, str]:
+    """Measures the five results.
+
+    Args:
+      target_height: one target height for all episodes, m; None for the config's range.
+      physics: "fused", "mjx", "mujoco", or "config" for the config's.
+
+    Returns:
+      The report, and the name of the engine.
+
+    Raises:
+      UserError: the engine does not support the model.
+    """
+    changes = {}
+    if target_height is not None:
+        changes["target_height_range"] = (target_height, target_height)
+    if physics in ("fused", "mjx"):
+        changes["physics"] = physics
+    env = BounceBall(validate(EnvConfig, dict(config.env) | changes, "evaluation"))
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
+    statistics = make(env, networks, episodes)(policy, jax.random.PRNGKey(seed))
+    return judge(env, statistics), physics if physics == "mujoco" else env.engine.name
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""What a training shows and writes while it runs: the progress line and the TensorBoard log."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from tensorboardX import SummaryWriter
+
+from bounce_mjx.evaluation import Report
+
+
+class Reporter:
+    """Shows a progress bar on a terminal, a line a block elsewhere, and logs scalars."""
+
+    def __init__(self, run: Path, console: Console, total_steps: int, first_step: int):
+        self._console = console
+        self._writer = SummaryWriter(logdir=str(run))
+        self._progress = Progress(
+            TextColumn("[bold]training"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}% {task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TextColumn("<"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._total_steps = total_steps
+        self._task = self._progress.add_task(
+            "training", total=total_steps, completed=first_step, figures=""
+        )
+        self._last = {"episode/return": math.nan, "episode/bounces": math.nan}
+
+    def __enter__(self) -> "Reporter":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._progress.stop()
+        self._writer.close()
+
+    def block(self, steps: int, seconds: float, metrics: dict[str, np.ndarray]) -> None:
+        """Reports a block of iterations.
+
+        Args:
+          steps: environment steps done so far.
+          seconds: what the block took.
+          metrics: each [iterations]; a value that is not a number is left out.
+        """
+        means = {}
+        for name, values in metrics.items():
+            present = values[np.isfinite(values)]
+            if present.size:
+                means[name] = float(present.mean())
+        for name, value in means.items():
+            self._writer.add_scalar(name, value, steps)
+        self._last |= {name: means[name] for name in self._last if name in means}
+        rate = means["speed/steps_per_second"]
+        figures = (
+            f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s  "
+            f"return {self._last['episode/return']:.0f}  "
+            f"bounces {self._last['episode/bounces']:.1f}"
+        )
+        self._progress.update(self._task, completed=steps, figures=figures)
+        if not self._console.is_terminal:
+            left = (self._total_steps - steps) / rate
+            self._console.print(f"{figures}  {seconds:.1f} s, {left:.0f} s left", highlight=False)
+
+    def evaluation(self, steps: int, report: Report) -> None:
+        """Reports an evaluation."""
+        for result in report.results:
+            self._writer.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
+        for name, value in report.details.items():
+            self._writer.add_scalar(f"results/{name}", value, steps)
+        met = sum(result.passed is not False for result in report.results)
+        figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
+        self._console.print(
+            f"evaluation at {steps / 1e6:.1f}M steps: {met} of {len(report.results)} results met "
+            f"({figures})",
+            highlight=False,
+        )
+
+
+def results_table(report: Report, title: str) -> Table:
+    """The five results as a table."""
+    table = Table(title=title, title_justify="left")
+    for column, justify in (
+        ("result", "left"),
+        ("measured", "left"),
+        ("value", "right"),
+        ("bound", "left"),
+        ("", "left"),
+    ):
+        table.add_column(column, justify=justify)
+    for result in report.results:
+        verdict = {True: "[green]pass", False: "[red]FAIL", None: "not judged"}[result.passed]
+        table.add_row(result.name, result.measured, f"{result.value:.2f}", result.bound, verdict)
+    return table
+
+
+def details_line(report: Report) -> str:
+    """The figures beside the five results, in one line."""
+    d = report.details
+    return (
+        f"{d['episodes']:.0f} episodes: {d['mean_consecutive_bounces']:.1f} consecutive bounces, "
+        f"|apex error| {100 * d['mean_apex_error_m']:.1f} cm, return {d['mean_return']:.0f}, "
+        f"length {d['mean_length_s']:.2f} s (means)"
+    )
+
+
+def _short(rate: float) -> str:
+    return f"{rate / 1e6:.2f}M" if rate >= 1e6 else f"{rate / 1e3:.0f}k"

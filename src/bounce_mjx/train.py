@@ -1,0 +1,307 @@
+"""The main job: trains a policy, and leaves a run's folder with it (`python train_jax.py`)."""
+
+import concurrent.futures
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+
+from bounce_mjx.cli import parse
+from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig, load_config
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation import Report, judge, make_evaluator
+from bounce_mjx.policy import make_networks
+from bounce_mjx.ppo import TrainingState, make_trainer, policy_of
+from bounce_mjx.reporting import Reporter, details_line, results_table
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs import (
+    CheckpointWriter,
+    create_run,
+    find_checkpoint,
+    load_run_config,
+    load_training_state,
+    save_results,
+)
+
+# What a resumed run may change: everything else shapes the state that it goes on from.
+RESUMABLE_KEYS = frozenset(
+    {
+        "total_steps",
+        "eval_every",
+        "eval_episodes",
+        "screening_episodes",
+        "eval_seed",
+        "stop_when_solved",
+        "log_dir",
+    }
+)
+
+
+class TrainCommand(TrainConfig):
+    """The command line: the config's keys as flags, and where to start from."""
+
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
+    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
+    config: Path | None = None
+    """Preset: a YAML file such as configs/seed.yaml. Left out: configs/default.yaml where there is
+    an accelerator, else configs/cpu.yaml."""
+    resume: Path | None = None
+    """A run's folder to go on with, in place; the flags may change only how long it goes on and
+    how it is evaluated."""
+
+
+class Outcome(NamedTuple):
+    """What a training came to."""
+
+    run: Path
+    """The run's folder."""
+    report: Report
+    """Evaluation of the best checkpoint."""
+    best_steps: int
+    """Environment steps at the best checkpoint."""
+    solved_steps: int | None
+    """Environment steps at the first evaluation that met all five results."""
+    seconds: dict[str, float]
+    """Where the time went."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        args = sys.argv[1:] if args is None else args
+        enable_compilation_cache()
+        command = read_command(args)
+        console = Console()
+        outcome = train(command, console)
+        console.print(
+            results_table(outcome.report, f"best checkpoint, {outcome.best_steps:,} steps")
+        )
+        console.print(details_line(outcome.report), highlight=False)
+        spent = ", ".join(f"{name} {value:.1f} s" for name, value in outcome.seconds.items())
+        console.print(f"time: {spent}", highlight=False)
+        console.print(
+            f"run: {outcome.run}  (python -m bounce_mjx.eval {outcome.run})",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def enable_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder, so that a second start is quick.
+    `JAX_COMPILATION_CACHE_DIR` chooses another folder."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
+
+
+def read_command(args: Sequence[str]) -> TrainCommand:
+    """Reads the command line on top of the preset, or of the resumed run's config.
+
+    Raises:
+      UserError: a flag or the preset is wrong, or a resumed run is to change what it may not.
+    """
+    config_path, resume = _path_flag(args, "--config"), _path_flag(args, "--resume")
+    if config_path and resume:
+        raise UserError("--config and --resume exclude each other; a resumed run has its config")
+    if resume:
+        base = load_run_config(find_checkpoint(resume, resume).run)
+    elif config_path:
+        base = load_config(config_path)
+    else:
+        preset = "cpu" if jax.default_backend() == "cpu" else "default"
+        base = load_config(resource_path(f"configs/{preset}.yaml"))
+    command = parse(
+        TrainCommand,
+        args,
+        prog="train_jax.py",
+        description="Trains a policy that keeps the ball bouncing.",
+        default=TrainCommand(**dict(base), config=config_path, resume=resume),
+    )
+    if resume:
+        changed = [
+            key
+            for key in TrainConfig.model_fields
+            if key not in RESUMABLE_KEYS and getattr(command, key) != getattr(base, key)
+        ]
+        if changed:
+            raise UserError(
+                f"--resume cannot change {', '.join(_differing_keys(base, command, changed))}; "
+                "leave those flags out, or start a new run"
+            )
+    return command
+
+
+def train(command: TrainCommand, console: Console) -> Outcome:
+    """Trains as the command says.
+
+    Raises:
+      UserError: the run's folder, the model or the resumed checkpoint is not usable.
+    """
+    clock = _Clock()
+    config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+    env = BounceBall(config.env)
+    trainer = make_trainer(config.ppo, env, config.env.episode_steps)
+    checkpoint = (
+        find_checkpoint(command.resume / "checkpoints" / "latest", command.resume)
+        if command.resume
+        else None
+    )
+    iterations = max(1, round(config.block_steps / config.ppo.batch_steps))
+    block_steps = iterations * config.ppo.batch_steps
+    blocks_per_eval = max(1, round(config.eval_every / block_steps))
+    run = checkpoint.run if checkpoint else create_run(config)
+
+    console.print(f"physics: {env.engine.name} ({env.engine.reason})", highlight=False)
+    console.print(
+        f"device: {jax.devices()[0].device_kind}  run: {run}", highlight=False, soft_wrap=True
+    )
+    clock.lap("setup")
+
+    key = jax.random.PRNGKey(config.seed)
+    with console.status("compiling"):
+        programs = compile_programs(config, env, trainer, iterations)
+        if checkpoint:
+            state = load_training_state(checkpoint, jax.eval_shape(trainer.init, key))
+        else:
+            state = programs.init(key)
+        jax.block_until_ready(state)
+    clock.lap("compile")
+
+    steps = int(state.iteration) * config.ppo.batch_steps
+    best: tuple[Report, int] | None = None
+    solved_steps = None
+    blocks = 0
+    writer = CheckpointWriter(run)
+    with Reporter(run, console, config.total_steps, steps) as reporter:
+        while steps < config.total_steps or best is None:
+            started = time.perf_counter()
+            state, metrics = programs.run(state)
+            metrics = {name: np.asarray(value) for name, value in metrics.items()}
+            seconds = time.perf_counter() - started
+            steps += block_steps
+            blocks += 1
+            metrics["speed/steps_per_second"] = np.array([block_steps / seconds])
+            reporter.block(steps, seconds, metrics)
+            clock.lap("train")
+
+            if blocks % blocks_per_eval == 0 or steps >= config.total_steps:
+                report = programs.evaluate(state)
+                clock.lap("evaluate")
+                reporter.evaluation(steps, report)
+                writer.save("latest", steps, state)
+                if best is None or report.score >= best[0].score:
+                    best = (report, steps)
+                    writer.save("best", steps, state)
+                if report.passed and solved_steps is None:
+                    solved_steps = steps
+                clock.lap("save")
+                if report.passed and config.stop_when_solved:
+                    break
+    writer.close()
+    clock.lap("save")
+
+    outcome = Outcome(run, *best, solved_steps, clock.seconds)
+    save_results(
+        run,
+        {
+            "best_steps": outcome.best_steps,
+            "solved_steps": outcome.solved_steps,
+            "trained_steps": steps,
+            "seconds": outcome.seconds,
+            "device": jax.devices()[0].device_kind,
+            **outcome.report.to_dict(),
+        },
+    )
+    return outcome
+
+
+class Programs(NamedTuple):
+    """The compiled programs of a training."""
+
+    init: Callable[[jax.Array], TrainingState]
+    run: Callable[[TrainingState], tuple[TrainingState, dict[str, jax.Array]]]
+    evaluate: Callable[[TrainingState], Report]
+
+
+def compile_programs(
+    config: TrainConfig, env: BounceBall, trainer: Any, iterations: int
+) -> Programs:
+    """Compiles the programs side by side, as each takes seconds."""
+    key = jax.random.PRNGKey(config.seed)
+    init = jax.jit(trainer.init)
+    state = jax.eval_shape(init, key)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    full = make_evaluator(env, networks, config.eval_episodes)
+    screening = make_evaluator(env, networks, max(1, config.screening_episodes))
+    run = jax.jit(trainer.run, static_argnums=1, donate_argnums=0)
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        compiled_run = pool.submit(lambda: run.lower(state, iterations).compile())
+        compiled_full = pool.submit(lambda: full.lower(policy_of(state), key).compile())
+        compiled_init = pool.submit(lambda: init.lower(key).compile())
+        if config.screening_episodes:
+            compiled_screening = pool.submit(
+                lambda: screening.lower(policy_of(state), key).compile()
+            )
+    eval_key = jax.random.PRNGKey(config.eval_seed)
+
+    def evaluate(state: TrainingState) -> Report:
+        policy = policy_of(state)
+        if config.screening_episodes:
+            screened = judge(
+                env, compiled_screening.result()(policy, jax.random.fold_in(eval_key, 1))
+            )
+            if not screened.passed:
+                return screened
+        return judge(env, compiled_full.result()(policy, eval_key))
+
+    return Programs(compiled_init.result(), compiled_run.result(), evaluate)
+
+
+class _Clock:
+    """Adds up the time between laps by name."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+def _path_flag(args: Sequence[str], flag: str) -> Path | None:
+    """The value of a flag that decides the defaults of all others, so must be read before them."""
+    for i, word in enumerate(args):
+        if word == flag and i + 1 < len(args):
+            return Path(args[i + 1])
+        if word.startswith(f"{flag}="):
+            return Path(word.removeprefix(f"{flag}="))
+    return None
+
+
+def _differing_keys(base: TrainConfig, command: TrainConfig, keys: Sequence[str]) -> list[str]:
+    """Dotted names of the settings that differ."""
+    names = []
+    for key in keys:
+        old, new = getattr(base, key), getattr(command, key)
+        fields = getattr(type(old), "model_fields", None)
+        if fields is None:
+            names.append(key)
+        else:
+            inner = [name for name in fields if getattr(old, name) != getattr(new, name)]
+            names += [f"{key}.{name}" for name in _differing_keys(old, new, inner)]
+    return names
+
+
+if __name__ == "__main__":
+    main()
