@@ -41,7 +41,7 @@ class EvalCommand(pydantic.BaseModel):
     """One target height for all episodes, m; left out: the range of the run's config."""
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
     """Engine: mujoco is the C engine itself; config is the one that the run was trained on."""
-    json: Path | None = None
+    json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
     log_dir: Path = Path("runs/bounce_ball")
     """Where to look for the newest run."""
@@ -57,9 +57,9 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="python -m bounce_mjx.eval",
             description="Measures the five results of a trained policy.",
         )
-        if command.json is not None and not command.json.absolute().parent.is_dir():
+        if command.json_file is not None and not command.json_file.absolute().parent.is_dir():
             raise UserError(
-                f"the folder of --json {command.json} does not exist; make it or choose another"
+                f"the folder of --json {command.json_file} does not exist; make it or choose another"
             )
         enable_compilation_cache()
         checkpoint = find_checkpoint(command.checkpoint, command.log_dir)
@@ -81,10 +81,10 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         console.print(results_table(report, "the five results"))
         console.print(details_line(report), highlight=False)
-        if command.json is not None:
+        if command.json_file is not None:
             plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
             plain |= {"seed": command.seed, "target_height": command.target_height}
-            command.json.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+            command.json_file.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
     sys.exit(0 if report.passed else 1)
 
 
