@@ -6,6 +6,7 @@ field (its docstring) give the unit; they are also the help text of the command 
 
 import difflib
 import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -15,10 +16,10 @@ from pydantic import Field
 
 from bounce_mjx.errors import UserError
 
-ArmVector = tuple[float, float, float, float, float, float]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -276,7 +277,7 @@ class EnvConfig(_Config):
     """Half-width of the uniform noise of the joint angles at a reset, rad."""
     joint_velocity_noise: NonNegative = 0.01
     """Half-width of the uniform noise of the joint velocities at a reset, rad/s."""
-    ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.45)
+    ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
     """Ball position of a reset before noise, m."""
     ball_position_noise: NonNegative = 0.01
     """Half-width of the uniform noise of each ball coordinate at a reset, m."""
@@ -350,11 +351,11 @@ class PPOConfig(_Config):
     """Upper limit of the learning rate at the start of the training."""
     final_max_learning_rate: Positive = 1e-4
     """Upper limit of the learning rate at and after decay_steps."""
-    decay_steps: Count = 20_000_000
+    decay_steps: Count = 40_000_000
     """Environment steps over which the upper limit goes down, in equal ratios."""
     target_kl: NonNegative = 0.01
     """KL divergence of one update that the learning rate is steered to; 0 leaves it as it is."""
-    discount: UnitInterval = 0.99
+    discount: UnitInterval = 0.98
     """Discount factor of a control step."""
     gae_lambda: UnitInterval = 0.95
     """Lambda of the generalised advantage estimation."""
@@ -368,10 +369,13 @@ class PPOConfig(_Config):
     """Global norm to which a gradient is clipped."""
     reward_scale: Positive = 0.1
     """Factor of the reward that the trainer sees."""
-    init_noise_std: Positive = 0.6
+    init_noise_std: Positive = 0.4
     """Standard deviation of the action noise at the start."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy and of the value network."""
+    critic_metrics: tuple[str, ...] = ("n_bounces",)
+    """Metrics of the environment that the value network sees beside the observation. The reward
+    depends on the bounce count, which the observation lacks."""
 
     @pydantic.model_validator(mode="after")
     def _check_batch(self):
@@ -444,7 +448,7 @@ def load_config(path: Path) -> TrainConfig:
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
         raise UserError(
             f"the config file {path} cannot be read ({reason}); give a YAML file such as "
             "configs/default.yaml"
@@ -464,24 +468,59 @@ def dump_config(config: TrainConfig) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
-def describe(error: pydantic.ValidationError, config_class: type[_Config]) -> str:
-    """The first mistake of a validation error as part of a sentence."""
+def describe(
+    error: pydantic.ValidationError,
+    config_class: type[pydantic.BaseModel],
+    spell: Callable[[str], str] = str,
+) -> str:
+    """The first mistake of a validation error as part of a sentence.
+
+    Args:
+      spell: how to write the dotted name of a setting.
+    """
     first = error.errors()[0]
-    path = [str(part) for part in first["loc"]]
-    key = ".".join(path)
-    if first["type"] == "extra_forbidden":
-        known = _keys_beside(config_class, path[:-1])
-        near = difflib.get_close_matches(path[-1], known, n=1)
-        advice = f"did you mean {near[0]}?" if near else f"known keys here are {', '.join(known)}"
-        return f"unknown key {key}; {advice}"
-    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("extra_forbidden", "invalid_key"):
+        path = [str(part) for part in first["loc"]]
+        return f"unknown key {'.'.join(path)}; {_advice(config_class, path)}"
+    path = [part for part in first["loc"] if isinstance(part, str)]
     if first["type"] == "value_error":
-        return f"{key}: {message}" if key else message
-    wanted = message[0].lower() + message[1:]
-    return f"{key} is {first['input']!r}, but {wanted.replace('input ', 'the value ', 1)}"
+        return ": ".join([*path[-1:], first["msg"].removeprefix("Value error, ")])
+    return f"{spell('.'.join(path))} is {first['input']!r}, but must {_wanted(error)}"
 
 
-def _keys_beside(config_class: type[_Config], path: list[str]) -> list[str]:
-    for part in path:
-        config_class = config_class.model_fields[part].annotation
-    return list(config_class.model_fields)
+def _wanted(error: pydantic.ValidationError) -> str:
+    """What the first mistake should have been, after "must"."""
+    first = error.errors()[0]
+    if first["type"] == "missing":
+        beside = [e["loc"] for e in error.errors() if e["loc"][:-1] == first["loc"][:-1]]
+        return f"have {beside[-1][-1] + 1} items"
+    limits = first.get("ctx", {})
+    special = {
+        "model_type": "be a group of keys and values",
+        "path_type": "be a path",
+        "too_long": f"have {limits.get('max_length')} items",
+        "too_short": f"have at least {limits.get('min_length')} item",
+        "tuple_type": "be a list",
+    }
+    ordinary = first["msg"].removeprefix("Input should ").split(", unable")[0]
+    return special.get(first["type"], ordinary)
+
+
+def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
+    """What to do about an unknown key."""
+    known = list(_dotted_keys(config_class))
+    prefix = ".".join([*path[:-1], ""])
+    beside = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
+    same_name = [key for key in known if key.split(".")[-1] == path[-1]]
+    near = difflib.get_close_matches(path[-1], beside, n=1)
+    if near or same_name:
+        return f"did you mean {prefix + near[0] if near else same_name[0]}?"
+    return f"known keys here are {', '.join(sorted(beside))}"
+
+
+def _dotted_keys(config_class: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in config_class.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, _Config):
+            yield from _dotted_keys(field.annotation, f"{prefix}{name}.")
+        else:
+            yield prefix + name

@@ -57,10 +57,8 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="python -m bounce_mjx.eval",
             description="Measures the five results of a trained policy.",
         )
-        if command.json_file is not None and not command.json_file.absolute().parent.is_dir():
-            raise UserError(
-                f"the folder of --json {command.json_file} does not exist; make it or choose another"
-            )
+        if command.json_file is not None:
+            _check_writable(command.json_file)
         enable_compilation_cache()
         checkpoint = find_checkpoint(command.checkpoint, command.log_dir)
         config = load_run_config(checkpoint.run)
@@ -84,8 +82,22 @@ def main(args: Sequence[str] | None = None) -> None:
         if command.json_file is not None:
             plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
             plain |= {"seed": command.seed, "target_height": command.target_height}
-            command.json_file.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+            try:
+                command.json_file.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+            except OSError as error:
+                raise UserError(
+                    f"--json {command.json_file} cannot be written ({error.strerror}); give "
+                    "another file"
+                ) from error
     sys.exit(0 if report.passed else 1)
+
+
+def _check_writable(json_file: Path) -> None:
+    """Spares the user an evaluation whose results could not be written."""
+    if not json_file.absolute().parent.is_dir():
+        raise UserError(f"the folder of --json {json_file} does not exist; make it")
+    if json_file.is_dir():
+        raise UserError(f"--json {json_file} is a folder; give a file")
 
 
 def evaluate_policy(

@@ -24,11 +24,13 @@ class Policy(NamedTuple):
 
 
 def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
-    """Networks on normalised observations: a Gaussian with a learned, state-independent standard
-    deviation, and a value."""
+    """Networks on normalised inputs: a Gaussian with a learned, state-independent standard
+    deviation on the observation, and a value on the observation and the critic's metrics."""
     return make_ppo_networks(
-        observation_size,
+        {"state": (observation_size,), "critic": (observation_size + len(config.critic_metrics),)},
         action_size,
+        policy_obs_key="state",
+        value_obs_key="critic",
         policy_hidden_layer_sizes=config.hidden_layers,
         value_hidden_layer_sizes=config.hidden_layers,
         activation=jax.nn.silu,

@@ -17,6 +17,7 @@ from brax.training.acme import running_statistics
 
 from bounce_mjx import vector
 from bounce_mjx.config import PPOConfig
+from bounce_mjx.env import OBSERVATION_SIZE
 from bounce_mjx.errors import UserError
 from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
 
@@ -39,6 +40,7 @@ class TrainingState(NamedTuple):
     params: Params
     optimizer: optax.OptState
     normalizer: running_statistics.RunningStatisticsState
+    """Statistics [29 + K] of what the networks see: the observation, and K metrics for the critic."""
     learning_rate: jax.Array
     """Current learning rate []."""
     env: vector.VectorState
@@ -51,8 +53,8 @@ class TrainingState(NamedTuple):
 class Rollout(NamedTuple):
     """T steps of B environments."""
 
-    observation: jax.Array
-    """Normalised [T, B, 29]."""
+    seen: jax.Array
+    """Normalised observation and critic metrics [T, B, 29 + K]."""
     action: jax.Array
     """As drawn, before clipping [T, B, 6]."""
     log_prob: jax.Array
@@ -65,11 +67,25 @@ class Rollout(NamedTuple):
     """[T, B], bool."""
 
 
+class Collection(NamedTuple):
+    """A rollout and what surrounds it."""
+
+    env: vector.VectorState
+    """Environments after the last step."""
+    rollout: Rollout
+    normalizer: running_statistics.RunningStatisticsState
+    """Statistics with those of the rollout."""
+    last: jax.Array
+    """What is seen after the last step, normalised [B, 29 + K]."""
+    at_timeout: jax.Array
+    """The same before each environment's reset by a time-out, if it had one [B, 29 + K]."""
+
+
 class Samples(NamedTuple):
     """What the update learns from; N samples."""
 
-    observation: jax.Array
-    """Normalised [N, 29]."""
+    seen: jax.Array
+    """Normalised observation and critic metrics [N, 29 + K]."""
     action: jax.Array
     """[N, 6]."""
     log_prob: jax.Array
@@ -93,12 +109,19 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
 
     Raises:
-      UserError: a rollout is longer than an episode.
+      UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
     """
     if config.rollout_length > episode_steps:
         raise UserError(
             f"rollout_length {config.rollout_length} is longer than an episode of {episode_steps} "
             "control steps; choose a shorter rollout or longer episodes"
+        )
+    known_metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+    unknown = [name for name in config.critic_metrics if name not in known_metrics]
+    if unknown:
+        raise UserError(
+            f"critic_metrics names {unknown[0]}, which the environment does not have; choose from "
+            f"{', '.join(known_metrics)}"
         )
     networks = make_networks(config, env.observation_size, env.action_size)
     distribution = networks.parametric_action_distribution
@@ -106,11 +129,16 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
     )
 
-    def policy_apply(params: Params, observation: jax.Array):
+    def policy_apply(params: Params, seen: jax.Array):
+        observation = seen[..., : env.observation_size]
         return networks.policy_network.apply(None, params.policy, observation)
 
-    def value_apply(params: Params, observation: jax.Array) -> jax.Array:
-        return networks.value_network.apply(None, params.value, observation)
+    def value_apply(params: Params, seen: jax.Array) -> jax.Array:
+        return networks.value_network.apply(None, params.value, seen)
+
+    def see(observation: jax.Array, metrics: Metrics) -> jax.Array:
+        extra = [metrics[name][:, None] for name in config.critic_metrics]
+        return jnp.concatenate([observation, *extra], axis=-1)
 
     def init(key: jax.Array) -> TrainingState:
         key, policy_key, value_key, env_key, steps_key = jax.random.split(key, 5)
@@ -123,74 +151,59 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return TrainingState(
             params=params,
             optimizer=optimizer.init(params),
-            normalizer=init_normalizer(env.observation_size),
+            normalizer=init_normalizer(env.observation_size + len(config.critic_metrics)),
             learning_rate=jnp.float32(config.learning_rate),
             env=env_state._replace(steps=steps),
             key=key,
             iteration=jnp.int32(0),
         )
 
-    def collect(state: TrainingState, key: jax.Array):
-        """Runs the policy for T steps.
-
-        Returns the new environment states, the rollout, the statistics of the observations with
-        the new ones, the observations that follow the last step [B, 29] and those that preceded
-        each environment's time-out [B, 29] (both normalised), and metrics.
-        """
+    def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
+        """Runs the policy for T steps."""
 
         def one_step(carry, step_key):
-            env_state, timeout_observation = carry
+            env_state, at_timeout = carry
             action_key, reset_key = jax.random.split(step_key)
-            raw_observation = vector.observe(env_state)
-            observation = normalize(raw_observation, state.normalizer)
-            logits = policy_apply(state.params, observation)
+            raw = see(vector.observe(env_state), env_state.env.metrics)
+            seen = normalize(raw, state.normalizer)
+            logits = policy_apply(state.params, seen)
             action = distribution.sample_no_postprocessing(logits, action_key)
             env_state, result = vector.step(env, env_state, action, reset_key, episode_steps)
-            timeout_observation = jnp.where(
-                result.truncated[:, None], result.final_observation, timeout_observation
+            at_timeout = jnp.where(
+                result.truncated[:, None],
+                see(result.final_observation, result.metrics),
+                at_timeout,
             )
             step_of_rollout = Rollout(
-                observation=observation,
+                seen=seen,
                 action=action,
                 log_prob=distribution.log_prob(logits, action),
                 reward=config.reward_scale * result.reward,
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
-            return (env_state, timeout_observation), (
-                step_of_rollout,
-                raw_observation,
-                step_metrics(result),
-            )
+            return (env_state, at_timeout), (step_of_rollout, raw, step_metrics(result))
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
-        (env_state, timeout_observation), (rollout, raw_observations, metrics) = jax.lax.scan(
-            one_step,
-            (state.env, vector.observe(state.env)),
-            jax.random.split(key, config.rollout_length),
+        first = see(vector.observe(state.env), state.env.env.metrics)
+        (env_state, at_timeout), (rollout, raw, metrics) = jax.lax.scan(
+            one_step, (state.env, first), jax.random.split(key, config.rollout_length)
         )
-        normalizer = running_statistics.update(state.normalizer, raw_observations)
-        last_observation = normalize(vector.observe(env_state), state.normalizer)
-        timeout_observation = normalize(timeout_observation, state.normalizer)
-        return (
-            env_state,
-            rollout,
-            normalizer,
-            last_observation,
-            timeout_observation,
-            rollout_metrics(metrics),
+        last = see(vector.observe(env_state), env_state.env.metrics)
+        collection = Collection(
+            env=env_state,
+            rollout=rollout,
+            normalizer=running_statistics.update(state.normalizer, raw),
+            last=normalize(last, state.normalizer),
+            at_timeout=normalize(at_timeout, state.normalizer),
         )
+        return collection, rollout_metrics(metrics)
 
-    def prepare(
-        params: Params,
-        rollout: Rollout,
-        last_observation: jax.Array,
-        timeout_observation: jax.Array,
-    ) -> Samples:
+    def prepare(params: Params, collection: Collection) -> Samples:
         """Values the rollout and turns it into samples."""
-        observations = jnp.concatenate([rollout.observation, last_observation[None]])
-        values = value_apply(params, observations)
-        timeout_values = value_apply(params, timeout_observation)
+        rollout = collection.rollout
+        values = value_apply(params, jnp.concatenate([rollout.seen, collection.last[None]]))
+        timeout_values = value_apply(params, collection.at_timeout)
         advantage = generalized_advantages(
             rollout.reward,
             values[:-1],
@@ -201,7 +214,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             config.gae_lambda,
         )
         samples = Samples(
-            observation=rollout.observation,
+            seen=rollout.seen,
             action=rollout.action,
             log_prob=rollout.log_prob,
             advantage=advantage,
@@ -210,7 +223,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return jax.tree.map(lambda x: x.reshape((config.batch_steps,) + x.shape[2:]), samples)
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
-        logits = policy_apply(params, samples.observation)
+        logits = policy_apply(params, samples.seen)
         log_ratio = distribution.log_prob(logits, samples.action) - samples.log_prob
         ratio = jnp.exp(log_ratio)
         advantage = (samples.advantage - samples.advantage.mean()) / (
@@ -218,8 +231,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         )
         clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)
         policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-        value_error = value_apply(params, samples.observation) - samples.value_target
-        value_loss = jnp.mean(jnp.square(value_error))
+        values = value_apply(params, samples.seen)
+        value_loss = jnp.mean(jnp.square(values - samples.value_target))
         standard_deviation = logits[1]
         entropy = jnp.mean(
             jnp.sum(jnp.log(standard_deviation) + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
@@ -262,15 +275,15 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
-        env_state, rollout, normalizer, last, timeout, metrics = collect(state, collect_key)
-        samples = prepare(state.params, rollout, last, timeout)
+        collection, metrics = collect(state, collect_key)
+        samples = prepare(state.params, collection)
         (params, optimizer_state, learning_rate), losses = update(state, samples, update_key)
         state = TrainingState(
             params=params,
             optimizer=optimizer_state,
-            normalizer=normalizer,
+            normalizer=collection.normalizer,
             learning_rate=learning_rate,
-            env=env_state,
+            env=collection.env,
             key=key,
             iteration=state.iteration + 1,
         )
@@ -284,7 +297,14 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
 def policy_of(state: TrainingState) -> Policy:
     """What acting needs of a training state."""
-    return Policy(state.normalizer, state.params.policy)
+    n = OBSERVATION_SIZE
+    statistics = state.normalizer
+    normalizer = statistics.replace(
+        mean=statistics.mean[:n],
+        std=statistics.std[:n],
+        summed_variance=statistics.summed_variance[:n],
+    )
+    return Policy(normalizer, state.params.policy)
 
 
 def generalized_advantages(

@@ -67,7 +67,8 @@ class Reporter:
         self._progress.update(self._task, completed=steps, figures=figures)
         if not self._console.is_terminal:
             left = (self._total_steps - steps) / rate
-            self._console.print(f"{figures}  {seconds:.1f} s, {left:.0f} s left", highlight=False)
+            line = f"{figures}  {seconds:.1f} s, {left:.0f} s left"
+            self._console.print(line, highlight=False, soft_wrap=True)
 
     def evaluation(self, steps: int, report: Report) -> None:
         """Reports an evaluation."""
@@ -81,6 +82,7 @@ class Reporter:
             f"evaluation at {steps / 1e6:.1f}M steps: {met} of {len(report.results)} results met "
             f"({figures})",
             highlight=False,
+            soft_wrap=True,
         )
 
 

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
+import tensorstore
 
 from bounce_mjx.config import TrainConfig, dump_config, load_config
 from bounce_mjx.env import OBSERVATION_SIZE
@@ -89,10 +91,11 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             f"{path} is no run's folder nor in one, as no {CONFIG_FILE} is there; give a folder "
             "that train_jax.py made"
         )
-    for folder in (path, path / _CHECKPOINTS / "best", path / _CHECKPOINTS / "latest"):
+    at = path.absolute()
+    for folder in (at, at / _CHECKPOINTS / "best", at / _CHECKPOINTS / "latest"):
         if folder.name.isdigit() and folder.parent.parent.name == _CHECKPOINTS:
             return Checkpoint(run, folder, int(folder.name))
-        steps = [p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()]
+        steps = _steps(folder)
         if steps:
             newest = max(steps, key=lambda p: int(p.name))
             return Checkpoint(run, newest, int(newest.name))
@@ -105,7 +108,7 @@ def newest_run(log_dir: Path) -> Path:
     Raises:
       UserError: there is none.
     """
-    runs = sorted(p.parent for p in log_dir.glob(f"*/{_CHECKPOINTS}") if any(p.glob("*/[0-9]*")))
+    runs = sorted(p.parent.parent for p in log_dir.glob(f"*/{_CHECKPOINTS}/*") if _steps(p))
     if not runs:
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with train_jax.py or give "
@@ -185,18 +188,48 @@ class CheckpointWriter:
             manager.close()
 
 
+def _steps(folder: Path) -> list[Path]:
+    """The checkpoints in a folder; one that is still being written has a longer name."""
+    return [p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()]
+
+
 def _restore(checkpoint: Checkpoint, item: str, template: Any) -> Any:
-    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    template = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), template
-    )
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            return checkpointer.restore(checkpoint.folder.absolute() / item, template)
-    # orbax and tensorstore raise many types for a damaged file; all of them mean the same here.
+        stored = _read_arrays(checkpoint.folder.absolute() / item)
+    # A damaged file raises many types; all of them mean the same here.
     except Exception as error:
-        reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else repr(error)
+        reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
         raise UserError(
-            f"the checkpoint {checkpoint.folder} cannot be restored ({reason}); it is damaged or "
-            "of another config, so give another checkpoint"
+            f"the checkpoint {checkpoint.folder} is damaged ({reason}); give another checkpoint"
         ) from error
+    leaves, tree = jax.tree_util.tree_flatten_with_path(template)
+    wanted = {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in leaves}
+    for name in sorted(wanted.keys() | stored.keys()):
+        has, needs = (getattr(x.get(name), "shape", "nothing") for x in (stored, wanted))
+        if has != needs:
+            raise UserError(
+                f"the checkpoint {checkpoint.folder} is damaged or of another config, as its "
+                f"{name} is {has} where {checkpoint.run / CONFIG_FILE} needs {needs}; restore "
+                "that file or give another checkpoint"
+            )
+    arrays = [jax.numpy.asarray(stored[name], leaf.dtype) for name, leaf in wanted.items()]
+    return jax.tree_util.tree_unflatten(tree, arrays)
+
+
+def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
+    """The arrays of an item by dotted name.
+
+    Not by orbax, whose readers print tracebacks from their threads where a file is damaged.
+    """
+    metadata = json.loads((folder / "_METADATA").read_text(encoding="utf-8"))
+    driver = "zarr3" if metadata["use_zarr3"] else "zarr"
+    database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+    keys = tensorstore.KvStore.open(database).result().list().result()
+    opening = {
+        name: tensorstore.open(
+            {"driver": driver, "kvstore": {**database, "path": f"{name}/"}}, open=True
+        )
+        for name in {key.decode().rpartition("/")[0] for key in keys}
+    }
+    reading = {name: array.result().read() for name, array in opening.items()}
+    return {name: array.result() for name, array in reading.items()}

@@ -36,7 +36,7 @@ class StepResult(NamedTuple):
     truncated: jax.Array
     """Whether only the time limit ended the episode [B], bool."""
     metrics: dict[str, jax.Array]
-    """The environment's metrics, each [B]."""
+    """The environment's metrics of the step, each [B]."""
     episode_return: jax.Array
     """Return of the episode up to this step [B]."""
     episode_length: jax.Array

@@ -1,0 +1,505 @@
+"""The two commands: what they leave behind, and what they say to a mistake."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from bounce_mjx import eval as eval_command
+from bounce_mjx import train as train_command
+from bounce_mjx.config import TrainConfig, load_config
+from bounce_mjx.errors import UserError
+from bounce_mjx.policy import Policy
+from bounce_mjx.resources import resource_path
+from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config, newest_run
+
+TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
+STEPS = 256
+TINY = (
+    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
+    "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
+    "--no-stop-when-solved --episode-seconds 0.5"
+).split()
+RESULT_NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
+
+Fails = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of 256 steps, in `runs/bounce_ball` of a working directory."""
+    log_dir = tmp_path_factory.mktemp("trained") / "runs" / "bounce_ball"
+    train_command.main([*TINY, "--total-steps", str(STEPS), "--log-dir", str(log_dir)])
+    (run,) = log_dir.iterdir()
+    return run
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may damage, in the working directory of `fails`."""
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+@pytest.fixture
+def fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd) -> Fails:
+    """A function (main, arguments) -> the sentence with which the command refuses them.
+
+    The command runs in an empty directory, in which it must leave everything as it is.
+    """
+    monkeypatch.chdir(tmp_path)
+
+    def call(main: Callable[[list[str]], None], args: list[str]) -> str:
+        before = contents(tmp_path)
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as exit_info:
+            main([str(arg) for arg in args])
+        out, err = capfd.readouterr()
+        assert exit_info.value.code == 2
+        assert "Traceback" not in out
+        assert re.fullmatch(r"error: .+\n", err), err
+        assert contents(tmp_path) == before
+        return err
+
+    return call
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Every path under a folder, a file with its bytes."""
+    return {p: p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+def assert_says(sentence: str, words: tuple[str, ...]) -> None:
+    missing = [word for word in words if word not in sentence]
+    assert not missing, sentence
+
+
+BAD_FLAGS = {
+    "unknown flag": ("--zzz 3", "--zzz", "--help"),
+    "near miss": ("--num-envz 3", "--num-envz", "did you mean --num-envs?"),
+    "near miss of a term": (
+        "--reward.height.wieght 3",
+        "--reward.height.wieght",
+        "did you mean --reward.height.weight?",
+    ),
+    "near miss of a switch": ("--no-stop-if-solved", "did you mean --no-stop-when-solved?"),
+    "with its group": ("--ppo.num-envs 3", "did you mean --num-envs?"),
+    "stray word": ("seed.yaml", "seed.yaml", "--help"),
+    "no environments": ("--num-envs 0", "--num-envs is 0", "greater than or equal to 1"),
+    "not a number": ("--num-envs abc", "--num-envs", "INT", "abc"),
+    "not a number after =": ("--num_envs=abc --seed 3", "--num-envs", "INT", "given abc "),
+    "no value": ("--num-envs --seed 3", "--num-envs", "INT", "nothing"),
+    "fraction": ("--num-envs 1.5", "--num-envs", "INT", "1.5"),
+    "minibatches": (
+        "--num-envs 8 --rollout-length 8 --num-minibatches 7",
+        "num_minibatches 7",
+        "64 samples",
+        "choose a divisor of 64",
+    ),
+    "targets reversed": ("--target-height-range 0.6 0.4", "(0.6, 0.4)", "lower first"),
+    "one target": ("--target-height-range 0.6", "--target-height-range", "FLOAT FLOAT"),
+    "target below the floor": ("--target-height-range -1 0.4", "target_height_range", "low <="),
+    "target nan": ("--target-height-range nan 0.4", "target_height_range (nan", "low <="),
+    "control step": ("--control-dt 0.0105", "control_dt 0.0105", "multiple of physics_dt"),
+    "short episode": ("--episode-seconds 0.001", "episode_seconds 0.001", "longer episode"),
+    "rollout longer than an episode": (
+        "--num-envs 8 --rollout-length 8 --episode-seconds 0.05",
+        "rollout_length 8",
+        "5 control steps",
+        "shorter rollout",
+    ),
+    "scale nan": ("--action-scale nan", "--action-scale is nan", "finite"),
+    "angle nan": ("--default-joint-angles 0 0 nan 0 0 0", "--default-joint-angles", "finite"),
+    "ball at infinity": ("--ball-init-pos 0 0 inf", "--ball-init-pos is inf", "finite"),
+    "weight nan": ("--reward.height.weight nan", "--reward.height.weight is nan", "finite"),
+    "width zero": ("--reward.height.scale 0", "--reward.height.scale is 0.0", "greater than 0"),
+    "negative noise": ("--joint-angle-noise -0.1", "--joint-angle-noise is -0.1", "equal to 0"),
+    "negative rate": ("--learning-rate -1", "--learning-rate is -1.0", "greater than 0"),
+    "discount": ("--discount 1.5", "--discount is 1.5", "less than or equal to 1"),
+    "negative seed": ("--seed -1", "--seed is -1", "greater than or equal to 0"),
+    "no layers": ("--hidden-layers", "--hidden-layers is ()", "at least 1 item"),
+    "empty layer": ("--hidden-layers 16 0", "--hidden-layers is 0", "equal to 1"),
+    "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
+    "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "exclude"),
+    "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
+    "run missing": ("--resume nowhere", "nowhere", "give a run's folder"),
+    "MJCF missing": ("--mjcf a.xml", "a.xml", "does not exist", "give the path"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FLAGS.values(), ids=BAD_FLAGS)
+def test_bad_flag(fails: Fails, case: tuple[str, ...]) -> None:
+    flags, *words = case
+    assert_says(fails(train_command.main, flags.split()), words)
+
+
+BAD_YAML = {
+    "list": (b"- 1\n", "a list", "mapping", "configs/default.yaml"),
+    "no YAML": (b"ppo: [1\nseed: {", "cannot be read", "line 2", "configs/default.yaml"),
+    "binary": (bytes(range(256)), "cannot be read", "utf-8", "configs/default.yaml"),
+    "unknown key": (b"zzz: 3", "unknown key zzz", "known keys here are", "total_steps"),
+    "near miss": (b"ppo: {num_env: 3}", "unknown key ppo.num_env;", "did you mean ppo.num_envs?"),
+    "deep near miss": (
+        b"env: {reward: {height: {wieght: 3}}}",
+        "env.reward.height.wieght",
+        "did you mean env.reward.height.weight?",
+    ),
+    "wrong level": (b"num_envs: 3", "unknown key num_envs", "did you mean ppo.num_envs?"),
+    "number as a key": (b"1: 2", "unknown key 1", "known keys here are"),
+    "group missing": (b"ppo: 3", "ppo is 3", "group of keys and values"),
+    "no environments": (b"ppo: {num_envs: 0}", "ppo.num_envs is 0", "equal to 1"),
+    "minibatches": (
+        b"ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 7}",
+        "ppo: num_minibatches 7",
+        "choose a divisor of 64",
+    ),
+    "nan": (b"env: {action_scale: .nan}", "env.action_scale is nan", "finite"),
+    "word": (b"env: {default_joint_angles: [a, 0, 0, 0, 0, 0]}", "'a'", "valid number"),
+    "too few": (b"env: {target_height_range: [0.4]}", "[0.4]", "have 2 items"),
+    "too many": (b"env: {target_height_range: [0.4, 0.5, 0.6]}", "0.6]", "have 2 items"),
+    "no list": (b"env: {target_height_range: 0.4}", "target_height_range is 0.4", "list"),
+    "no layers": (b"ppo: {hidden_layers: []}", "ppo.hidden_layers is []", "at least 1 item"),
+    "unknown engine": (b"env: {physics: warp}", "env.physics is 'warp'", "'fused'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_YAML.values(), ids=BAD_YAML)
+def test_bad_config_file(fails: Fails, tmp_path: Path, case: tuple) -> None:
+    text, *words = case
+    (tmp_path / "my.yaml").write_bytes(text)
+    assert_says(fails(train_command.main, ["--config", "my.yaml"]), ["my.yaml", *words])
+
+
+def test_flag_is_judged_on_top_of_the_config_file(fails: Fails, tmp_path: Path) -> None:
+    (tmp_path / "my.yaml").write_text("ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 4}")
+    sentence = fails(train_command.main, "--config my.yaml --num-envs 9 --rollout-length 5".split())
+    assert_says(sentence, ("num_minibatches 4", "45 samples", "choose a divisor of 45"))
+
+
+MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+BAD_MJCF = {
+    "text": ("hello", "does not compile", "mend it"),
+    "joint": (MJCF.replace('"Joint3"', '"Elbow"'), "no joint named Joint3", "needs the names"),
+    "paddle": (MJCF.replace('"blocker"', '"bat"'), "no geom named blocker", "needs the names"),
+    "ball": (MJCF.replace('"ball_link"', '"ball"'), "no body named ball_link", "needs the names"),
+    "actuator": (
+        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', "", MJCF),
+        "0 actuators on Joint2",
+        "give it exactly one position servo",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_MJCF.values(), ids=BAD_MJCF)
+def test_bad_mjcf(fails: Fails, tmp_path: Path, case: tuple[str, ...]) -> None:
+    text, *words = case
+    assert text != MJCF
+    (tmp_path / "my.xml").write_text(text, encoding="utf-8")
+    assert_says(fails(train_command.main, ["--mjcf", "my.xml"]), ["my.xml", *words])
+
+
+@pytest.mark.parametrize("log_dir", ["file", "file/inside"])
+def test_log_dir_that_cannot_be_made(fails: Fails, tmp_path: Path, log_dir: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    sentence = fails(train_command.main, [*TINY, "--log-dir", log_dir])
+    assert_says(sentence, (f"in {log_dir} ", "choose", "--log-dir"))
+
+
+BAD_EVAL_FLAGS = {
+    "unknown flag": ("--num-envs 3", "--num-envs", "--help"),
+    "near miss": ("--target-hight 0.5", "did you mean --target-height?"),
+    "near miss of a renamed flag": ("--jsn a", "did you mean --json?"),
+    "no episodes": ("--episodes 0", "--episodes is 0", "equal to 1"),
+    "target below the floor": ("--target-height -1", "--target-height is -1.0", "greater than 0"),
+    "target nan": ("--target-height nan", "--target-height is nan", "finite"),
+    "unknown engine": ("--physics warp", "--physics", "{config,fused,mjx,mujoco}", "warp"),
+    "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
+    "json is a folder": ("--json .", "is a folder", "give a file"),
+    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder"),
+    "no runs": ("", "runs/bounce_ball", "train_jax.py"),
+    "no run": (".", "config.yaml", "give a folder that train_jax.py made"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_EVAL_FLAGS.values(), ids=BAD_EVAL_FLAGS)
+def test_bad_eval_flag(fails: Fails, case: tuple[str, ...]) -> None:
+    flags, *words = case
+    assert_says(fails(eval_command.main, flags.split()), words)
+
+
+def test_run_without_checkpoint(fails: Fails, run: Path) -> None:
+    shutil.rmtree(run / "checkpoints")
+    assert_says(fails(eval_command.main, ["run"]), ("run", "no checkpoint", "give another"))
+    assert_says(fails(train_command.main, ["--resume", "run"]), ("run", "no checkpoint", "give"))
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def zero(path: Path) -> None:
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+DAMAGES = {
+    "structure halved": ("_METADATA", halve),
+    "structure deleted": ("_METADATA", Path.unlink),
+    "index halved": ("manifest.ocdbt", halve),
+    "index deleted": ("manifest.ocdbt", Path.unlink),
+    "arrays halved": ("**/d/*", halve),
+    "arrays emptied": ("**/d/*", empty),
+    "arrays zeroed": ("**/d/*", zero),
+    "arrays deleted": ("**/d/*", Path.unlink),
+    "all deleted": ("", shutil.rmtree),
+}
+
+
+def damage(item: Path, pattern: str, how: Callable[[Path], None]) -> None:
+    paths = list(item.glob(pattern)) if pattern else [item]
+    assert paths
+    for path in paths:
+        how(path)
+
+
+@pytest.mark.parametrize("case", DAMAGES.values(), ids=DAMAGES)
+def test_damaged_checkpoint_is_not_evaluated(fails: Fails, run: Path, case: tuple) -> None:
+    damage(run / f"checkpoints/latest/{STEPS}/policy", *case)
+    sentence = fails(eval_command.main, ["run/checkpoints/latest"])
+    assert_says(sentence, (f"run/checkpoints/latest/{STEPS}", "damaged", "give another"))
+
+
+@pytest.mark.parametrize("name", ["arrays halved", "structure deleted"])
+def test_damaged_checkpoint_is_not_resumed(fails: Fails, run: Path, name: str) -> None:
+    damage(run / f"checkpoints/latest/{STEPS}/training", *DAMAGES[name])
+    sentence = fails(train_command.main, ["--resume", "run", "--total-steps", "512"])
+    assert_says(sentence, (f"run/checkpoints/latest/{STEPS}", "damaged", "give another"))
+
+
+@pytest.mark.parametrize("layers", ["[8]", "[16, 16]"])
+def test_checkpoint_of_another_network(fails: Fails, run: Path, layers: str) -> None:
+    config = run / "config.yaml"
+    text = re.sub(r"hidden_layers:\n(  - \d+\n)+", f"hidden_layers: {layers}\n", config.read_text())
+    config.write_text(text)
+    assert load_config(config).ppo.hidden_layers == tuple(json.loads(layers))
+    assert_says(fails(eval_command.main, ["run"]), ("another config", "run/config.yaml", "restore"))
+
+
+def test_damaged_config_of_a_run(fails: Fails, run: Path) -> None:
+    (run / "config.yaml").write_text("ppo: {num_envs: 0}")
+    assert_says(fails(eval_command.main, ["run"]), ("run/config.yaml", "ppo.num_envs is 0"))
+
+
+RESUME_CHANGES = {
+    "ppo.num_envs": "--num-envs 16",
+    "env.reward.height.weight": "--reward.height.weight 1",
+    "seed": "--seed 7",
+    "block_steps": "--block-steps 128",
+}
+
+
+@pytest.mark.parametrize("key", RESUME_CHANGES)
+def test_resume_cannot_change_what_shapes_the_state(fails: Fails, run: Path, key: str) -> None:
+    sentence = fails(train_command.main, ["--resume", "run", *RESUME_CHANGES[key].split()])
+    assert_says(sentence, (f"cannot change {key};", "leave those flags out"))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [TRAIN_SCRIPT, "--num-envs", "0"],
+        [TRAIN_SCRIPT, "--config", "my.yaml"],
+        ["-m", "bounce_mjx.eval", "--episode", "3"],
+    ],
+    ids=["train", "config", "eval"],
+)
+def test_whole_process_exits_without_a_traceback(tmp_path: Path, command: list) -> None:
+    (tmp_path / "my.yaml").write_text("ppo: {num_env: 8}")
+    done = subprocess.run(
+        [sys.executable, *map(str, command)], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert re.fullmatch(r"error: .+\n", done.stderr), done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["my.yaml"]
+
+
+def test_whole_process_exits_without_a_traceback_on_a_damaged_checkpoint(run: Path) -> None:
+    damage(run / f"checkpoints/latest/{STEPS}/policy", *DAMAGES["arrays halved"])
+    done = subprocess.run(
+        [sys.executable, "-m", "bounce_mjx.eval", "run/checkpoints/latest"],
+        cwd=run.parent,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert re.fullmatch(r"error: .+\n", done.stderr), done.stderr
+
+
+@pytest.mark.parametrize("main", [train_command.main, eval_command.main], ids=["train", "eval"])
+def test_help(main: Callable[[list[str]], None], capsys) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--help"])
+    assert exit_info.value.code == 0
+    flag = "--num-envs" if main is train_command.main else "--target-height"
+    assert flag in capsys.readouterr().out
+
+
+def test_presets_are_valid() -> None:
+    presets = {p.stem: load_config(p) for p in resource_path("configs").glob("*.yaml")}
+    assert {"default", "cpu", "seed"} <= presets.keys()
+    seed = presets["seed"]
+    assert seed.total_steps == 50_000_000
+    assert (seed.ppo.num_envs, seed.ppo.rollout_length) == (1024, 128)
+    assert (seed.ppo.num_epochs, seed.ppo.num_minibatches) == (15, 16)
+    assert seed.ppo.learning_rate == 2e-4
+    assert seed.ppo.hidden_layers == (512, 512, 512)
+
+
+def test_run_keeps_the_resolved_config(trained: Path) -> None:
+    kept = load_config(trained / "config.yaml")
+    command = train_command.read_command([*TINY, "--total-steps", str(STEPS)])
+    for key in TrainConfig.model_fields.keys() - {"log_dir"}:
+        assert getattr(kept, key) == getattr(command, key), key
+    assert kept.log_dir == trained.parent
+
+
+def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
+    assert [p.name for p in (trained / "checkpoints/latest").iterdir()] == [str(STEPS)]
+    results = json.loads((trained / "results.json").read_text())
+    assert results["trained_steps"] == STEPS
+    assert results["solved_steps"] is None and results["passed"] is False
+    best = [p.name for p in (trained / "checkpoints/best").iterdir()]
+    assert best == [str(results["best_steps"])]
+    assert tuple(result["name"] for result in results["results"]) == RESULT_NAMES
+
+
+def test_run_logs_to_tensorboard(trained: Path) -> None:
+    log = EventAccumulator(str(trained)).Reload()
+    expected = {
+        "episode/return",
+        "episode/length",
+        "loss/policy",
+        "loss/value",
+        "policy/kl",
+        "policy/learning_rate",
+        "policy/action_std",
+        "speed/steps_per_second",
+        *(f"reward/{name}" for name in TERM_NAMES),
+        *(f"results/{name.replace(' ', '_')}" for name in RESULT_NAMES),
+    }
+    assert expected <= set(log.Tags()["scalars"])
+    assert [event.step for event in log.Scalars("loss/value")] == [64, 128, 192, 256]
+    assert [event.step for event in log.Scalars("results/stable")] == [128, 256]
+    for name in expected:
+        assert np.isfinite([event.value for event in log.Scalars(name)]).all(), name
+
+
+def evaluate(args: list[str], json_file: Path) -> dict:
+    """Runs the command on a policy that fails; the content of its JSON file."""
+    with pytest.raises(SystemExit) as exit_info:
+        eval_command.main([*map(str, args), "--episodes", "4", "--json", str(json_file)])
+    assert exit_info.value.code == 1
+    return json.loads(json_file.read_text())
+
+
+def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> None:
+    report = evaluate([trained], tmp_path / "a.json")
+    assert tuple(result["name"] for result in report["results"]) == RESULT_NAMES
+    assert not report["passed"]
+    assert False in [result["passed"] for result in report["results"]]
+    shown = " ".join(capsys.readouterr().out.split())
+    for result in report["results"]:
+        assert isinstance(result["value"], float)
+        assert f"{result['value']:.2f} │ {result['bound']}" in shown
+    assert "FAIL" in shown
+
+
+def test_eval_finds_the_checkpoint(trained: Path, tmp_path: Path, monkeypatch) -> None:
+    best = json.loads((trained / "results.json").read_text())["best_steps"]
+    monkeypatch.chdir(trained.parent.parent.parent)
+    latest = f"checkpoints/latest/{STEPS}"
+    for given, found in (
+        ([], f"checkpoints/best/{best}"),
+        ([trained.relative_to(Path.cwd())], f"checkpoints/best/{best}"),
+        ([trained / "checkpoints/latest"], latest),
+        ([trained / latest], latest),
+    ):
+        report = evaluate(given, tmp_path / "a.json")
+        assert Path(report["checkpoint"]) == trained / found
+
+
+def test_eval_repeats_itself_for_a_seed(trained: Path, tmp_path: Path) -> None:
+    first, again = (evaluate([trained, "--seed", "5"], tmp_path / "a.json") for _ in range(2))
+    assert first == again
+    other = evaluate([trained, "--seed", "6"], tmp_path / "a.json")
+    assert other["details"]["mean_return"] != first["details"]["mean_return"]
+
+
+def test_eval_takes_a_fixed_target(trained: Path, tmp_path: Path) -> None:
+    report = evaluate([trained, "--target-height", "0.8"], tmp_path / "a.json")
+    assert report["target_height"] == 0.8
+    speed = report["results"][RESULT_NAMES.index("upward speed")]
+    assert speed["passed"] is None
+
+
+def test_eval_on_mujoco_agrees(trained: Path, tmp_path: Path) -> None:
+    fused = evaluate([trained], tmp_path / "a.json")
+    mujoco = evaluate([trained, "--physics", "mujoco"], tmp_path / "a.json")
+    assert (fused["physics"], mujoco["physics"]) == ("fused", "mujoco")
+    for name in ("mean_return", "mean_length_s"):
+        assert mujoco["details"][name] == pytest.approx(fused["details"][name], rel=0.02)
+
+
+def test_policy_is_read_as_orbax_reads_it(trained: Path) -> None:
+    checkpoint = find_checkpoint(trained / "checkpoints/latest", trained)
+    ours = load_policy(checkpoint, load_run_config(trained))
+    with ocp.StandardCheckpointer() as checkpointer:
+        theirs = checkpointer.restore(checkpoint.folder.absolute() / "policy")
+    assert isinstance(ours, Policy)
+    jax.tree.map(
+        np.testing.assert_array_equal, ours.params, jax.tree.map(np.asarray, theirs["params"])
+    )
+    np.testing.assert_array_equal(ours.normalizer.mean, theirs["normalizer"]["mean"])
+
+
+def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
+    for folder in (
+        "2026-01-01/checkpoints/latest/64",
+        "2026-01-02/checkpoints/best/128",
+        "2026-01-03/checkpoints/latest/64.orbax-checkpoint-tmp",
+        "2026-01-04/checkpoints/latest",
+    ):
+        (tmp_path / folder).mkdir(parents=True)
+    assert newest_run(tmp_path) == tmp_path / "2026-01-02"
+    with pytest.raises(UserError, match="no run with a checkpoint"):
+        newest_run(tmp_path / "2026-01-04")
+
+
+def test_resumed_run_equals_an_uninterrupted_one(trained: Path, tmp_path: Path) -> None:
+    log_dir = tmp_path / "runs"
+    train_command.main([*TINY, "--total-steps", str(STEPS // 2), "--log-dir", str(log_dir)])
+    (run,) = log_dir.iterdir()
+    train_command.main(["--resume", str(run), "--total-steps", str(STEPS)])
+    assert list(log_dir.iterdir()) == [run]
+
+    log = EventAccumulator(str(run)).Reload()
+    assert [event.step for event in log.Scalars("loss/value")] == [64, 128, 192, 256]
+    with ocp.StandardCheckpointer() as checkpointer:
+        resumed, straight = (
+            checkpointer.restore((folder / f"checkpoints/latest/{STEPS}/training").absolute())
+            for folder in (run, trained)
+        )
+    jax.tree.map(np.testing.assert_array_equal, resumed, straight)

@@ -1,0 +1,731 @@
+"""`BounceBall`: observation, resets, actions, bounces, ends, faults, and brax's own tools on it."""
+
+import functools
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.envs.wrappers import training
+from brax.training.agents.ppo import networks as brax_networks
+from brax.training.agents.ppo import train as brax_ppo
+
+from bounce_mjx import BounceBall, EnvConfig, brax_interop
+from bounce_mjx.env import TaskState, update_task
+from bounce_mjx.resources import resource_path
+from reward_reference import REFERENCE_WEIGHTS, reference_terms
+
+JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
+TARGET_XY = np.array([0.58856, 0.0])
+DEFAULT_ANGLES = np.radians([0, 40, 110, 0, -60, 0])
+FLOAT32_EPS = 1.2e-7
+
+
+@pytest.fixture(scope="module")
+def env():
+    return BounceBall()
+
+
+@pytest.fixture(scope="module")
+def reset(env):
+    return jax.jit(env.reset)
+
+
+@pytest.fixture(scope="module")
+def step(env):
+    return jax.jit(env.step)
+
+
+@pytest.fixture(scope="module")
+def finish(env):
+    return jax.jit(env.finish_step)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The MJCF as MuJoCo reads it, without the package in between."""
+    return mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+
+
+def mj_data(model, physics) -> mujoco.MjData:
+    """MuJoCo's own view of one physics state."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = physics.qpos, physics.qvel
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def with_task(state, **changes):
+    """`state` with other task fields."""
+    pipeline = state.pipeline_state
+    changes = {
+        name: jnp.asarray(value, getattr(pipeline.task, name).dtype)
+        for name, value in changes.items()
+    }
+    return state.replace(pipeline_state=pipeline._replace(task=pipeline.task._replace(**changes)))
+
+
+def with_ball(physics, position=None, velocity=None, spin=None):
+    """`physics` with another ball; the free joint comes after the six hinges."""
+    qpos, qvel = physics.qpos, physics.qvel
+    if position is not None:
+        qpos = qpos.at[6:9].set(jnp.array(position))
+    if velocity is not None:
+        qvel = qvel.at[6:9].set(jnp.array(velocity))
+    if spin is not None:
+        qvel = qvel.at[9:12].set(jnp.array(spin))
+    return physics._replace(qpos=qpos, qvel=qvel)
+
+
+def with_physics(state, physics):
+    return state.replace(pipeline_state=state.pipeline_state._replace(physics=physics))
+
+
+def all_finite(tree) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree))
+
+
+def assert_identical(first, second):
+    """Bit for bit."""
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+# Attributes and observation
+
+
+def test_attributes(env):
+    assert env.observation_size == 29
+    assert env.action_size == 6
+    assert env.dt == 0.01
+    assert env.config == EnvConfig()
+    assert env.backend == "fused"
+    assert isinstance(env.mj_model, mujoco.MjModel)
+    assert env.mj_model.opt.timestep == 0.001
+
+
+def test_config_reaches_the_model():
+    env = BounceBall(EnvConfig(physics_dt=0.002, control_dt=0.02))
+    assert env.dt == 0.02
+    assert env.mj_model.opt.timestep == 0.002
+
+
+@pytest.fixture(scope="module")
+def walked(reset, step):
+    """A state in motion, with a spinning ball so that no entry of the observation is trivial."""
+    state = reset(jax.random.key(3))
+    physics = with_ball(state.pipeline_state.physics, velocity=(0.3, -0.2, 1.0), spin=(4, -7, 5))
+    state = with_physics(state, physics)
+    for action in np.random.default_rng(0).uniform(-1, 1, (4, 6)):
+        state = step(state, jnp.array(action, jnp.float32))
+    return state
+
+
+@pytest.mark.parametrize(
+    ("entries", "read"),
+    [
+        pytest.param(
+            slice(0, 6), lambda d: [d.joint(j).qpos[0] for j in JOINTS], id="joint angles"
+        ),
+        pytest.param(slice(6, 9), lambda d: d.body("ball_link").xpos, id="ball position"),
+        pytest.param(slice(9, 13), lambda d: d.body("ball_link").xquat, id="ball quaternion"),
+        pytest.param(slice(13, 19), lambda d: [d.joint(j).qvel[0] for j in JOINTS], id="joint vel"),
+        pytest.param(slice(19, 22), lambda d: d.joint("ball_link").qvel[:3], id="ball velocity"),
+        pytest.param(slice(22, 25), lambda d: d.joint("ball_link").qvel[3:], id="ball spin"),
+        pytest.param(slice(25, 28), lambda d: d.geom("blocker").xpos, id="paddle"),
+    ],
+)
+def test_observation_entries(entries, read, walked, model):
+    expected = np.array(read(mj_data(model, walked.pipeline_state.physics)))
+    assert np.all(np.abs(expected) > 1e-4), "too small to tell from zero"
+    np.testing.assert_allclose(walked.obs[entries], expected, rtol=0, atol=1e-6)
+
+
+def test_observation_ends_with_the_target_height(walked):
+    assert walked.obs.shape == (29,)
+    assert walked.obs.dtype == jnp.float32
+    assert walked.obs[28] == walked.pipeline_state.task.target_height
+
+
+# Reset
+
+N_RESETS = 2000
+
+
+@pytest.fixture(scope="module")
+def resets(env):
+    """A batch of resets, each from its own key."""
+    keys = jax.random.split(jax.random.key(7), N_RESETS)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(env.reset))(keys))
+
+
+def reset_noise(resets) -> dict[str, np.ndarray]:
+    """Every random entry of the resets, scaled so that it should be uniform in [-1, 1]."""
+    obs = resets.obs.astype(np.float64)
+    return {
+        "joint angles": (obs[:, 0:6] - DEFAULT_ANGLES) / 0.1,
+        "joint velocities": obs[:, 13:19] / 0.01,
+        "ball position": (obs[:, 6:9] - [0.58856, 0.0, 0.45]) / 0.01,
+        "target height": (obs[:, 28:] - 0.5) / 0.1,
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["joint angles", "joint velocities", "ball position", "target height"]
+)
+def test_reset_noise_is_uniform(name, resets):
+    noise = reset_noise(resets)[name]
+    # Rounding of a coordinate of order 1 to float32, in units of the smallest half-width, 0.01.
+    assert np.abs(noise).max() <= 1.0 + 3 * FLOAT32_EPS / 0.01
+    # Five standard errors of each estimate for a uniform variable.
+    assert np.abs(noise.mean(axis=0)).max() < 5 / np.sqrt(3 * N_RESETS)
+    spread_error = np.abs(noise.std(axis=0) * np.sqrt(3) - 1)
+    assert spread_error.max() < 5 * np.sqrt(0.2 / N_RESETS)
+    quartiles = np.mean(np.abs(noise) < 0.5, axis=0)
+    assert np.abs(quartiles - 0.5).max() < 5 * 0.5 / np.sqrt(N_RESETS)
+
+
+def test_reset_noise_is_independent(resets):
+    noise = np.concatenate(list(reset_noise(resets).values()), axis=1)
+    correlation = np.corrcoef(noise.T) - np.eye(16)
+    assert np.abs(correlation).max() < 5 / np.sqrt(N_RESETS)
+
+
+def test_reset_has_a_resting_ball_and_no_history(resets):
+    task = resets.pipeline_state.task
+    np.testing.assert_array_equal(resets.obs[:, 9:13], np.tile([1, 0, 0, 0], (N_RESETS, 1)))
+    np.testing.assert_array_equal(resets.obs[:, 19:25], 0)
+    np.testing.assert_array_equal(task.n_bounces, 0)
+    np.testing.assert_array_equal(task.last_action, 0)
+    np.testing.assert_array_equal(task.rising, False)
+    np.testing.assert_array_equal(task.apex, resets.obs[:, 8])
+    np.testing.assert_array_equal(resets.done, 0)
+    np.testing.assert_array_equal(resets.reward, 0)
+    assert all(np.all(value == 0) for value in resets.metrics.values())
+
+
+def test_reset_is_a_function_of_its_key(reset):
+    first, again, other = (reset(jax.random.key(seed)) for seed in (1, 1, 2))
+    assert_identical(first, again)
+    drawn = np.r_[0:9, 13:19, 28]
+    assert np.all(np.asarray(first.obs != other.obs)[drawn])
+
+
+def test_noise_free_reset_has_the_paddle_at_home():
+    config = EnvConfig(
+        joint_angle_noise=0, joint_velocity_noise=0, ball_position_noise=0,
+        target_height_range=(0.8, 0.8),
+    )  # fmt: skip
+    obs = jax.jit(BounceBall(config).reset)(jax.random.key(0)).obs
+    np.testing.assert_allclose(obs[0:6], DEFAULT_ANGLES, atol=1e-7)
+    np.testing.assert_allclose(obs[6:9], [0.58856, 0, 0.45], atol=1e-7)
+    np.testing.assert_allclose(obs[25:28], [0.59356, 0, 0.04980], atol=1e-5)
+    assert obs[28] == np.float32(0.8)
+
+
+# Actions
+
+
+def test_servo_target_is_measured_angle_plus_scaled_action(env, reset):
+    physics = reset(jax.random.key(0)).pipeline_state.physics
+    action = np.array([1, -1, 0.5, -0.25, 0, 0.75], np.float32)
+    targets = env.servo_targets(physics, jnp.array(action))
+    np.testing.assert_allclose(targets, physics.qpos[:6] + 0.02 * action, rtol=0, atol=1e-6)
+
+
+def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
+    physics = reset(jax.random.key(0)).pipeline_state.physics
+    ranges = np.array([model.joint(name).range for name in JOINTS])
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        at_limit = physics._replace(
+            qpos=physics.qpos.at[:6].set(jnp.array(ranges[:, side] - sign * 0.005))
+        )
+        outwards = env.servo_targets(at_limit, jnp.full(6, sign))
+        np.testing.assert_allclose(outwards, ranges[:, side], rtol=1e-6)
+        inwards = env.servo_targets(at_limit, jnp.full(6, -sign))
+        np.testing.assert_allclose(inwards, ranges[:, side] - sign * 0.025, rtol=0, atol=2e-6)
+
+
+def test_action_is_clipped_to_one(reset, step):
+    state = reset(jax.random.key(0))
+    signs = jnp.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    at_limit = step(state, signs)
+    assert_identical(step(state, 5.0 * signs), at_limit)
+    assert_identical(step(state, jnp.inf * signs), at_limit)
+    assert not np.allclose(step(state, 0.5 * signs).obs[:6], at_limit.obs[:6], atol=1e-4)
+    np.testing.assert_array_equal(at_limit.pipeline_state.task.last_action, signs)
+
+
+def c_step(model, physics, action) -> mujoco.MjData:
+    """One control step by MuJoCo's C engine: the action as SPEC.md words it, then 10 substeps."""
+    data = mj_data(model, physics)
+    for name, entry in zip(JOINTS, np.clip(action, -1, 1), strict=True):
+        target = np.clip(data.joint(name).qpos[0] + 0.02 * entry, *model.joint(name).range)
+        (actuator,) = np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(name).id)
+        data.ctrl[actuator] = target
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+    return data
+
+
+def test_step_equals_ten_substeps_of_mujoco(env, reset, step, model):
+    rng = np.random.default_rng(1)
+    touched = 0
+    for seed in range(12):
+        state = reset(jax.random.key(seed))
+        physics = state.pipeline_state.physics
+        # Every second ball is about to hit the paddle.
+        if seed % 2:
+            position = np.asarray(state.obs[25:28]) + [0, 0, 0.035]
+            physics = with_ball(physics, position, (0.1, 0, -2), (1, 2, 3))
+        action = rng.uniform(-2, 2, 6).astype(np.float32)
+        after = step(with_physics(state, physics), jnp.array(action)).pipeline_state.physics
+        data = c_step(model, physics, action)
+        touched += data.qvel[8] > -2
+        np.testing.assert_allclose(after.qpos, data.qpos, rtol=0, atol=5e-6)
+        np.testing.assert_allclose(after.qvel, data.qvel, rtol=0, atol=2e-3)
+    assert touched >= 6
+
+
+# Reward and metrics
+
+
+@pytest.fixture(scope="module")
+def episodes(reset, step):
+    """Pairs (state before, action, state after) of a few random episodes up to their ends."""
+    rng = np.random.default_rng(5)
+    transitions = []
+    for seed in range(6):
+        state = reset(jax.random.key(100 + seed))
+        for _ in range(80):
+            action = rng.uniform(-1.5, 1.5, 6).astype(np.float32)
+            before, state = state, step(state, jnp.array(action))
+            transitions.append(jax.device_get((before, action, state)))
+            if state.done:
+                break
+    return transitions
+
+
+def test_reward_is_the_sum_of_the_fifteen_metrics(episodes):
+    names = {f"reward/{name}" for name in REFERENCE_WEIGHTS}
+    for _, _, after in episodes:
+        terms = {name: v for name, v in after.metrics.items() if name.startswith("reward/")}
+        assert set(terms) == names
+        np.testing.assert_allclose(after.reward, sum(terms.values()), rtol=1e-5, atol=1e-5)
+
+
+def test_reset_and_step_report_the_same_metrics(episodes, reset):
+    task_metrics = {"bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"}
+    names = {f"reward/{name}" for name in REFERENCE_WEIGHTS} | task_metrics
+    assert set(reset(jax.random.key(0)).metrics) == names
+    assert set(episodes[0][2].metrics) == names
+
+
+def test_reward_terms_follow_the_state(episodes, model):
+    """The terms by the seed's transcription, fed by MuJoCo's C engine and the given actions."""
+    rows = []
+    for before, action, after in episodes:
+        data = mj_data(model, after.pipeline_state.physics)
+        rows.append(
+            {
+                "ball_position": data.body("ball_link").xpos.copy(),
+                "ball_velocity": data.joint("ball_link").qvel[:3].copy(),
+                "paddle_position": data.geom("blocker").xpos.copy(),
+                "target_height": before.pipeline_state.task.target_height,
+                "n_bounces": after.metrics["n_bounces"],
+                "bounced": after.metrics["bounced"] > 0,
+                "action": np.clip(action, -1, 1),
+                "last_action": before.pipeline_state.task.last_action,
+                "joint_velocity": [data.joint(name).qvel[0] for name in JOINTS],
+            }
+        )
+    assert any(row["bounced"] for row in rows)
+    inputs = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    for name, expected in reference_terms(**inputs).items():
+        actual = np.array([after.metrics[f"reward/{name}"] for _, _, after in episodes])
+        np.testing.assert_allclose(
+            actual, REFERENCE_WEIGHTS[name] * expected, rtol=1e-3, atol=1e-4, err_msg=name
+        )
+
+
+def test_state_remembers_the_clipped_action(episodes):
+    for _, action, after in episodes:
+        np.testing.assert_array_equal(after.pipeline_state.task.last_action, np.clip(action, -1, 1))
+
+
+def test_ball_xy_error_is_the_distance_from_the_target_point(episodes):
+    for _, _, after in episodes:
+        expected = np.hypot(*(after.obs[6:8] - TARGET_XY))
+        np.testing.assert_allclose(after.metrics["ball_xy_error"], expected, rtol=1e-5, atol=1e-7)
+
+
+# Bounces
+
+PADDLE_Z = 0.05
+
+
+def drive(steps, start_height=0.45, target=0.5, config=None):
+    """Feeds ball heights and vertical velocities, one pair a step, to `update_task`.
+
+    Returns:
+      bounced and n_bounces after each step, and the last task state.
+    """
+    update = jax.jit(functools.partial(update_task, config or EnvConfig()))
+    task = TaskState(
+        target_height=jnp.float32(target),
+        last_action=jnp.zeros(6),
+        rising=jnp.asarray(False),
+        n_bounces=jnp.float32(0),
+        apex=jnp.float32(start_height),
+    )
+    bounced, counts = [], []
+    for z, vz in steps:
+        task, is_bounce = update(
+            task,
+            jnp.array([0.5, 0.0, z]),
+            jnp.array([0.0, 0.0, vz]),
+            jnp.array([0.55, 0.0, PADDLE_Z]),
+            jnp.ones(6),
+        )
+        bounced.append(bool(is_bounce))
+        counts.append(float(task.n_bounces))
+    return bounced, counts, task
+
+
+def flights(*apexes):
+    """Steps that reach each apex and then bounce."""
+    return [pair for apex in apexes for pair in ((apex, 0.0), (0.1, -2.0), (0.1, 2.0))]
+
+
+def counts_at_bounces(*apexes, **settings):
+    bounced, counts, _ = drive(flights(*apexes), **settings)
+    assert bounced == [False, False, True] * len(apexes)
+    return counts[2::3]
+
+
+@pytest.mark.parametrize(
+    ("apexes", "expected"),
+    [
+        pytest.param([0.45], [1], id="first"),
+        pytest.param([0.5, 0.5, 0.5, 0.5], [1, 2, 3, 4], id="every good bounce adds one"),
+        pytest.param([0.5, 0.5, 0.5, 0.39, 0.5], [1, 2, 3, 1, 2], id="too low restarts at 1"),
+        pytest.param([0.5, 0.399], [1, 1], id="just below the tolerance"),
+        pytest.param([0.5, 0.401], [1, 2], id="just within the tolerance"),
+        pytest.param([0.5, 1.3], [1, 2], id="far above the target"),
+        pytest.param([0.5, 0.15, 0.15, 0.15], [1, 1, 1, 1], id="dribbling"),
+    ],
+)
+def test_bounce_count(apexes, expected):
+    assert counts_at_bounces(*apexes) == expected
+
+
+def test_first_bounce_counts_from_any_height():
+    assert counts_at_bounces(0.15, start_height=0.15) == [1]
+
+
+def test_bounce_count_follows_the_configured_tolerance():
+    config = EnvConfig(apex_tolerance=0.2)
+    assert counts_at_bounces(0.5, 0.31, 0.29, config=config) == [1, 2, 1]
+
+
+def test_bounce_count_follows_the_target_height():
+    assert counts_at_bounces(0.5, 0.5, target=0.8) == [1, 1]
+
+
+def test_apex_is_the_highest_point_since_the_bounce():
+    falling = [(0.52, -0.5), (0.4, -1.5), (0.1, -2.0)]
+    _, _, task = drive(flights(0.5) + falling)
+    assert task.apex == np.float32(0.52)
+    bounced, counts, task = drive(flights(0.5) + falling + [(0.12, 1.0)])
+    assert bounced[-1] and counts[-1] == 2
+    assert task.apex == np.float32(0.12)
+
+
+def test_count_stays_between_bounces():
+    _, counts, _ = drive(flights(0.5) + [(0.3, 1.5), (0.5, 0.0), (0.3, -1.5), (0.1, -2.0)])
+    assert counts[2:] == [1] * 5
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(("distance", "expected"), [(0.119, True), (0.121, False)])
+def test_bounce_is_near_the_paddle(side, distance, expected):
+    z = PADDLE_Z + side * distance
+    bounced, counts, _ = drive([(z, -2.0), (z, 2.0)])
+    assert bounced == [False, expected]
+    assert counts[-1] == expected
+
+
+def test_rising_ball_does_not_bounce_again():
+    assert drive([(0.1, -1.0), (0.1, 1.0), (0.12, 2.0)])[0] == [False, True, False]
+
+
+def test_ball_that_began_to_rise_far_away_does_not_bounce_near_the_paddle():
+    assert drive([(0.4, -1.0), (0.4, 1.0), (0.1, 1.0)])[0] == [False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("velocities", "expected"),
+    [
+        ([-1.0, 0.009], [False, False]),
+        ([-1.0, 0.011], [False, True]),
+        ([-1.0, 0.009, 0.011], [False, False, True]),
+        ([-1.0, 0.011, 0.009, 0.011], [False, True, False, True]),
+    ],
+)
+def test_rising_starts_at_one_centimetre_per_second(velocities, expected):
+    assert drive([(0.1, v) for v in velocities])[0] == expected
+
+
+def test_update_task_keeps_the_target_and_the_action():
+    task = drive([(0.45, 0.0)], target=0.55)[2]
+    assert task.target_height == np.float32(0.55)
+    np.testing.assert_array_equal(task.last_action, np.ones(6))
+
+
+@pytest.mark.parametrize(("apex", "error"), [(0.47, 0.03), (0.58, 0.08)])
+def test_step_reports_the_bounce(apex, error, reset, finish):
+    state = with_task(
+        reset(jax.random.key(0)), target_height=0.5, n_bounces=4, rising=False, apex=apex
+    )
+    above_paddle = np.asarray(state.obs[25:28]) + [0, 0, 0.05]
+    physics = state.pipeline_state.physics
+    rising = finish(state, jnp.zeros(6), with_ball(physics, above_paddle, (0, 0, 2.0)))
+    assert rising.metrics["bounced"] == 1
+    assert rising.metrics["n_bounces"] == 5
+    np.testing.assert_allclose(rising.metrics["apex_error"], error, atol=1e-6)
+    falling = finish(state, jnp.zeros(6), with_ball(physics, above_paddle, (0, 0, -2.0)))
+    assert falling.metrics["bounced"] == 0
+    assert falling.metrics["n_bounces"] == 4
+    assert falling.metrics["apex_error"] == 0
+
+
+# Ends
+
+
+@pytest.mark.parametrize(
+    ("axis", "inside", "outside"),
+    [
+        pytest.param(2, 0.0501, 0.0499, id="fell"),
+        pytest.param(2, 1.499, 1.501, id="too high above the target 0.5"),
+        pytest.param(0, 1.499, 1.501, id="+x"),
+        pytest.param(0, -1.499, -1.501, id="-x"),
+        pytest.param(1, 1.499, 1.501, id="+y"),
+        pytest.param(1, -1.499, -1.501, id="-y"),
+    ],
+)
+def test_ball_ends_the_episode_beyond_its_bound(axis, inside, outside, reset, finish):
+    state = with_task(reset(jax.random.key(0)), target_height=0.5)
+    for coordinate, done in ((inside, 0), (outside, 1)):
+        position = np.array([0.5, 0.0, 0.5])
+        position[axis] = coordinate
+        physics = with_ball(state.pipeline_state.physics, position)
+        assert finish(state, jnp.zeros(6), physics).done == done
+
+
+def test_height_bound_follows_the_target(reset, finish):
+    state = reset(jax.random.key(0))
+    physics = with_ball(state.pipeline_state.physics, (0.5, 0.0, 1.55))
+    for target, done in ((0.5, 1), (0.6, 0)):
+        assert finish(with_task(state, target_height=target), jnp.zeros(6), physics).done == done
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_fast_joint_ends_the_episode(joint, sign, reset, finish):
+    state = reset(jax.random.key(0))
+    physics = state.pipeline_state.physics
+    for factor, done in ((0.999, 0), (1.001, 1)):
+        speed = sign * factor * 2 * np.pi
+        moving = physics._replace(qvel=physics.qvel.at[joint].set(speed))
+        assert finish(state, jnp.zeros(6), moving).done == done
+
+
+def test_a_fast_or_spinning_ball_ends_nothing(reset, finish):
+    state = reset(jax.random.key(0))
+    physics = with_ball(state.pipeline_state.physics, velocity=(7, 7, 7), spin=(50, 50, 50))
+    assert finish(state, jnp.zeros(6), physics).done == 0
+
+
+# Faults
+
+
+@pytest.fixture(scope="module")
+def finish_each(env):
+    """`finish_step` of one state for a batch of physics states."""
+    return jax.jit(jax.vmap(env.finish_step, in_axes=(None, None, 0)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_physics_ends_the_episode_and_goes_no_further(value, walked, finish_each):
+    before = walked.pipeline_state
+    qpos, qvel = np.tile(before.physics.qpos, (25, 1)), np.tile(before.physics.qvel, (25, 1))
+    qpos[np.arange(13), np.arange(13)] = value
+    qvel[13 + np.arange(12), np.arange(12)] = value
+    physics = before.physics._replace(qpos=jnp.array(qpos), qvel=jnp.array(qvel))
+    after = finish_each(walked, jnp.ones(6), physics)
+    np.testing.assert_array_equal(after.done, 1)
+    np.testing.assert_array_equal(after.metrics["non_finite"], 1)
+    assert all_finite(after)
+    np.testing.assert_array_equal(after.obs, np.tile(walked.obs, (25, 1)))
+
+
+@pytest.mark.xfail(strict=True, reason="a reward of -inf leaves the environment uncounted")
+@pytest.mark.parametrize("speed", [1e20, 1e38])
+def test_diverged_physics_goes_no_further_either(speed, walked, finish):
+    """Finite coordinates whose squares overflow, beyond MuJoCo's own limit of 1e10 (mjMAXVAL)."""
+    physics = walked.pipeline_state.physics
+    after = finish(walked, jnp.ones(6), physics._replace(qvel=physics.qvel.at[0].set(speed)))
+    assert after.done == 1
+    assert after.metrics["non_finite"] == 1
+    assert all_finite(after)
+
+
+def test_finite_steps_are_not_counted_as_faults(episodes):
+    assert all(after.metrics["non_finite"] == 0 for _, _, after in episodes)
+
+
+@pytest.mark.parametrize("broken", [range(6), [2]], ids=["all entries", "one entry"])
+def test_nan_action_ends_the_episode_and_goes_no_further(broken, walked, step):
+    action = jnp.zeros(6).at[jnp.array(list(broken))].set(jnp.nan)
+    after = step(walked, action)
+    assert after.done == 1
+    assert after.metrics["non_finite"] == 1
+    assert all_finite(after)
+
+
+def test_fault_leaves_the_rest_of_the_batch_alone(env):
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(4), 5))
+    actions = jax.random.uniform(jax.random.key(5), (5, 6))
+    finish_many = jax.jit(jax.vmap(env.finish_step))
+    healthy = states.pipeline_state.physics
+    broken = healthy._replace(qpos=healthy.qpos.at[2, 8].set(jnp.nan))
+    expected, actual = (finish_many(states, actions, p) for p in (healthy, broken))
+    others = np.array([0, 1, 3, 4])
+    assert_identical(*(jax.tree.map(lambda x: x[others], s) for s in (expected, actual)))
+    np.testing.assert_array_equal(actual.done, [0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(actual.metrics["non_finite"], [0, 0, 1, 0, 0])
+
+
+# brax
+
+
+@pytest.fixture(scope="module")
+def brax_episode(env):
+    """Four environments in brax's own training wrappers, over two time-outs of 3 steps."""
+    wrapped = training.wrap(env, episode_length=3)
+    # brax reads the batch off the shape of keys of the old kind.
+    states = [jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(8), 4))]
+    wrapped_step = jax.jit(wrapped.step)
+    actions = jax.random.uniform(jax.random.key(9), (6, 4, 6), minval=-1.0)
+    for action in actions:
+        states.append(wrapped_step(states[-1], action))
+    return states, actions
+
+
+def test_brax_episode_wrapper_truncates(brax_episode):
+    states, _ = brax_episode
+    for i, state in enumerate(states[1:], start=1):
+        timed_out = float(i % 3 == 0)
+        np.testing.assert_array_equal(state.done, timed_out)
+        np.testing.assert_array_equal(state.info["truncation"], timed_out)
+
+
+def test_brax_vmap_wrapper_equals_single_steps(brax_episode, step):
+    states, actions = brax_episode
+    for i in range(4):
+        single = jax.tree.map(lambda x, i=i: x[i], states[0]).replace(info={})
+        for t in range(2):
+            single = step(single, actions[t, i])
+            np.testing.assert_allclose(states[t + 1].obs[i], single.obs, rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(states[t + 1].reward[i], single.reward, rtol=1e-4)
+
+
+def test_brax_ppo_trains(env):
+    params_at = {}
+    with brax_interop.device_put_replicated():
+        make_policy, trained, metrics = brax_ppo.train(
+            env,
+            num_timesteps=2000,
+            num_envs=8,
+            episode_length=50,
+            unroll_length=5,
+            batch_size=8,
+            num_minibatches=2,
+            num_updates_per_batch=2,
+            normalize_observations=True,
+            run_evals=False,
+            max_devices_per_host=1,
+            network_factory=functools.partial(
+                brax_networks.make_ppo_networks,
+                policy_hidden_layer_sizes=(8,),
+                value_hidden_layer_sizes=(8,),
+            ),
+            policy_params_fn=lambda step, _, params: params_at.update({step: params}),
+        )
+    assert all_finite(trained) and all_finite(metrics)
+    _, *fresh_networks = params_at[0]
+    normalizer, *networks = trained
+    assert normalizer.mean.shape == (29,)
+    for before, after in zip(
+        jax.tree.leaves(fresh_networks), jax.tree.leaves(networks), strict=True
+    ):
+        assert before.shape == after.shape
+        assert np.any(np.asarray(before) != np.asarray(after))
+    action, _ = make_policy(trained, deterministic=True)(jnp.zeros(29), jax.random.key(0))
+    assert action.shape == (6,) and all_finite(action)
+
+
+def test_device_put_replicated_is_there_only_within(monkeypatch):
+    # Where jax still had the function it would be left alone: the next test.
+    monkeypatch.delattr(jax, "device_put_replicated", raising=False)
+    with pytest.raises(KeyError), brax_interop.device_put_replicated():
+        assert jax.device_put_replicated is brax_interop.replicate
+        raise KeyError
+    assert not hasattr(jax, "device_put_replicated")
+
+
+def test_device_put_replicated_of_jax_is_left_alone(monkeypatch):
+    own = object()
+    monkeypatch.setattr(jax, "device_put_replicated", own, raising=False)
+    with brax_interop.device_put_replicated():
+        assert jax.device_put_replicated is own
+    assert jax.device_put_replicated is own
+
+
+def test_replicate_copies_arrays_numbers_and_keys():
+    tree = {"a": np.arange(3, dtype=np.int8), "b": 2.5, "key": jax.random.key(3)}
+    copies = brax_interop.replicate(tree, jax.local_devices()[:1])
+    assert copies["a"].dtype == jnp.int8
+    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
+    np.testing.assert_array_equal(copies["b"], [2.5])
+    assert jnp.issubdtype(copies["key"].dtype, jax.dtypes.prng_key)
+    assert copies["key"].shape == (1,)
+    np.testing.assert_array_equal(
+        jax.random.key_data(copies["key"])[0], jax.random.key_data(tree["key"])
+    )
+
+
+def test_replicate_asks_for_a_device():
+    with pytest.raises(ValueError, match="at least one"):
+        brax_interop.replicate(jnp.zeros(2), [])
+
+
+def test_replicate_puts_one_copy_on_each_device():
+    # The number of CPU devices is fixed when jax starts: hence the process.
+    program = """
+import jax, numpy as np
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 2)
+from bounce_mjx import brax_interop
+copies = brax_interop.replicate(np.arange(3.0), jax.devices())
+assert copies.shape == (2, 3), copies.shape
+for i, shard in enumerate(sorted(copies.addressable_shards, key=lambda s: s.index[0].start)):
+    assert shard.device == jax.devices()[i], shard
+    assert np.array_equal(shard.data, [[0.0, 1.0, 2.0]]), shard
+assert jax.pmap(lambda x: jax.lax.psum(x, "d"), "d")(copies)[1, 2] == 4.0
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

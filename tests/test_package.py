@@ -1,0 +1,102 @@
+"""The wheel: what is in it, and that it works where there is no source checkout."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+# An editable install puts the checkout on the path of every interpreter of this environment.
+HIDE_CHECKOUT = f"""
+import sys
+from pathlib import Path
+sys.path = [p for p in sys.path if not Path(p).resolve().is_relative_to({str(CHECKOUT / "src")!r})]
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(command, cwd=CHECKOUT, check=True, capture_output=True)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def site(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty folder with the wheel installed in it, as `pip install --target` does."""
+    folder = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
+    """Runs a script that sees the installed wheel only; the lines that it prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", HIDE_CHECKOUT + script],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    source = CHECKOUT / "src"
+    expected = {str(p.relative_to(source)) for p in (source / "bounce_mjx").rglob("*.py")}
+    for folder in ("mjcf", "configs"):
+        data = [p for p in (CHECKOUT / folder).iterdir() if p.is_file()]
+        assert data
+        expected |= {f"bounce_mjx/{folder}/{p.name}" for p in data}
+    assert expected <= names
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
+
+
+def test_installed_environment_runs(site: Path, tmp_path: Path) -> None:
+    script = """
+import jax
+import bounce_mjx
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.resources import resource_path
+env = BounceBall(EnvConfig(physics="fused"))
+state = env.reset(jax.random.PRNGKey(0))
+following = env.step(state, jax.numpy.ones(env.action_size))
+print(bounce_mjx.__file__)
+print(resource_path("mjcf/bounce_ball.xml"))
+print(env.engine.name, *following.obs.shape, bool(jax.numpy.isfinite(following.obs).all()))
+print(float(abs(following.obs - state.obs).max()) > 0.0)
+print(*bounce_mjx.__all__)
+"""
+    module, mjcf, result, moved, public = run_installed(site, script, tmp_path)
+    assert Path(module) == site / "bounce_mjx" / "__init__.py"
+    assert Path(mjcf) == site / "bounce_mjx" / "mjcf" / "bounce_ball.xml"
+    assert result == "fused 29 True"
+    assert moved == "True"
+    assert {"BounceBall", "EnvConfig"} <= set(public.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
+    script = """
+from bounce_mjx.config import load_config
+from bounce_mjx.resources import resource_path
+from bounce_mjx.train import read_command
+import jax
+preset = "cpu" if jax.default_backend() == "cpu" else "default"
+print(read_command([]).ppo == load_config(resource_path(f"configs/{preset}.yaml")).ppo)
+print(resource_path(f"configs/{preset}.yaml"))
+"""
+    same, preset = run_installed(site, script, tmp_path)
+    assert same == "True"
+    assert Path(preset).parent == site / "bounce_mjx" / "configs"

@@ -1,0 +1,233 @@
+"""The batch: fresh resets, time-outs, and what a step reports at the end of an episode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, vector
+
+NUM_ENVS = 4
+STEPS = 70
+NO_LIMIT = 10**6
+RESET_KEY = jax.random.key(11)
+STEP_KEYS = jax.random.split(jax.random.key(12), STEPS)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return BounceBall()
+
+
+@pytest.fixture(scope="module")
+def single(env):
+    """Compiled `reset` and `step` of one environment."""
+    return jax.jit(env.reset), jax.jit(env.step)
+
+
+@pytest.fixture(scope="module")
+def reset(env):
+    return jax.jit(lambda key: vector.reset(env, key, NUM_ENVS))
+
+
+@pytest.fixture(scope="module")
+def step(env):
+    """(state, action, key, episode_steps) -> (state, result), compiled once for every limit."""
+    return jax.jit(lambda *args: vector.step(env, *args))
+
+
+@pytest.fixture(scope="module")
+def actions():
+    """Random actions [STEPS, NUM_ENVS, 6], the last environment's so tame that its ball bounces."""
+    drawn = np.random.default_rng(2).uniform(-1, 1, (STEPS, NUM_ENVS, 6)).astype(np.float32)
+    drawn[:, -1] = 0
+    return drawn
+
+
+def run(reset, step, actions, episode_steps):
+    """The results of each step, stacked [STEPS, NUM_ENVS, ...], and the states before each."""
+    state, states, results = reset(RESET_KEY), [], []
+    for action, key in zip(actions, STEP_KEYS, strict=False):
+        states.append(state)
+        state, result = step(state, action, key, episode_steps)
+        results.append(result)
+    return jax.tree.map(lambda *x: np.stack(x), *results), [*states, state]
+
+
+@pytest.fixture(scope="module")
+def unlimited(reset, step, actions):
+    """A run in which only the task ends episodes."""
+    return run(reset, step, actions, NO_LIMIT)
+
+
+@pytest.fixture(scope="module")
+def limited(reset, step, actions):
+    """A run with a time-out after 25 steps, before any ball has come down to the paddle."""
+    return run(reset, step, actions, 25)
+
+
+def python_loop(single, actions, episode_steps, i):
+    """Environment i alone, in plain Python, as `StepResult` describes it."""
+    reset_one, step_one = single
+    state = reset_one(jax.random.split(RESET_KEY, NUM_ENVS)[i])
+    episode_return, length, rows = 0.0, 0, []
+    for action, key in zip(actions[:, i], STEP_KEYS, strict=True):
+        state = step_one(state, action)
+        length += 1
+        episode_return += float(state.reward)
+        terminated = bool(state.done)
+        truncated = length == episode_steps and not terminated
+        row = {
+            "final_observation": state.obs,
+            "reward": state.reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            "episode_return": episode_return,
+            "episode_length": length,
+            "n_bounces": state.metrics["n_bounces"],
+        }
+        if terminated or truncated:
+            state = reset_one(jax.random.split(key, NUM_ENVS)[i])
+            episode_return, length = 0.0, 0
+        rows.append(row | {"observation": state.obs})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.mark.parametrize("i", range(NUM_ENVS))
+@pytest.mark.parametrize(("fixture", "episode_steps"), [("unlimited", NO_LIMIT), ("limited", 25)])
+def test_run_equals_a_loop_over_single_environments(
+    i, fixture, episode_steps, single, actions, request
+):
+    results, _ = request.getfixturevalue(fixture)
+    expected = python_loop(single, actions, episode_steps, i)
+    for name in ("terminated", "truncated", "episode_length"):
+        np.testing.assert_array_equal(getattr(results, name)[:, i], expected[name], err_msg=name)
+    for name in ("reward", "episode_return"):
+        np.testing.assert_allclose(
+            getattr(results, name)[:, i], expected[name], rtol=1e-3, atol=1e-3, err_msg=name
+        )
+    # The contact magnifies the rounding of a differently compiled step.
+    for name in ("observation", "final_observation"):
+        np.testing.assert_allclose(
+            getattr(results, name)[:, i], expected[name], rtol=0, atol=5e-3, err_msg=name
+        )
+    np.testing.assert_array_equal(results.metrics["n_bounces"][:, i], expected["n_bounces"])
+
+
+def test_runs_contain_what_they_are_to_test(unlimited, limited):
+    results, _ = unlimited
+    assert results.terminated.any() and not results.truncated.any()
+    assert results.metrics["bounced"].any()
+    results, _ = limited
+    assert results.truncated.sum() == 2 * NUM_ENVS and not results.terminated.any()
+
+
+def test_shapes(reset, step, actions):
+    state = reset(RESET_KEY)
+    assert vector.observe(state).shape == (NUM_ENVS, 29)
+    np.testing.assert_array_equal(state.steps, np.zeros(NUM_ENVS))
+    np.testing.assert_array_equal(state.episode_return, np.zeros(NUM_ENVS))
+    _, result = step(state, actions[0], STEP_KEYS[0], NO_LIMIT)
+    assert result.observation.shape == result.final_observation.shape == (NUM_ENVS, 29)
+    assert result.terminated.dtype == result.truncated.dtype == bool
+    for leaf in (result.reward, result.episode_length, *result.metrics.values()):
+        assert leaf.shape == (NUM_ENVS,)
+
+
+def test_one_step_equals_unbatched_steps(reset, step, single, actions):
+    reset_one, step_one = single
+    state = reset(RESET_KEY)
+    _, result = step(state, actions[0], STEP_KEYS[0], NO_LIMIT)
+    for i, key in enumerate(jax.random.split(RESET_KEY, NUM_ENVS)):
+        start = reset_one(key)
+        np.testing.assert_allclose(vector.observe(state)[i], start.obs, rtol=0, atol=1e-6)
+        alone = step_one(start, actions[0, i])
+        np.testing.assert_allclose(result.final_observation[i], alone.obs, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(result.reward[i], alone.reward, rtol=1e-5)
+        for name, value in alone.metrics.items():
+            np.testing.assert_allclose(result.metrics[name][i], value, rtol=1e-3, atol=1e-5)
+
+
+def test_observation_is_the_next_state_and_differs_from_the_final_one_only_at_ends(unlimited):
+    results, states = unlimited
+    ended = results.terminated | results.truncated
+    for t in range(STEPS):
+        np.testing.assert_array_equal(results.observation[t], vector.observe(states[t + 1]))
+    same = (results.observation == results.final_observation).all(axis=2)
+    np.testing.assert_array_equal(same, ~ended)
+
+
+def test_end_starts_a_new_episode(limited):
+    results, states = limited
+    for t in np.flatnonzero(results.truncated.any(axis=1)):
+        after = states[t + 1]
+        np.testing.assert_array_equal(after.steps, 0)
+        np.testing.assert_array_equal(after.episode_return, 0)
+        # The balls of the old episodes have fallen; those of the new ones are back at rest.
+        assert np.all(results.final_observation[t, :, 21] < -1)
+        np.testing.assert_array_equal(results.observation[t, :, 19:25], 0)
+        np.testing.assert_allclose(results.observation[t, :, 8], 0.45, atol=0.0101)
+        np.testing.assert_array_equal(after.env.pipeline_state.task.last_action, 0)
+        np.testing.assert_array_equal(after.env.pipeline_state.task.n_bounces, 0)
+        np.testing.assert_array_equal(results.episode_length[t], 25)
+
+
+def test_every_episode_has_a_draw_of_its_own(limited):
+    results, states = limited
+    first, second = results.observation[np.flatnonzero(results.truncated.any(axis=1))]
+    starts = np.concatenate([vector.observe(states[0]), first, second])
+    drawn = starts[:, np.r_[0:9, 13:19, 28]]
+    for entry in drawn.T:
+        # A coordinate of order 1 keeps 24 bits of a draw; two of 12 hardly ever coincide.
+        assert len(np.unique(entry)) == len(starts)
+
+
+def test_time_out_is_exactly_at_the_limit(limited):
+    results, _ = limited
+    times = np.flatnonzero(results.truncated.any(axis=1))
+    np.testing.assert_array_equal(times, [24, 49])
+    assert results.truncated[times].all()
+
+
+def test_end_of_the_task_at_the_limit_is_no_time_out(unlimited, reset, step, actions):
+    ended_at, i = np.argwhere(unlimited[0].terminated)[0]
+    episode_steps = ended_at + 1
+    at_limit, _ = run(reset, step, actions[: episode_steps + 1], int(episode_steps))
+    assert at_limit.terminated[ended_at, i] and not at_limit.truncated[ended_at, i]
+    one_less, _ = run(reset, step, actions[: episode_steps + 1], int(ended_at))
+    assert one_less.truncated[ended_at - 1, i] and not one_less.terminated[ended_at - 1, i]
+    assert not one_less.terminated[ended_at, i]
+
+
+def test_run_depends_on_the_reset_keys(unlimited, reset, step, actions):
+    """Only from the first end on: before it the keys are not used."""
+    ended_at, i = np.argwhere(unlimited[0].terminated)[0]
+    state = unlimited[1][ended_at]
+    _, again = step(state, actions[ended_at], STEP_KEYS[ended_at], NO_LIMIT)
+    _, other = step(state, actions[ended_at], jax.random.key(99), NO_LIMIT)
+    np.testing.assert_array_equal(again.observation, unlimited[0].observation[ended_at])
+    np.testing.assert_array_equal(other.final_observation, again.final_observation)
+    assert np.all(other.observation[i, :6] != again.observation[i, :6])
+    others = np.flatnonzero(~unlimited[0].terminated[ended_at])
+    np.testing.assert_array_equal(other.observation[others], again.observation[others])
+
+
+def test_nan_action_ends_one_episode_and_leaves_the_others_alone(reset, step, actions):
+    state = reset(RESET_KEY)
+    broken = actions[0].copy()
+    broken[2] = np.nan
+    expected = step(state, actions[0], STEP_KEYS[0], NO_LIMIT)
+    actual = step(state, broken, STEP_KEYS[0], NO_LIMIT)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(actual))
+    np.testing.assert_array_equal(actual[1].terminated, [False, False, True, False])
+    np.testing.assert_array_equal(actual[1].metrics["non_finite"], [0, 0, 1, 0])
+    others = np.array([0, 1, 3])
+    # The batch is last in the states and first in the results.
+    for a, b in zip(jax.tree.leaves(expected[0]), jax.tree.leaves(actual[0]), strict=True):
+        np.testing.assert_array_equal(a[..., others], b[..., others])
+    for a, b in zip(jax.tree.leaves(expected[1]), jax.tree.leaves(actual[1]), strict=True):
+        np.testing.assert_array_equal(a[others], b[others])
+    next_state, result = step(actual[0], actions[1], STEP_KEYS[1], NO_LIMIT)
+    assert not result.terminated.any()
+    np.testing.assert_array_equal(next_state.steps, [2, 2, 1, 2])
+    assert jnp.all(jnp.isfinite(result.final_observation))
