@@ -40,7 +40,7 @@ class TrainingState(NamedTuple):
     params: Params
     optimizer: optax.OptState
     normalizer: running_statistics.RunningStatisticsState
-    """Statistics [29 + K] of what the networks see: the observation, and K metrics for the critic."""
+    """Statistics [29 + K] of what the networks see: the observation and K critic metrics."""
     learning_rate: jax.Array
     """Current learning rate []."""
     env: vector.VectorState

@@ -1,0 +1,168 @@
+"""Physics steps per second of the engines over batch sizes, measured side by side in one run.
+
+    python benchmarks/physics.py --batch-sizes 512 4096 --engines fused mjx c
+
+One measurement is a program of `--control-steps` control steps (10 physics steps each) under
+random actions. The engines take turns, and the fastest of the repeats counts, as other work on
+the machine only ever slows one down.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import mujoco
+import numpy as np
+import pydantic
+from mujoco import rollout
+from pydantic import Field
+from tables import device_name, markdown_table, write
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.cli import parse
+from bounce_mjx.errors import exit_on_user_error
+
+EngineName = Literal["fused", "mjx", "c"]
+
+
+class Command(pydantic.BaseModel):
+    """The command line."""
+
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
+    )
+
+    batch_sizes: tuple[Annotated[int, Field(ge=1)], ...] = (512, 4096, 32768)
+    """Numbers of environments."""
+    engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
+    """fused, mjx, and c: MuJoCo's C engine on all processor cores."""
+    control_steps: Annotated[int, Field(ge=1)] = 20
+    """Control steps in one measurement of the fused engine; the others, far slower, do 2."""
+    repeats: Annotated[int, Field(ge=1)] = 5
+    """Measurements of each engine."""
+    out: Path = Path("benchmarks/results")
+    """Folder for physics.json and physics.md."""
+
+
+def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
+    """A compiled run of a JAX engine, and the seconds that it took to compile."""
+    env = BounceBall(EnvConfig(physics=engine))
+    at_minor = {"in_axes": -1, "out_axes": -1}
+
+    def control_step(physics, key):
+        actions = jax.random.uniform(key, (env.action_size, batch), minval=-1.0, maxval=1.0)
+        targets = jax.vmap(env.servo_targets, **at_minor)(physics, actions)
+        advance = jax.vmap(
+            lambda state, ctrl: env.engine.step(state, ctrl, env.config.num_substeps), **at_minor
+        )
+        return advance(physics, targets), None
+
+    def run(physics, key):
+        return jax.lax.scan(control_step, physics, jax.random.split(key, control_steps))[0]
+
+    keys = jax.random.split(jax.random.PRNGKey(0), batch)
+    physics = jax.jit(jax.vmap(env.reset, out_axes=-1))(keys).pipeline_state.physics
+    started = time.perf_counter()
+    program = jax.jit(run).lower(physics, keys[0]).compile()
+    compile_seconds = time.perf_counter() - started
+    return lambda: jax.block_until_ready(program(physics, keys[0])), compile_seconds
+
+
+def c_program(batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
+    """A run of the C engine on all cores."""
+    env = BounceBall()
+    model, threads = env.mj_model, os.cpu_count() or 1
+    rng = np.random.default_rng(0)
+    state = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    physics = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state.physics
+    state[:, 1:] = np.concatenate([physics.qpos, physics.qvel])
+    steps = control_steps * env.config.num_substeps
+    noise = rng.uniform(-1.0, 1.0, (batch, control_steps, 6)).repeat(
+        env.config.num_substeps, axis=1
+    )
+    control = np.asarray(env.config.default_joint_angles) + env.config.action_scale * noise
+    assert control.shape == (batch, steps, model.nu)
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    pool = rollout.Rollout(nthread=threads)
+    return lambda: pool.rollout(model, data, state, control) and None, 0.0
+
+
+def measure(command: Command) -> list[dict]:
+    """One record a batch size and engine."""
+    records = []
+    for batch in command.batch_sizes:
+        programs = {}
+        for engine in command.engines:
+            steps = command.control_steps if engine == "fused" else min(2, command.control_steps)
+            make = c_program if engine == "c" else lambda b, s, e=engine: jax_program(e, b, s)
+            programs[engine] = (*make(batch, steps), steps)
+        times = {engine: [] for engine in programs}
+        for repeat in range(command.repeats + 1):
+            for engine, (run, _, _) in programs.items():
+                started = time.perf_counter()
+                run()
+                if repeat:
+                    times[engine].append(time.perf_counter() - started)
+        for engine, (_, compile_seconds, steps) in programs.items():
+            physics_steps = batch * steps * EnvConfig().num_substeps
+            records.append(
+                {
+                    "batch": batch,
+                    "engine": engine,
+                    "steps_per_second": physics_steps / min(times[engine]),
+                    "median_steps_per_second": physics_steps / float(np.median(times[engine])),
+                    "compile_seconds": compile_seconds,
+                }
+            )
+    return records
+
+
+def table(records: list[dict]) -> str:
+    """Steps per second by batch size and engine, and how many times faster fused is."""
+    rows = []
+    for batch in dict.fromkeys(r["batch"] for r in records):
+        at_batch = {r["engine"]: r for r in records if r["batch"] == batch}
+        for engine, record in at_batch.items():
+            ratio = ""
+            if "fused" in at_batch and engine != "fused":
+                faster = at_batch["fused"]["steps_per_second"] / record["steps_per_second"]
+                ratio = f"{faster:.3g}"
+            rows.append(
+                [
+                    f"{batch:,}",
+                    engine,
+                    f"{record['steps_per_second'] / 1e6:,.3f}",
+                    f"{record['median_steps_per_second'] / 1e6:,.3f}",
+                    f"{record['compile_seconds']:.1f}",
+                    ratio,
+                ]
+            )
+    header = [
+        "environments",
+        "engine",
+        "M steps/s (best)",
+        "(median)",
+        "compile s",
+        "fused is x faster",
+    ]
+    return markdown_table(header, rows)
+
+
+def main() -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        command = parse(
+            Command, sys.argv[1:], prog="benchmarks/physics.py", description=__doc__.split("\n")[0]
+        )
+        records = measure(command)
+        device = device_name()
+        record = {"device": device, "jax": jax.__version__, "records": records}
+        write(command.out, "physics", record, f"Device: {device}\n\n{table(records)}")
+
+
+if __name__ == "__main__":
+    main()

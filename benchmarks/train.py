@@ -1,0 +1,147 @@
+"""Time from process start to all five results, and the results on every engine, over seeds.
+
+    python benchmarks/train.py --seeds 0 1 2 3 4 --engines fused mjx mujoco
+
+Each training is a process of its own with an empty compilation cache: `train_jax.py
+--stop-when-solved`, as a user would start it. Words after `--` go to it.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+from tables import device_name, markdown_table, write
+
+from bounce_mjx.cli import parse
+from bounce_mjx.errors import UserError, exit_on_user_error
+
+PHASES = ("import", "setup", "compile", "train", "evaluate", "save")
+
+
+class Command(pydantic.BaseModel):
+    """The command line."""
+
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
+    )
+
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2, 3, 4)
+    """Seeds of the trainings."""
+    engines: tuple[Literal["fused", "mjx", "mujoco"], ...] = ("fused", "mujoco")
+    """Engines on which each trained policy is evaluated, 1,024 episodes each."""
+    stop_when_solved: bool = True
+    """End a training at its first passing evaluation; else it goes on to total_steps."""
+    out: Path = Path("benchmarks/results")
+    """Folder for train.json and train.md."""
+
+
+def train_once(seed: int, folder: Path, stop_when_solved: bool, extra: list[str]) -> dict:
+    """Runs one cold training and returns its results with the time of each phase."""
+    stop = "--stop-when-solved" if stop_when_solved else "--no-stop-when-solved"
+    command = [sys.executable, "train_jax.py", "--seed", str(seed), stop]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache")}
+    started = time.perf_counter()
+    finished = subprocess.run(
+        [*command, "--log-dir", str(folder / "runs"), *extra],
+        env=environment,
+        cwd=Path(__file__).resolve().parent.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    total = time.perf_counter() - started
+    if finished.returncode:
+        raise UserError(f"the training with seed {seed} failed: {finished.stdout[-500:]}")
+    run = next((folder / "runs").iterdir())
+    results = json.loads((run / "results.json").read_text(encoding="utf-8"))
+    seconds = results["seconds"]
+    seconds["import"] = total - sum(seconds.values())
+    return {"seed": seed, "run": str(run), "total_seconds": total, **results}
+
+
+def evaluate_on(run: str, engine: str, folder: Path) -> dict:
+    """The five results of a run's policy on one engine."""
+    out = folder / f"{engine}.json"
+    subprocess.run(
+        [sys.executable, "-m", "bounce_mjx.eval", run, "--physics", engine, "--json", str(out)],
+        stdout=subprocess.DEVNULL,
+        check=False,
+    )
+    return json.loads(out.read_text(encoding="utf-8"))
+
+
+def table(records: list[dict], engines: tuple[str, ...]) -> str:
+    """Two tables: the time to the five results, and the five results on each engine."""
+    times = [
+        [
+            str(r["seed"]),
+            "-" if r["solved_steps"] is None else f"{r['solved_steps'] / 1e6:.2f}",
+            *[f"{r['seconds'][phase]:.1f}" for phase in PHASES],
+            f"{r['total_seconds']:.1f}",
+        ]
+        for r in records
+    ]
+    results = [
+        [
+            str(r["seed"]),
+            engine,
+            *[f"{result['value']:.2f}" for result in r["engines"][engine]["results"]],
+            "pass" if r["engines"][engine]["passed"] else "FAIL",
+            f"{r['engines'][engine]['details']['mean_consecutive_bounces']:.1f}",
+            f"{100 * r['engines'][engine]['details']['mean_apex_error_m']:.1f}",
+        ]
+        for r in records
+        for engine in engines
+    ]
+    time_header = ["seed", "solved, M steps", *[f"{phase} s" for phase in PHASES], "total s"]
+    result_header = [
+        "seed",
+        "engine",
+        "1 bounces %",
+        "2 horizontal %",
+        "3 height %",
+        "4 speed m/s",
+        "5 stable %",
+        "",
+        "mean bounces",
+        "mean apex error, cm",
+    ]
+    return f"{markdown_table(time_header, times)}\n\n{markdown_table(result_header, results)}"
+
+
+def main() -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        args = sys.argv[1:]
+        extra = args[args.index("--") + 1 :] if "--" in args else []
+        own = args[: args.index("--")] if "--" in args else args
+        command = parse(
+            Command, own, prog="benchmarks/train.py", description=__doc__.split("\n")[0]
+        )
+        records = []
+        for seed in command.seeds:
+            with tempfile.TemporaryDirectory() as name:
+                folder = Path(name)
+                record = train_once(seed, folder, command.stop_when_solved, extra)
+                record["engines"] = {
+                    engine: evaluate_on(record["run"], engine, folder) for engine in command.engines
+                }
+                records.append(record)
+                solved = record["solved_steps"]
+                print(
+                    f"seed {seed}: {record['total_seconds']:.1f} s, solved at {solved}", flush=True
+                )
+        device = device_name()
+        text = f"Device: {device}\n\n{table(records, command.engines)}"
+        write(command.out, "train", {"device": device, "records": records}, text)
+
+
+if __name__ == "__main__":
+    main()

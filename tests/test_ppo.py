@@ -1,0 +1,400 @@
+"""PPO: advantages, learning rate, bootstrapping at time-outs, purity, and that it learns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+
+from bounce_mjx import BounceBall, EnvConfig, evaluation, policy, ppo, vector
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.errors import UserError
+
+
+def all_finite(tree) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree))
+
+
+def plain(tree):
+    """`tree` with its random keys as numbers."""
+
+    def to_numpy(leaf):
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+    return jax.tree.map(to_numpy, tree)
+
+
+def assert_identical(first, second):
+    """Bit for bit."""
+    jax.tree.map(np.testing.assert_array_equal, plain(first), plain(second))
+
+
+# Generalised advantages
+
+
+def advantages_by_definition(reward, value, next_value, terminated, truncated, discount, lam):
+    """Each advantage as its own sum of discounted errors, forward in time, up to an end."""
+    result = np.zeros(reward.shape)
+    for t, b in np.ndindex(*reward.shape):
+        weight = 1.0
+        for k in range(t, len(reward)):
+            bootstrap = 0.0 if terminated[k, b] else next_value[k, b]
+            result[t, b] += weight * (reward[k, b] + discount * bootstrap - value[k, b])
+            if terminated[k, b] or truncated[k, b]:
+                break
+            weight *= discount * lam
+    return result
+
+
+def random_rollout(seed=0, steps=30, envs=40):
+    rng = np.random.default_rng(seed)
+    ends = rng.random((steps, envs))
+    return {
+        "reward": rng.normal(size=(steps, envs)).astype(np.float32),
+        "value": rng.normal(size=(steps, envs)).astype(np.float32),
+        "next_value": rng.normal(size=(steps, envs)).astype(np.float32),
+        "terminated": ends < 0.1,
+        "truncated": ends > 0.9,
+    }
+
+
+@pytest.mark.parametrize(("discount", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.9, 1.0), (1.0, 1.0)])
+def test_advantages_equal_their_definition(discount, lam):
+    rollout = random_rollout()
+    actual = ppo.generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
+    expected = advantages_by_definition(*rollout.values(), discount, lam)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("terminated_at", "truncated_at", "expected"),
+    [
+        # Errors: 1 + 1/2 - 1 = 0.5, 2 + 10/2 - 1 = 6, 3 + 1/2 - 1 = 2.5, 4 + 2/2 - 1 = 4; each
+        # advantage is its error plus a quarter of the next advantage.
+        pytest.param([], [], [2.21875, 6.875, 3.5, 4.0], id="no end"),
+        # The second step keeps its error of 6 and gets nothing from the third.
+        pytest.param([], [1], [2.0, 6.0, 3.5, 4.0], id="time-out"),
+        # Without a value to follow, the second error is 2 - 1 = 1.
+        pytest.param([1], [], [0.75, 1.0, 3.5, 4.0], id="termination"),
+        pytest.param([3], [], [2.171875, 6.6875, 2.75 + 0.5 - 0.5, 3.0 + 0.0], id="last step"),
+    ],
+)
+def test_advantages_by_hand(terminated_at, truncated_at, expected):
+    steps = np.arange(4)
+    actual = ppo.generalized_advantages(
+        reward=jnp.array([[1.0], [2.0], [3.0], [4.0]]),
+        value=jnp.ones((4, 1)),
+        next_value=jnp.array([[1.0], [10.0], [1.0], [2.0]]),
+        terminated=jnp.array(np.isin(steps, terminated_at)[:, None]),
+        truncated=jnp.array(np.isin(steps, truncated_at)[:, None]),
+        discount=0.5,
+        gae_lambda=0.5,
+    )
+    np.testing.assert_allclose(actual[:, 0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("end", ["terminated", "truncated"])
+def test_nothing_flows_back_over_an_end(end):
+    rollout = random_rollout(seed=1)
+    rollout["terminated"][:], rollout["truncated"][:] = False, False
+    rollout[end][10] = True
+    later = {name: array.copy() for name, array in rollout.items()}
+    for name in ("reward", "value", "next_value"):
+        later[name][11:] += 5.0
+    first, second = (
+        np.asarray(ppo.generalized_advantages(**r, discount=0.99, gae_lambda=0.95))
+        for r in (rollout, later)
+    )
+    np.testing.assert_array_equal(first[:11], second[:11])
+    assert np.all(first[11:] != second[11:])
+
+
+def test_only_a_time_out_uses_the_value_that_follows():
+    rollout = random_rollout(seed=2)
+    changed = rollout | {"next_value": rollout["next_value"] + 1.0}
+    first, second = (
+        np.asarray(ppo.generalized_advantages(**r, discount=0.5, gae_lambda=0.0))
+        for r in (rollout, changed)
+    )
+    expected = np.where(rollout["terminated"], 0.0, 0.5)
+    np.testing.assert_allclose(second - first, expected, atol=1e-5)
+
+
+# Learning rate
+
+
+@pytest.fixture(scope="module")
+def rate_config():
+    """Ten iterations of 100 steps each until the limit has come down."""
+    return PPOConfig(
+        num_envs=10, rollout_length=10, num_minibatches=2, decay_steps=1000,
+        max_learning_rate=1e-2, final_max_learning_rate=1e-4, min_learning_rate=1e-5,
+        target_kl=0.01,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("iteration", "expected"), [(0, 1e-2), (5, 1e-3), (10, 1e-4), (11, 1e-4), (10**6, 1e-4)]
+)
+def test_max_learning_rate_falls_in_equal_ratios(iteration, expected, rate_config):
+    actual = ppo.max_learning_rate(rate_config, jnp.int32(iteration))
+    np.testing.assert_allclose(actual, expected, rtol=1e-5)
+
+
+def test_max_learning_rate_never_rises(rate_config):
+    rates = np.array([ppo.max_learning_rate(rate_config, jnp.int32(i)) for i in range(15)])
+    assert np.all(np.diff(rates[:11]) < 0)
+    np.testing.assert_array_equal(rates[10:], rates[10])
+
+
+def adapted(config, kl, learning_rate=1e-3, limit=1e-2):
+    return float(ppo.adapt_learning_rate(config, learning_rate, jnp.float32(kl), limit))
+
+
+def test_learning_rate_follows_the_kl_divergence(rate_config):
+    slower, faster = adapted(rate_config, 0.0201), adapted(rate_config, 0.0049)
+    assert slower < 1e-3 < faster
+    np.testing.assert_allclose(slower * faster, 1e-6, rtol=1e-5)
+    for kl in (0.0051, 0.01, 0.0199):
+        np.testing.assert_allclose(adapted(rate_config, kl), 1e-3, rtol=1e-6)
+
+
+def test_learning_rate_stays_in_its_limits(rate_config):
+    np.testing.assert_allclose(adapted(rate_config, 0.0, 9.9e-3), 1e-2, rtol=1e-6)
+    np.testing.assert_allclose(adapted(rate_config, 0.01, 5e-3, limit=2e-3), 2e-3, rtol=1e-6)
+    np.testing.assert_allclose(adapted(rate_config, 1.0, 1.01e-5), 1e-5, rtol=1e-6)
+
+
+def test_learning_rate_is_fixed_without_a_target(rate_config):
+    fixed = rate_config.model_copy(update={"target_kl": 0.0})
+    for kl in (0.0, 1.0):
+        np.testing.assert_allclose(adapted(fixed, kl), 1e-3, rtol=1e-6)
+
+
+# Bootstrapping, end to end
+
+
+class TwoStates(Env):
+    """An episode starts in the first state; every step leads to the second one."""
+
+    observation_size = 2
+    action_size = 1
+    backend = "none"
+
+    def __init__(self, first_reward: float, terminates: bool):
+        """Leaving the first state pays `first_reward`, leaving the second one pays 1 and
+        terminates the episode if `terminates`."""
+        self.first_reward = first_reward
+        self.terminates = terminates
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        names = ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite")
+        return State(None, jnp.array([1.0, 0.0]), zero, zero, dict.fromkeys(names, zero))
+
+    def step(self, state, action):
+        in_second = state.obs[1]
+        return state.replace(
+            obs=jnp.array([0.0, 1.0]),
+            reward=jnp.where(in_second > 0, 1.0, self.first_reward),
+            done=in_second if self.terminates else jnp.zeros(()),
+        )
+
+
+def two_state_config(**changes) -> PPOConfig:
+    return PPOConfig(
+        num_envs=16, rollout_length=2, num_minibatches=2, hidden_layers=(16,), discount=0.9,
+        reward_scale=0.1, learning_rate=3e-3, target_kl=0.0, decay_steps=10**9, **changes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("env", "expected"),
+    [
+        # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out were an end.
+        pytest.param(TwoStates(1.0, terminates=False), [1.0, 1.0], id="constant reward"),
+        # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led
+        # on to the first state of the next episode, they would be worth 0.526 and 0.474.
+        pytest.param(TwoStates(0.0, terminates=False), [0.9, 1.0], id="second state pays"),
+        pytest.param(TwoStates(1.0, terminates=True), [0.19, 0.1], id="terminates"),
+    ],
+)
+def test_time_out_bootstraps_the_old_episodes_last_state(env, expected):
+    config = two_state_config()
+    trainer = ppo.make_trainer(config, env, episode_steps=2)
+    state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 500))(jax.random.key(0))
+    networks = policy.make_networks(config, env.observation_size, env.action_size)
+    values = networks.value_network.apply(
+        None, state.params.value, policy.normalize(jnp.eye(2), state.normalizer)
+    )
+    np.testing.assert_allclose(values, expected, atol=0.03)
+    assert metrics["loss/value"][-1] < 1e-3
+    np.testing.assert_allclose(metrics["episode/return"][-1], 1.0 + env.first_reward, rtol=1e-6)
+    np.testing.assert_allclose(metrics["episode/length"][-1], 2.0, rtol=1e-6)
+    assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
+
+
+def test_episodes_do_not_all_time_out_together():
+    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0, False), episode_steps=1000)
+    steps = np.asarray(trainer.init(jax.random.key(0)).env.steps)
+    assert steps.min() >= 0 and steps.max() < 1000
+    assert len(np.unique(steps)) > 8
+
+
+def test_rollout_longer_than_an_episode_is_refused():
+    with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
+        ppo.make_trainer(two_state_config(), TwoStates(1.0, False), episode_steps=1)
+
+
+# The trainer as a pure function
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return PPOConfig(
+        num_envs=8, rollout_length=4, num_minibatches=2, num_epochs=2, hidden_layers=(16,)
+    )
+
+
+@pytest.fixture(scope="module")
+def env():
+    return BounceBall()
+
+
+@pytest.fixture(scope="module")
+def trainer(tiny, env):
+    return ppo.make_trainer(tiny, env, env.config.episode_steps)
+
+
+@pytest.fixture(scope="module")
+def init(trainer):
+    return jax.jit(trainer.init)
+
+
+@pytest.fixture(scope="module")
+def run_two(trainer, init):
+    """Two iterations, compiled."""
+    example = init(jax.random.key(0))
+    return jax.jit(trainer.run, static_argnums=1).lower(example, 2).compile()
+
+
+@pytest.fixture(scope="module")
+def after_two(init, run_two):
+    """State and metrics after two iterations from key 0."""
+    return run_two(init(jax.random.key(0)))
+
+
+def test_training_is_a_function_of_its_key(init, run_two, after_two):
+    assert_identical(run_two(init(jax.random.key(0))), after_two)
+    other, _ = run_two(init(jax.random.key(1)))
+    for a, b in zip(
+        jax.tree.leaves(other.params), jax.tree.leaves(after_two[0].params), strict=True
+    ):
+        assert np.any(np.asarray(a) != np.asarray(b))
+
+
+def test_training_changes_every_parameter(init, after_two):
+    before = init(jax.random.key(0))
+    after, _ = after_two
+    for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
+        assert np.any(np.asarray(a) != np.asarray(b))
+    assert np.any(jax.random.key_data(before.key) != jax.random.key_data(after.key))
+    assert all_finite((after.params, after.optimizer, after.normalizer))
+
+
+def test_counters(tiny, init, after_two):
+    assert init(jax.random.key(0)).iteration == 0
+    state, metrics = after_two
+    assert state.iteration == 2
+    assert all(value.shape == (2,) for value in metrics.values())
+    samples = 2 * tiny.num_envs * tiny.rollout_length
+    # The normaliser counts the observations that it has seen.
+    assert float(np.ravel(state.normalizer.count)[0]) == samples
+    np.testing.assert_array_equal(metrics["task/non_finite"], 0)
+
+
+def test_four_iterations_equal_two_and_two(trainer, init, run_two, after_two):
+    state, first_metrics = after_two
+    resumed, second_metrics = run_two(state)
+    at_once, metrics = jax.jit(trainer.run, static_argnums=1)(init(jax.random.key(0)), 4)
+    assert_identical(resumed, at_once)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), first_metrics, second_metrics)
+    assert_identical(joined, metrics)
+
+
+@pytest.mark.xfail(strict=True, reason="brax's log_value is weakly typed: run compiles twice")
+def test_run_returns_the_types_that_it_takes(trainer, init):
+    """Else a jitted `run` compiles again for its own result."""
+    state = init(jax.random.key(0))
+    result, _ = jax.eval_shape(lambda s: trainer.run(s, 1), state)
+    types = [
+        [(x.shape, x.dtype, x.weak_type) for x in map(jax.typeof, jax.tree.leaves(tree))]
+        for tree in (state, result)
+    ]
+    assert types[0] == types[1]
+
+
+def test_vmap_over_seeds_equals_single_runs(trainer, init, run_two, after_two):
+    keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
+    many_states = jax.jit(jax.vmap(trainer.init))(keys)
+    many, many_metrics = jax.jit(jax.vmap(lambda s: trainer.run(s, 2)))(many_states)
+    for i, (one, metrics) in enumerate((after_two, run_two(init(keys[1])))):
+        chosen, chosen_metrics = jax.tree.map(lambda x, i=i: x[i], (many, many_metrics))
+        # Adam magnifies the rounding of gradients near zero up to a step of the learning rate.
+        for a, b in zip(jax.tree.leaves(chosen.params), jax.tree.leaves(one.params), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=2e-4)
+        np.testing.assert_allclose(
+            vector.observe(chosen.env), vector.observe(one.env), rtol=0, atol=2e-3
+        )
+        np.testing.assert_allclose(chosen_metrics["reward"], metrics["reward"], rtol=1e-3)
+
+
+class FaultyBall(BounceBall):
+    """Its physics fails in about half of the environments as soon as the ball falls."""
+
+    def __init__(self):
+        super().__init__()
+        healthy = self.engine.step
+
+        def step(state, ctrl, num_substeps):
+            fails = (state.qpos[0] > 0.0) & (state.qvel[8] < -0.05)
+            after = healthy(state, ctrl, num_substeps)
+            return after._replace(qpos=jnp.where(fails, jnp.nan, after.qpos))
+
+        self.engine = self.engine._replace(step=step)
+
+
+def test_faults_do_not_spoil_the_training(tiny):
+    env = FaultyBall()
+    trainer = ppo.make_trainer(tiny, env, env.config.episode_steps)
+    state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 2))(jax.random.key(0))
+    assert metrics["task/non_finite"].sum() >= 8
+    np.testing.assert_array_equal(metrics["task/non_finite"], metrics["episode/ended"])
+    assert all_finite(state._replace(key=jnp.zeros(())))
+    assert all_finite({k: v for k, v in metrics.items() if k.startswith(("loss", "policy"))})
+
+
+# Learning
+
+
+def test_ppo_learns_to_bounce():
+    env = BounceBall(EnvConfig(episode_seconds=4.0))
+    config = PPOConfig(
+        num_envs=128, rollout_length=32, num_minibatches=4, hidden_layers=(64, 64),
+        learning_rate=1e-3,
+    )  # fmt: skip
+    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    untrained = jax.jit(trainer.init)(jax.random.key(0))
+    trained, metrics = jax.jit(trainer.run, static_argnums=1)(untrained, 120)
+
+    networks = policy.make_networks(config, env.observation_size, env.action_size)
+    unseen = jax.random.key(1234)
+    policies = [ppo.policy_of(untrained), ppo.policy_of(trained)]
+    evaluate = evaluation.make_evaluator(env, networks, episodes=64).lower(policies[0], unseen)
+    evaluate = evaluate.compile()
+    before, after = (evaluation.judge(env, evaluate(p, unseen)).details for p in policies)
+    assert after["mean_return"] > 3 * before["mean_return"]
+    assert after["mean_consecutive_bounces"] > before["mean_consecutive_bounces"] + 2
+    rewards = np.asarray(metrics["reward"])
+    assert rewards[-20:].mean() > rewards[:20].mean()
