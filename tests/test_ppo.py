@@ -77,7 +77,8 @@ def test_advantages_equal_their_definition(discount, lam):
         pytest.param([], [1], [2.0, 6.0, 3.5, 4.0], id="time-out"),
         # Without a value to follow, the second error is 2 - 1 = 1.
         pytest.param([1], [], [0.75, 1.0, 3.5, 4.0], id="termination"),
-        pytest.param([3], [], [2.171875, 6.6875, 2.75 + 0.5 - 0.5, 3.0 + 0.0], id="last step"),
+        # The last error is 4 - 1 = 3.
+        pytest.param([3], [], [2.203125, 6.8125, 3.25, 3.0], id="termination at the last step"),
     ],
 )
 def test_advantages_by_hand(terminated_at, truncated_at, expected):
@@ -182,61 +183,68 @@ class TwoStates(Env):
     action_size = 1
     backend = "none"
 
-    def __init__(self, first_reward: float, terminates: bool):
+    def __init__(self, first_reward: float, terminates: bool = False, hidden: bool = False):
         """Leaving the first state pays `first_reward`, leaving the second one pays 1 and
-        terminates the episode if `terminates`."""
+        terminates the episode if `terminates`. If `hidden`, the two look the same, and only the
+        metric n_bounces tells them apart."""
         self.first_reward = first_reward
         self.terminates = terminates
+        self.hidden = hidden
+
+    def _state(self, second, reward, done):
+        names = ("bounced", "ball_xy_error", "apex_error", "non_finite")
+        metrics = dict.fromkeys(names, jnp.zeros(())) | {"n_bounces": second}
+        obs = jnp.ones(2) if self.hidden else jnp.stack([1.0 - second, second])
+        return State(second, obs, reward, done, metrics)
 
     def reset(self, rng):
         zero = jnp.zeros(())
-        names = ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite")
-        return State(None, jnp.array([1.0, 0.0]), zero, zero, dict.fromkeys(names, zero))
+        return self._state(zero, zero, zero)
 
     def step(self, state, action):
-        in_second = state.obs[1]
-        return state.replace(
-            obs=jnp.array([0.0, 1.0]),
-            reward=jnp.where(in_second > 0, 1.0, self.first_reward),
-            done=in_second if self.terminates else jnp.zeros(()),
-        )
+        was_second = state.pipeline_state
+        reward = jnp.where(was_second > 0, 1.0, self.first_reward)
+        return self._state(jnp.ones(()), reward, was_second * self.terminates)
 
 
 def two_state_config(**changes) -> PPOConfig:
-    return PPOConfig(
-        num_envs=16, rollout_length=2, num_minibatches=2, hidden_layers=(16,), discount=0.9,
-        reward_scale=0.1, learning_rate=3e-3, target_kl=0.0, decay_steps=10**9, **changes,
-    )  # fmt: skip
+    settings = {
+        "num_envs": 16, "rollout_length": 2, "num_minibatches": 2, "hidden_layers": (16,),
+        "discount": 0.9, "reward_scale": 0.1, "learning_rate": 3e-3, "target_kl": 0.0,
+        "max_learning_rate": 3e-3, "decay_steps": 10**9, "critic_metrics": (),
+    }  # fmt: skip
+    return PPOConfig(**settings | changes)
 
 
 @pytest.mark.parametrize(
-    ("env", "expected"),
+    ("env", "critic_metrics", "expected"),
     [
         # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out were an end.
-        pytest.param(TwoStates(1.0, terminates=False), [1.0, 1.0], id="constant reward"),
+        pytest.param(TwoStates(1.0), (), [1.0, 1.0], id="constant reward"),
         # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led
         # on to the first state of the next episode, they would be worth 0.526 and 0.474.
-        pytest.param(TwoStates(0.0, terminates=False), [0.9, 1.0], id="second state pays"),
-        pytest.param(TwoStates(1.0, terminates=True), [0.19, 0.1], id="terminates"),
+        pytest.param(TwoStates(0.0), (), [0.9, 1.0], id="second state pays"),
+        pytest.param(TwoStates(0.0, hidden=True), ("n_bounces",), [0.9, 1.0], id="by metric"),
+        pytest.param(TwoStates(1.0, terminates=True), (), [0.19, 0.1], id="terminates"),
     ],
 )
-def test_time_out_bootstraps_the_old_episodes_last_state(env, expected):
-    config = two_state_config()
+def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, expected):
+    config = two_state_config(critic_metrics=critic_metrics)
     trainer = ppo.make_trainer(config, env, episode_steps=2)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 500))(jax.random.key(0))
     networks = policy.make_networks(config, env.observation_size, env.action_size)
+    seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]) if env.hidden else jnp.eye(2)
     values = networks.value_network.apply(
-        None, state.params.value, policy.normalize(jnp.eye(2), state.normalizer)
+        None, state.params.value, policy.normalize(seen, state.normalizer)
     )
     np.testing.assert_allclose(values, expected, atol=0.03)
-    assert metrics["loss/value"][-1] < 1e-3
     np.testing.assert_allclose(metrics["episode/return"][-1], 1.0 + env.first_reward, rtol=1e-6)
     np.testing.assert_allclose(metrics["episode/length"][-1], 2.0, rtol=1e-6)
     assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
 
 
 def test_episodes_do_not_all_time_out_together():
-    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0, False), episode_steps=1000)
+    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1000)
     steps = np.asarray(trainer.init(jax.random.key(0)).env.steps)
     assert steps.min() >= 0 and steps.max() < 1000
     assert len(np.unique(steps)) > 8
@@ -244,7 +252,13 @@ def test_episodes_do_not_all_time_out_together():
 
 def test_rollout_longer_than_an_episode_is_refused():
     with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
-        ppo.make_trainer(two_state_config(), TwoStates(1.0, False), episode_steps=1)
+        ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1)
+
+
+def test_unknown_critic_metric_is_refused():
+    config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
+    with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
+        ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
 
 
 # The trainer as a pure function
@@ -310,8 +324,20 @@ def test_counters(tiny, init, after_two):
     assert all(value.shape == (2,) for value in metrics.values())
     samples = 2 * tiny.num_envs * tiny.rollout_length
     # The normaliser counts the observations that it has seen.
-    assert float(np.ravel(state.normalizer.count)[0]) == samples
+    assert int(state.normalizer.count) == samples
     np.testing.assert_array_equal(metrics["task/non_finite"], 0)
+
+
+def test_policy_sees_only_the_observation(tiny, after_two):
+    state, _ = after_two
+    assert state.normalizer.mean.shape == (29 + len(tiny.critic_metrics),)
+    acting = ppo.policy_of(state)
+    np.testing.assert_array_equal(acting.normalizer.mean, state.normalizer.mean[:29])
+    networks = policy.make_networks(tiny, 29, 6)
+    observation = state.normalizer.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
+    actions = policy.act(networks, acting, observation)
+    assert actions.shape == (3, 6)
+    assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
 
 
 def test_four_iterations_equal_two_and_two(trainer, init, run_two, after_two):

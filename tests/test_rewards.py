@@ -6,10 +6,10 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 from bounce_mjx.config import EnvConfig, RewardConfig
 from bounce_mjx.rewards import TERM_NAMES, RewardInputs, weighted_terms
+from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = (
     "position",

@@ -21,7 +21,8 @@ NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, lt=2**31)]
+Steps = Annotated[int, Field(ge=1, le=10**12)]
 
 
 class _Config(pydantic.BaseModel):
@@ -321,6 +322,12 @@ class EnvConfig(_Config):
             )
         return self
 
+    @pydantic.field_validator("mjcf")
+    @classmethod
+    def _make_absolute(cls, path: Path | None) -> Path | None:
+        """A run's config is read from other folders too."""
+        return None if path is None else path.expanduser().absolute()
+
     @property
     def num_substeps(self) -> int:
         """Physics steps in one control step."""
@@ -351,7 +358,7 @@ class PPOConfig(_Config):
     """Upper limit of the learning rate at the start of the training."""
     final_max_learning_rate: Positive = 1e-4
     """Upper limit of the learning rate at and after decay_steps."""
-    decay_steps: Count = 40_000_000
+    decay_steps: Steps = 20_000_000
     """Environment steps over which the upper limit goes down, in equal ratios."""
     target_kl: NonNegative = 0.01
     """KL divergence of one update that the learning rate is steered to; 0 leaves it as it is."""
@@ -378,7 +385,13 @@ class PPOConfig(_Config):
     depends on the bounce count, which the observation lacks."""
 
     @pydantic.model_validator(mode="after")
-    def _check_batch(self):
+    def _check_batch_and_learning_rates(self):
+        limits = (self.final_max_learning_rate, self.max_learning_rate)
+        if self.min_learning_rate > min(limits):
+            raise ValueError(
+                f"min_learning_rate {self.min_learning_rate} is above the upper limits "
+                f"max_learning_rate {limits[1]} and final_max_learning_rate {limits[0]}; lower it"
+            )
         batch = self.num_envs * self.rollout_length
         if batch % self.num_minibatches:
             raise ValueError(
@@ -403,11 +416,11 @@ class TrainConfig(_Config):
     """The trainer."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Seed of the whole training."""
-    total_steps: Count = 50_000_000
+    total_steps: Steps = 50_000_000
     """Environment steps to train for, rounded up to whole blocks."""
-    block_steps: Count = 1_000_000
+    block_steps: Steps = 1_000_000
     """Environment steps between two progress reports, rounded to whole iterations."""
-    eval_every: Count = 2_000_000
+    eval_every: Steps = 2_000_000
     """Environment steps between two evaluations, rounded to whole blocks."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the five results."""

@@ -83,6 +83,11 @@ class Report(NamedTuple):
         met = sum(result.passed is not False for result in self.results)
         return met, self.details["mean_return"]
 
+    @classmethod
+    def from_dict(cls, plain: dict) -> "Report":
+        """The report of `to_dict`."""
+        return cls(tuple(Result(**result) for result in plain["results"]), plain["details"])
+
     def to_dict(self) -> dict:
         """The report as plain data, for JSON."""
         return {

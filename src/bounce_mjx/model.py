@@ -75,7 +75,7 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     for joint, name in zip(joints, JOINT_NAMES, strict=True):
         driving = [
             i
-            for i in range(mj_model.nu)
+            for i in range(len(mj_model.actuator_trntype))
             if mj_model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
             and mj_model.actuator_trnid[i, 0] == joint
         ]

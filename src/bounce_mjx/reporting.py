@@ -1,23 +1,35 @@
 """What a training shows and writes while it runs: the progress line and the TensorBoard log."""
 
 import math
+import typing
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
-from tensorboardX import SummaryWriter
 
 from bounce_mjx.evaluation import Report
+
+if typing.TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
+
+
+def open_log(run: Path) -> "SummaryWriter":
+    """Opens the TensorBoard log of a run."""
+    # tensorboardX imports PyTorch where that is installed, which takes seconds; this way they
+    # pass beside the compilation.
+    from tensorboardX import SummaryWriter
+
+    return SummaryWriter(logdir=str(run))
 
 
 class Reporter:
     """Shows a progress bar on a terminal, a line a block elsewhere, and logs scalars."""
 
-    def __init__(self, run: Path, console: Console, total_steps: int, first_step: int):
+    def __init__(self, log: "SummaryWriter", console: Console, total_steps: int, first_step: int):
         self._console = console
-        self._writer = SummaryWriter(logdir=str(run))
+        self._writer = log
         self._progress = Progress(
             TextColumn("[bold]training"),
             BarColumn(),

@@ -59,7 +59,7 @@ def create_run(config: TrainConfig) -> Path:
             copies += 1
             folder = config.log_dir / f"{stamp}_{copies}"
         folder.mkdir()
-        (folder / CONFIG_FILE).write_text(dump_config(config), encoding="utf-8")
+        save_config(folder, config)
     except OSError as error:
         raise UserError(
             f"the run's folder cannot be made in {config.log_dir} ({error.strerror}); choose a "
@@ -153,6 +153,26 @@ def load_training_state(checkpoint: Checkpoint, template: TrainingState) -> Trai
     return _restore(checkpoint, "training", template)
 
 
+def save_config(run: Path, config: TrainConfig) -> None:
+    """Writes the run's resolved config."""
+    (run / CONFIG_FILE).write_text(dump_config(config), encoding="utf-8")
+
+
+def load_results(run: Path) -> dict[str, Any] | None:
+    """The run's results; None if it has none yet.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    path = run / RESULTS_FILE
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}); delete it to go on without it") from error
+
+
 def save_results(run: Path, results: dict[str, Any]) -> None:
     """Writes the run's results as JSON."""
     text = json.dumps(results, indent=2) + "\n"
@@ -175,6 +195,8 @@ class CheckpointWriter:
 
     def save(self, name: CheckpointName, steps: int, state: TrainingState) -> None:
         """Starts to save the state after `steps` environment steps; training may go on."""
+        # A copy, as the training reuses the memory of its state while orbax still writes.
+        state = jax.tree.map(np.array, state)
         items = ocp.args.Composite(
             policy=ocp.args.StandardSave(policy_of(state)),
             training=ocp.args.StandardSave(state),

@@ -1,12 +1,13 @@
 """The main job: trains a policy, and leaves a run's folder with it (`python train_jax.py`)."""
 
 import concurrent.futures
+import dataclasses
 import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
@@ -19,15 +20,17 @@ from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import Report, judge, make_evaluator
 from bounce_mjx.policy import make_networks
-from bounce_mjx.ppo import TrainingState, make_trainer, policy_of
-from bounce_mjx.reporting import Reporter, details_line, results_table
+from bounce_mjx.ppo import Trainer, TrainingState, make_trainer, policy_of
+from bounce_mjx.reporting import Reporter, details_line, open_log, results_table
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import (
     CheckpointWriter,
     create_run,
     find_checkpoint,
+    load_results,
     load_run_config,
     load_training_state,
+    save_config,
     save_results,
 )
 
@@ -149,39 +152,53 @@ def train(command: TrainCommand, console: Console) -> Outcome:
     config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
     env = BounceBall(config.env)
     trainer = make_trainer(config.ppo, env, config.env.episode_steps)
-    checkpoint = (
-        find_checkpoint(command.resume / "checkpoints" / "latest", command.resume)
-        if command.resume
-        else None
-    )
     iterations = max(1, round(config.block_steps / config.ppo.batch_steps))
     block_steps = iterations * config.ppo.batch_steps
     blocks_per_eval = max(1, round(config.eval_every / block_steps))
-    run = checkpoint.run if checkpoint else create_run(config)
+    if command.resume:
+        run = find_checkpoint(command.resume, command.resume).run
+        checkpoint = find_checkpoint(run / "checkpoints" / "latest", run)
+    else:
+        run, checkpoint = create_run(config), None
+    progress = _Progress.of_run(run) if checkpoint else _Progress()
 
     console.print(f"physics: {env.engine.name} ({env.engine.reason})", highlight=False)
-    console.print(
-        f"device: {jax.devices()[0].device_kind}  run: {run}", highlight=False, soft_wrap=True
-    )
+    device = jax.devices()[0].device_kind
+    console.print(f"device: {device}  run: {run}", highlight=False, soft_wrap=True)
     clock.lap("setup")
 
     key = jax.random.PRNGKey(config.seed)
+    pool = concurrent.futures.ThreadPoolExecutor()
     with console.status("compiling"):
-        programs = compile_programs(config, env, trainer, iterations)
+        log = pool.submit(open_log, run)
+        programs = compile_programs(config, env, trainer, iterations, pool)
         if checkpoint:
             state = load_training_state(checkpoint, jax.eval_shape(trainer.init, key))
+            save_config(run, config)
         else:
             state = programs.init(key)
         jax.block_until_ready(state)
+    pool.shutdown(wait=False)
     clock.lap("compile")
 
     steps = int(state.iteration) * config.ppo.batch_steps
-    best: tuple[Report, int] | None = None
-    solved_steps = None
-    blocks = 0
     writer = CheckpointWriter(run)
-    with Reporter(run, console, config.total_steps, steps) as reporter:
-        while steps < config.total_steps or best is None:
+    with Reporter(log.result(), console, config.total_steps, steps) as reporter:
+
+        def evaluate() -> Report:
+            report = programs.evaluate(state)
+            clock.lap("evaluate")
+            reporter.evaluation(steps, report)
+            writer.save("latest", steps, state)
+            if progress.improves(report, steps):
+                writer.save("best", steps, state)
+            clock.lap("save")
+            return report
+
+        if progress.best is None and steps >= config.total_steps:
+            evaluate()
+        blocks = 0
+        while steps < config.total_steps:
             started = time.perf_counter()
             state, metrics = programs.run(state)
             metrics = {name: np.asarray(value) for name, value in metrics.items()}
@@ -191,24 +208,14 @@ def train(command: TrainCommand, console: Console) -> Outcome:
             metrics["speed/steps_per_second"] = np.array([block_steps / seconds])
             reporter.block(steps, seconds, metrics)
             clock.lap("train")
-
             if blocks % blocks_per_eval == 0 or steps >= config.total_steps:
-                report = programs.evaluate(state)
-                clock.lap("evaluate")
-                reporter.evaluation(steps, report)
-                writer.save("latest", steps, state)
-                if best is None or report.score >= best[0].score:
-                    best = (report, steps)
-                    writer.save("best", steps, state)
-                if report.passed and solved_steps is None:
-                    solved_steps = steps
-                clock.lap("save")
+                report = evaluate()
                 if report.passed and config.stop_when_solved:
                     break
     writer.close()
     clock.lap("save")
 
-    outcome = Outcome(run, *best, solved_steps, clock.seconds)
+    outcome = Outcome(run, progress.best, progress.best_steps, progress.solved_steps, clock.seconds)
     save_results(
         run,
         {
@@ -216,11 +223,37 @@ def train(command: TrainCommand, console: Console) -> Outcome:
             "solved_steps": outcome.solved_steps,
             "trained_steps": steps,
             "seconds": outcome.seconds,
-            "device": jax.devices()[0].device_kind,
+            "device": device,
             **outcome.report.to_dict(),
         },
     )
     return outcome
+
+
+@dataclasses.dataclass
+class _Progress:
+    """The best evaluation of a run so far."""
+
+    best: Report | None = None
+    best_steps: int = 0
+    solved_steps: int | None = None
+
+    @classmethod
+    def of_run(cls, run: Path) -> "_Progress":
+        """That of a run which is resumed."""
+        results = load_results(run)
+        if results is None:
+            return cls()
+        return cls(Report.from_dict(results), results["best_steps"], results["solved_steps"])
+
+    def improves(self, report: Report, steps: int) -> bool:
+        """Takes a new evaluation in, and tells whether it is the best."""
+        if report.passed and self.solved_steps is None:
+            self.solved_steps = steps
+        if self.best is not None and report.score < self.best.score:
+            return False
+        self.best, self.best_steps = report, steps
+        return True
 
 
 class Programs(NamedTuple):
@@ -232,36 +265,41 @@ class Programs(NamedTuple):
 
 
 def compile_programs(
-    config: TrainConfig, env: BounceBall, trainer: Any, iterations: int
+    config: TrainConfig,
+    env: BounceBall,
+    trainer: Trainer,
+    iterations: int,
+    pool: concurrent.futures.Executor,
 ) -> Programs:
-    """Compiles the programs side by side, as each takes seconds."""
+    """Compiles the programs side by side, as each takes seconds; returns once the training can
+    start."""
     key = jax.random.PRNGKey(config.seed)
     init = jax.jit(trainer.init)
     state = jax.eval_shape(init, key)
+    policy = jax.eval_shape(policy_of, state)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    full = make_evaluator(env, networks, config.eval_episodes)
-    screening = make_evaluator(env, networks, max(1, config.screening_episodes))
     run = jax.jit(trainer.run, static_argnums=1, donate_argnums=0)
 
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        compiled_run = pool.submit(lambda: run.lower(state, iterations).compile())
-        compiled_full = pool.submit(lambda: full.lower(policy_of(state), key).compile())
-        compiled_init = pool.submit(lambda: init.lower(key).compile())
-        if config.screening_episodes:
-            compiled_screening = pool.submit(
-                lambda: screening.lower(policy_of(state), key).compile()
-            )
-    eval_key = jax.random.PRNGKey(config.eval_seed)
+    def compile_evaluator(episodes: int):
+        return make_evaluator(env, networks, episodes).lower(policy, key).compile()
+
+    compiled_run = pool.submit(lambda: run.lower(state, iterations).compile())
+    compiled_init = pool.submit(lambda: init.lower(key).compile())
+    evaluator = pool.submit(compile_evaluator, config.eval_episodes)
+    screening = (
+        pool.submit(compile_evaluator, config.screening_episodes)
+        if config.screening_episodes
+        else None
+    )
+    eval_key, screening_key = jax.random.split(jax.random.PRNGKey(config.eval_seed))
 
     def evaluate(state: TrainingState) -> Report:
         policy = policy_of(state)
-        if config.screening_episodes:
-            screened = judge(
-                env, compiled_screening.result()(policy, jax.random.fold_in(eval_key, 1))
-            )
+        if screening is not None:
+            screened = judge(env, screening.result()(policy, screening_key))
             if not screened.passed:
                 return screened
-        return judge(env, compiled_full.result()(policy, eval_key))
+        return judge(env, evaluator.result()(policy, eval_key))
 
     return Programs(compiled_init.result(), compiled_run.result(), evaluate)
 

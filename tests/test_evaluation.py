@@ -1,0 +1,415 @@
+"""The five expected results: what is counted, how it is judged, and by which engine."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import State
+from brax.training.networks import FeedForwardNetwork
+
+from bounce_mjx import BounceBall, EnvConfig, policy
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.evaluation import (
+    Report,
+    Result,
+    Statistics,
+    accumulate,
+    empty_statistics,
+    judge,
+    make_evaluator,
+)
+from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
+
+BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
+TARGET_X = 0.58856
+
+
+@pytest.fixture(scope="module")
+def env():
+    return BounceBall()
+
+
+# Counting
+
+
+def states(rows) -> State:
+    """A batch, batch last, from one dict of values an episode."""
+    defaults = {
+        "x": TARGET_X, "y": 0.0, "vz": 0.0, "reward": 0.0, "done": 0.0,
+        "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0,
+    }  # fmt: skip
+    columns = {
+        name: jnp.array([row.get(name, default) for row in rows], jnp.float32)
+        for name, default in defaults.items()
+    }
+    obs = jnp.zeros((29, len(rows)))
+    obs = obs.at[6].set(columns["x"]).at[7].set(columns["y"]).at[21].set(columns["vz"])
+    metrics = {name: columns[name] for name in ("bounced", "n_bounces", "apex_error")}
+    return State(None, obs, columns["reward"], columns["done"], metrics)
+
+
+def count(env, steps, first_step=0) -> Statistics:
+    """Statistics after a list of steps, each a list of one dict an episode."""
+    statistics = empty_statistics(len(steps[0]))
+    for i, rows in enumerate(steps, start=first_step):
+        statistics = accumulate(env, statistics, states(rows), jnp.int32(i))
+    return jax.tree.map(np.asarray, statistics)
+
+
+def test_empty_statistics():
+    statistics = empty_statistics(3)
+    assert statistics.running.dtype == bool and np.all(statistics.running)
+    for name, value in statistics._asdict().items():
+        assert value.shape == (3,)
+        assert name == "running" or np.all(value == 0)
+
+
+def test_episode_counts_up_to_its_end(env):
+    row = {"reward": 2.0, "vz": 1.0, "n_bounces": 3.0, "bounced": 1.0}
+    last = row | {"done": 1.0, "n_bounces": 4.0}
+    late = row | {"n_bounces": 9.0}
+    s = count(env, [[row, row], [last, row], [late, row], [late, row]], first_step=300)
+    np.testing.assert_array_equal(s.running, [False, True])
+    np.testing.assert_array_equal(s.steps, [2, 4])
+    np.testing.assert_array_equal(s.episode_return, [4, 8])
+    np.testing.assert_array_equal(s.max_bounces, [4, 3])
+    np.testing.assert_array_equal(s.settled_steps, [2, 4])
+    np.testing.assert_array_equal(s.centred_steps, [2, 4])
+    np.testing.assert_array_equal(s.settled_bounces, [2, 4])
+    np.testing.assert_array_equal(s.accurate_bounces, [2, 4])
+    np.testing.assert_array_equal(s.rising_steps, [2, 4])
+
+
+def test_largest_count_is_kept(env):
+    s = count(env, [[{"n_bounces": n}] for n in (1.0, 2.0, 3.0, 1.0)])
+    np.testing.assert_array_equal(s.max_bounces, [3])
+
+
+def test_settling_takes_two_seconds(env):
+    """Step i, from 0, ends at (i + 1) * 0.01 s; the first 200 end within the first 2 s."""
+    row = {"bounced": 1.0, "apex_error": 0.05, "vz": 1.0}
+    s = count(env, [[row]] * 4, first_step=198)
+    np.testing.assert_array_equal(s.settled_steps, [2])
+    np.testing.assert_array_equal(s.centred_steps, [2])
+    np.testing.assert_array_equal(s.settled_bounces, [2])
+    np.testing.assert_array_equal(s.accurate_bounces, [2])
+    np.testing.assert_allclose(s.apex_error, [0.1])
+    # The upward speed is of the whole episode.
+    np.testing.assert_array_equal(s.rising_steps, [4])
+
+
+def test_settling_follows_the_control_step():
+    env = BounceBall(EnvConfig(control_dt=0.02))
+    s = count(env, [[{}]] * 4, first_step=98)
+    np.testing.assert_array_equal(s.settled_steps, [2])
+
+
+@pytest.mark.parametrize(
+    ("row", "centred"),
+    [
+        ({"x": TARGET_X + 0.0499}, 1),
+        ({"x": TARGET_X + 0.0501}, 0),
+        ({"x": TARGET_X - 0.0499}, 1),
+        ({"x": TARGET_X - 0.0501}, 0),
+        ({"y": 1.0}, 1),
+    ],
+)
+def test_centred_is_within_five_centimetres_in_x(row, centred, env):
+    np.testing.assert_array_equal(count(env, [[row]], first_step=500).centred_steps, [centred])
+
+
+def test_centred_follows_the_configured_target():
+    reward = EnvConfig().reward.model_copy(update={"target_x": 0.5})
+    env = BounceBall(EnvConfig(reward=reward))
+    s = count(env, [[{"x": 0.54}, {"x": 0.56}]], first_step=500)
+    np.testing.assert_array_equal(s.centred_steps, [1, 0])
+
+
+@pytest.mark.parametrize(("error", "accurate"), [(0.0999, 1), (0.1001, 0)])
+def test_accurate_is_within_ten_centimetres(error, accurate, env):
+    s = count(env, [[{"bounced": 1.0, "apex_error": error}]], first_step=500)
+    np.testing.assert_array_equal(s.settled_bounces, [1])
+    np.testing.assert_array_equal(s.accurate_bounces, [accurate])
+    np.testing.assert_allclose(s.apex_error, [error], rtol=1e-6)
+
+
+def test_apex_counts_only_at_bounces(env):
+    s = count(env, [[{"apex_error": 0.05}]], first_step=500)
+    for value in (s.settled_bounces, s.accurate_bounces, s.apex_error):
+        np.testing.assert_array_equal(value, [0])
+
+
+def test_speed_is_of_the_rising_ball(env):
+    s = count(env, [[{"vz": v}] for v in (0.5, -3.0, 0.0, 1.0)])
+    np.testing.assert_array_equal(s.rising_steps, [2])
+    np.testing.assert_array_equal(s.rising_speed, [1.5])
+
+
+# Judging
+
+EPISODES = 200
+
+
+def statistics(**changes) -> Statistics:
+    """Of 200 episodes of 20 s that meet every result; `changes` replace fields."""
+    perfect = {
+        "running": True, "steps": 2000, "episode_return": 20_000, "max_bounces": 40,
+        "settled_steps": 1800, "centred_steps": 1800, "settled_bounces": 30,
+        "accurate_bounces": 30, "apex_error": 0.6, "rising_steps": 900, "rising_speed": 900,
+    }  # fmt: skip
+    values = {name: np.broadcast_to(value, EPISODES) for name, value in perfect.items()}
+    values |= {name: np.broadcast_to(value, EPISODES) for name, value in changes.items()}
+    running = values.pop("running").astype(bool)
+    return Statistics(running, **{name: v.astype(np.float32) for name, v in values.items()})
+
+
+def first(number, value, rest):
+    """`value` in the first `number` episodes, `rest` in the others."""
+    return np.where(np.arange(EPISODES) < number, value, rest)
+
+
+def test_perfect_statistics_pass(env):
+    report = judge(env, statistics())
+    assert report.passed
+    assert [result.passed for result in report.results] == [True] * 5
+    assert [result.value for result in report.results] == [100, 100, 100, 1, 100]
+    assert report.details["episodes"] == EPISODES
+    assert report.details["mean_consecutive_bounces"] == 40
+    assert report.details["mean_return"] == 20_000
+    np.testing.assert_allclose(report.details["mean_apex_error_m"], 0.02, rtol=1e-6)
+    np.testing.assert_allclose(report.details["mean_length_s"], 20.0)
+    assert report.score == (5, 20_000)
+
+
+@pytest.mark.parametrize(
+    ("result", "changes", "value", "passed"),
+    [
+        # 99% of 200 episodes are 198.
+        (BOUNCES, {"max_bounces": first(198, 3, 2)}, 99.0, True),
+        (BOUNCES, {"max_bounces": first(197, 3, 2)}, 98.5, False),
+        (BOUNCES, {"max_bounces": 2}, 0.0, False),
+        # 95% of 1,800 steps are 1,710, of 30 bounces 28.5.
+        (HORIZONTAL, {"centred_steps": 1710}, 95.0, True),
+        (HORIZONTAL, {"centred_steps": first(1, 1709, 1710)}, 100 * 341999 / 360000, False),
+        (HEIGHT, {"accurate_bounces": first(100, 28, 29)}, 95.0, True),
+        (HEIGHT, {"accurate_bounces": first(101, 28, 29)}, 100 * 5699 / 6000, False),
+        (SPEED, {"rising_speed": 90.1}, 90.1 / 900, True),
+        (SPEED, {"rising_speed": 89.9}, 89.9 / 900, False),
+        (SPEED, {"rising_speed": 1349.9}, 1349.9 / 900, True),
+        (SPEED, {"rising_speed": 1350.1}, 1350.1 / 900, False),
+        (STABLE, {"running": first(198, True, False)}, 99.0, True),
+        (STABLE, {"running": first(197, True, False)}, 98.5, False),
+    ],
+)
+def test_result_at_its_bound(result, changes, value, passed, env):
+    report = judge(env, statistics(**changes))
+    np.testing.assert_allclose(report.results[result].value, value, rtol=1e-6)
+    expected = [True] * 5
+    expected[result] = passed
+    assert [r.passed for r in report.results] == expected
+    assert report.passed == passed
+
+
+def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
+    """One long accurate episode outweighs many short ones."""
+    report = judge(
+        env,
+        statistics(
+            settled_steps=first(1, 1000, 1),
+            centred_steps=first(1, 1000, 0),
+            settled_bounces=first(1, 5000, 1),
+            accurate_bounces=first(1, 5000, 0),
+        ),
+    )
+    np.testing.assert_allclose(report.results[HORIZONTAL].value, 100 * 1000 / 1199)
+    np.testing.assert_allclose(report.results[HEIGHT].value, 100 * 5000 / 5199)
+    assert [report.results[i].passed for i in (HORIZONTAL, HEIGHT)] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("result", "changes"),
+    [
+        (HEIGHT, {"settled_bounces": 0, "accurate_bounces": 0, "apex_error": 0}),
+        (HORIZONTAL, {"settled_steps": 0, "centred_steps": 0}),
+        (SPEED, {"rising_steps": 0, "rising_speed": 0}),
+    ],
+)
+def test_nothing_to_measure_fails(result, changes, env):
+    report = judge(env, statistics(**changes))
+    assert report.results[result].passed is False
+    assert report.results[result].value == 0
+    assert not report.passed
+    assert np.all(np.isfinite(list(report.details.values())))
+
+
+def test_fresh_statistics_fail_without_a_crash(env):
+    report = judge(env, empty_statistics(4)._replace(running=jnp.zeros(4, bool)))
+    assert [result.passed for result in report.results] == [False] * 5
+    assert report.score == (0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("target_range", "judged"),
+    [
+        ((0.4, 0.6), True),
+        ((0.5, 0.5), True),
+        ((0.3, 0.6), False),
+        ((0.4, 0.8), False),
+        ((0.8, 0.8), False),
+    ],
+)
+def test_upward_speed_is_judged_only_for_low_targets(target_range, judged):
+    env = BounceBall(EnvConfig(target_height_range=target_range))
+    for speed, passed in ((900, True), (9000, False)):
+        report = judge(env, statistics(rising_speed=speed))
+        assert report.results[SPEED].passed is (passed if judged else None)
+        np.testing.assert_allclose(report.results[SPEED].value, speed / 900)
+        assert report.passed == (passed or not judged)
+
+
+def report_of(passed, mean_return) -> Report:
+    results = tuple(Result("", "", 0.0, "", p) for p in passed)
+    return Report(results, {"mean_return": mean_return})
+
+
+def test_score_orders_by_results_met_and_then_by_return():
+    worst_first = [
+        report_of([False] * 5, 500.0),
+        report_of([True] + [False] * 4, 100.0),
+        report_of([False] * 4 + [True], 200.0),
+        report_of([True] * 4 + [False], 50.0),
+        report_of([True, True, True, None, True], 10.0),
+        report_of([True] * 5, 20.0),
+    ]
+    scores = [report.score for report in worst_first]
+    assert scores == sorted(scores) and len(set(scores)) == len(scores)
+
+
+def test_report_as_json(env):
+    report = judge(env, statistics(max_bounces=2))
+    data = json.loads(json.dumps(report.to_dict()))
+    assert data["passed"] is False
+    assert [r["passed"] for r in data["results"]] == [False, True, True, True, True]
+    assert data["details"] == report.details
+
+
+# Evaluators
+
+
+@pytest.fixture(scope="module")
+def networks():
+    return policy.make_networks(PPOConfig(hidden_layers=(16,)), 29, 6)
+
+
+@pytest.fixture(scope="module")
+def random_policy(networks):
+    """A policy before any training."""
+    params = networks.policy_network.init(jax.random.key(5))
+    return policy.Policy(policy.init_normalizer(29), params)
+
+
+def holding_policy(networks):
+    """Networks and a policy that hold the paddle level at home, where balls bounce for some 3 s,
+    or tilted if the target is above 0.5 m, so that they fall off."""
+    home = jnp.array(EnvConfig().default_joint_angles)
+    tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
+
+    def apply(_, params, obs):
+        wanted = home + tilt * (obs[..., 28:] > 0.5)
+        mean = params["gain"] * (wanted - obs[..., :6])
+        return mean, jnp.ones_like(mean)
+
+    network = FeedForwardNetwork(init=None, apply=apply)
+    holding = policy.Policy(policy.init_normalizer(29), {"gain": jnp.float32(50.0)})
+    return networks.replace(policy_network=network), holding
+
+
+def test_evaluator_equals_a_python_loop(networks):
+    episodes, key = 6, jax.random.key(21)
+    env = BounceBall(EnvConfig(episode_seconds=2.6))
+    networks, holding = holding_policy(networks)
+    actual = make_evaluator(env, networks, episodes)(holding, key)
+
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    act = jax.jit(lambda obs: policy.act(networks, holding, obs))
+    expected = {name: np.zeros(episodes) for name in Statistics._fields}
+    for i, episode_key in enumerate(jax.random.split(key, episodes)):
+        state, sums = reset(episode_key), dict.fromkeys(Statistics._fields, 0.0)
+        for t in range(260):
+            state = step(state, act(state.obs))
+            sums["steps"] += 1
+            sums["episode_return"] += float(state.reward)
+            sums["max_bounces"] = max(sums["max_bounces"], float(state.metrics["n_bounces"]))
+            if t >= 200:
+                sums["settled_steps"] += 1
+                sums["centred_steps"] += abs(state.obs[6] - TARGET_X) <= 0.05
+                if state.metrics["bounced"]:
+                    error = float(state.metrics["apex_error"])
+                    sums["settled_bounces"] += 1
+                    sums["accurate_bounces"] += error <= 0.1
+                    sums["apex_error"] += error
+            if state.obs[21] > 0:
+                sums["rising_steps"] += 1
+                sums["rising_speed"] += float(state.obs[21])
+            if state.done:
+                break
+        else:
+            sums["running"] = 1.0
+        for name, value in sums.items():
+            expected[name][i] = value
+
+    assert 0 < expected["running"].sum() < episodes, "both kinds of episodes are wanted"
+    assert expected["settled_bounces"].sum() > 0
+    for name, value in expected.items():
+        # Each contact magnifies the rounding of the differently compiled steps.
+        np.testing.assert_allclose(getattr(actual, name), value, rtol=1e-2, err_msg=name)
+
+
+class CountingBall(BounceBall):
+    """Counts how often a batch of it is stepped."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.steps = 0
+
+    def _count(self):
+        self.steps += 1
+
+    def step(self, state, action):
+        jax.debug.callback(self._count)
+        return super().step(state, action)
+
+
+def test_evaluator_stops_when_all_episodes_have_ended(networks, random_policy):
+    env = CountingBall(EnvConfig(min_ball_height=0.4))
+    evaluate = make_evaluator(env, networks, 4)
+    statistics = evaluate(random_policy, jax.random.key(0))
+    jax.effects_barrier()
+    assert not np.any(statistics.running)
+    # Free fall through 0.04 to 0.06 m.
+    assert np.all((statistics.steps >= 8) & (statistics.steps <= 12))
+    assert env.steps == statistics.steps.max()
+
+    again, other = (evaluate(random_policy, jax.random.key(seed)) for seed in (0, 1))
+    np.testing.assert_array_equal(again.episode_return, statistics.episode_return)
+    drawn = np.concatenate([again.episode_return, other.episode_return])
+    assert len(np.unique(drawn)) == 8
+
+
+def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
+    env = BounceBall(EnvConfig(episode_seconds=1.0))
+    assert env.backend == "fused"
+    key = jax.random.key(31)
+    fused = make_evaluator(env, networks, 8)(random_policy, key)
+    mujoco = make_mujoco_evaluator(env, networks, 8)(random_policy, key)
+    assert np.any(fused.max_bounces > 0), "a contact is wanted"
+    assert not np.all(fused.running), "an end is wanted"
+    np.testing.assert_array_equal(mujoco.running, fused.running)
+    np.testing.assert_array_equal(mujoco.max_bounces, fused.max_bounces)
+    np.testing.assert_allclose(mujoco.steps, fused.steps, rtol=0, atol=1)
+    np.testing.assert_allclose(mujoco.rising_steps, fused.rising_steps, rtol=0, atol=1)
+    np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
+    # One step more or less is worth up to about 15.
+    np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
