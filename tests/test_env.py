@@ -285,8 +285,8 @@ def test_step_equals_ten_substeps_of_mujoco(env, reset, step, model):
         after = step(with_physics(state, physics), jnp.array(action)).pipeline_state.physics
         data = c_step(model, physics, action)
         touched += data.qvel[8] > -2
-        np.testing.assert_allclose(after.qpos, data.qpos, rtol=0, atol=5e-6)
-        np.testing.assert_allclose(after.qvel, data.qvel, rtol=0, atol=2e-3)
+        np.testing.assert_allclose(after.qpos, data.qpos, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(after.qvel, data.qvel, rtol=0, atol=1e-4)
     assert touched >= 6
 
 
@@ -572,7 +572,6 @@ def test_non_finite_physics_ends_the_episode_and_goes_no_further(value, walked, 
     np.testing.assert_array_equal(after.obs, np.tile(walked.obs, (25, 1)))
 
 
-@pytest.mark.xfail(strict=True, reason="a reward of -inf leaves the environment uncounted")
 @pytest.mark.parametrize("speed", [1e20, 1e38])
 def test_diverged_physics_goes_no_further_either(speed, walked, finish):
     """Finite coordinates whose squares overflow, beyond MuJoCo's own limit of 1e10 (mjMAXVAL)."""

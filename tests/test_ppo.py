@@ -245,7 +245,7 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
 
 def test_episodes_do_not_all_time_out_together():
     trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1000)
-    steps = np.asarray(trainer.init(jax.random.key(0)).env.steps)
+    steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)
     assert steps.min() >= 0 and steps.max() < 1000
     assert len(np.unique(steps)) > 8
 
@@ -349,7 +349,6 @@ def test_four_iterations_equal_two_and_two(trainer, init, run_two, after_two):
     assert_identical(joined, metrics)
 
 
-@pytest.mark.xfail(strict=True, reason="brax's log_value is weakly typed: run compiles twice")
 def test_run_returns_the_types_that_it_takes(trainer, init):
     """Else a jitted `run` compiles again for its own result."""
     state = init(jax.random.key(0))

@@ -125,7 +125,7 @@ def test_runs_contain_what_they_are_to_test(unlimited, limited):
 def test_shapes(reset, step, actions):
     state = reset(RESET_KEY)
     assert vector.observe(state).shape == (NUM_ENVS, 29)
-    np.testing.assert_array_equal(state.steps, np.zeros(NUM_ENVS))
+    np.testing.assert_array_equal(state.clock, np.zeros(NUM_ENVS))
     np.testing.assert_array_equal(state.episode_return, np.zeros(NUM_ENVS))
     _, result = step(state, actions[0], STEP_KEYS[0], NO_LIMIT)
     assert result.observation.shape == result.final_observation.shape == (NUM_ENVS, 29)
@@ -161,7 +161,7 @@ def test_end_starts_a_new_episode(limited):
     results, states = limited
     for t in np.flatnonzero(results.truncated.any(axis=1)):
         after = states[t + 1]
-        np.testing.assert_array_equal(after.steps, 0)
+        np.testing.assert_array_equal(after.clock, 0)
         np.testing.assert_array_equal(after.episode_return, 0)
         # The balls of the old episodes have fallen; those of the new ones are back at rest.
         assert np.all(results.final_observation[t, :, 21] < -1)
@@ -229,5 +229,5 @@ def test_nan_action_ends_one_episode_and_leaves_the_others_alone(reset, step, ac
         np.testing.assert_array_equal(a[others], b[others])
     next_state, result = step(actual[0], actions[1], STEP_KEYS[1], NO_LIMIT)
     assert not result.terminated.any()
-    np.testing.assert_array_equal(next_state.steps, [2, 2, 1, 2])
+    np.testing.assert_array_equal(next_state.clock, [2, 2, 1, 2])
     assert jnp.all(jnp.isfinite(result.final_observation))

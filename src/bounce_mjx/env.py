@@ -14,6 +14,8 @@ from bounce_mjx.physics import Engine, PhysicsState, make_engine
 from bounce_mjx.rewards import TERM_NAMES, RewardInputs, weighted_terms
 
 OBSERVATION_SIZE = 29
+# MuJoCo's mjMAXVAL: a coordinate beyond it has diverged, and counts as non-finite.
+_MAX_COORDINATE = 1e10
 
 
 class TaskState(NamedTuple):
@@ -139,7 +141,9 @@ class BounceBall(Env):
         """
         config, at = self.config, self._addresses
         before = state.pipeline_state
-        finite = jnp.all(jnp.isfinite(physics.qpos)) & jnp.all(jnp.isfinite(physics.qvel))
+        finite = jnp.array(True)
+        for coordinates in physics:
+            finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
         physics = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), physics, before.physics
         )
@@ -207,8 +211,8 @@ def update_task(
     """Detects a bounce and counts it.
 
     A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
-    the apex before it was no lower than the tolerance below the target height, or if it is the
-    first one; otherwise the count restarts at 1.
+    the apex before it was no lower than the tolerance below the target height; otherwise the
+    count restarts at 1, which is also what the first bounce of an episode comes to.
 
     Args:
       ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
@@ -220,7 +224,7 @@ def update_task(
     rising = ball_velocity[2] > config.bounce_min_velocity
     near = jnp.abs(ball[2] - paddle[2]) < config.bounce_max_distance
     bounced = rising & ~task.rising & near
-    continues = (task.apex > task.target_height - config.apex_tolerance) | (task.n_bounces == 0)
+    continues = task.apex > task.target_height - config.apex_tolerance
     counted = jnp.where(continues, task.n_bounces + 1.0, 1.0)
     updated = TaskState(
         target_height=task.target_height,

@@ -141,19 +141,22 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return jnp.concatenate([observation, *extra], axis=-1)
 
     def init(key: jax.Array) -> TrainingState:
-        key, policy_key, value_key, env_key, steps_key = jax.random.split(key, 5)
+        key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
         params = Params(
             networks.policy_network.init(policy_key), networks.value_network.init(value_key)
         )
+        # brax starts the noise as a weakly typed number, with which `run` would compile again
+        # for its own result.
+        params = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), params)
         env_state = vector.reset(env, env_key, config.num_envs)
         # Episodes that all began together would all time out together.
-        steps = jax.random.randint(steps_key, (config.num_envs,), 0, episode_steps)
+        clock = jax.random.randint(clock_key, (config.num_envs,), 0, episode_steps)
         return TrainingState(
             params=params,
             optimizer=optimizer.init(params),
             normalizer=init_normalizer(env.observation_size + len(config.critic_metrics)),
             learning_rate=jnp.float32(config.learning_rate),
-            env=env_state._replace(steps=steps),
+            env=env_state._replace(clock=clock),
             key=key,
             iteration=jnp.int32(0),
         )

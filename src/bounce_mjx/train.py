@@ -155,29 +155,26 @@ def train(command: TrainCommand, console: Console) -> Outcome:
     iterations = max(1, round(config.block_steps / config.ppo.batch_steps))
     block_steps = iterations * config.ppo.batch_steps
     blocks_per_eval = max(1, round(config.eval_every / block_steps))
+    key = jax.random.PRNGKey(config.seed)
     if command.resume:
         run = find_checkpoint(command.resume, command.resume).run
-        checkpoint = find_checkpoint(run / "checkpoints" / "latest", run)
+        progress = _Progress.of_run(run)
+        latest = find_checkpoint(run / "checkpoints" / "latest", run)
+        resumed = load_training_state(latest, jax.eval_shape(trainer.init, key))
+        save_config(run, config)
     else:
-        run, checkpoint = create_run(config), None
-    progress = _Progress.of_run(run) if checkpoint else _Progress()
+        run, progress, resumed = create_run(config), _Progress(), None
 
     console.print(f"physics: {env.engine.name} ({env.engine.reason})", highlight=False)
     device = jax.devices()[0].device_kind
     console.print(f"device: {device}  run: {run}", highlight=False, soft_wrap=True)
     clock.lap("setup")
 
-    key = jax.random.PRNGKey(config.seed)
     pool = concurrent.futures.ThreadPoolExecutor()
     with console.status("compiling"):
         log = pool.submit(open_log, run)
         programs = compile_programs(config, env, trainer, iterations, pool)
-        if checkpoint:
-            state = load_training_state(checkpoint, jax.eval_shape(trainer.init, key))
-            save_config(run, config)
-        else:
-            state = programs.init(key)
-        jax.block_until_ready(state)
+        state = jax.block_until_ready(programs.init(key) if resumed is None else resumed)
     pool.shutdown(wait=False)
     clock.lap("compile")
 

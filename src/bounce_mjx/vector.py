@@ -16,7 +16,9 @@ class VectorState(NamedTuple):
 
     env: State
     """brax states, the batch last in every array."""
-    steps: jax.Array
+    clock: jax.Array
+    """Steps that count towards the time limit [B], int."""
+    length: jax.Array
     """Steps since the reset [B], int."""
     episode_return: jax.Array
     """Sum of the rewards since the reset [B]."""
@@ -48,7 +50,8 @@ def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
     states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
     return VectorState(
         env=states,
-        steps=jnp.zeros(num_envs, jnp.int32),
+        clock=jnp.zeros(num_envs, jnp.int32),
+        length=jnp.zeros(num_envs, jnp.int32),
         episode_return=jnp.zeros_like(states.reward),
     )
 
@@ -68,12 +71,12 @@ def step(
       key: consumed by the resets.
       episode_steps: length at which an episode is truncated.
     """
-    num_envs = state.steps.shape[0]
+    num_envs = state.clock.shape[0]
     stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
-    steps = state.steps + 1
+    clock, length = state.clock + 1, state.length + 1
     episode_return = state.episode_return + stepped.reward
     terminated = stepped.done > 0
-    truncated = (steps >= episode_steps) & ~terminated
+    truncated = (clock >= episode_steps) & ~terminated
     ended = terminated | truncated
 
     fresh = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
@@ -86,11 +89,12 @@ def step(
         truncated=truncated,
         metrics=stepped.metrics,
         episode_return=episode_return,
-        episode_length=steps,
+        episode_length=length,
     )
     next_state = VectorState(
         env=env_state,
-        steps=jnp.where(ended, 0, steps),
+        clock=jnp.where(ended, 0, clock),
+        length=jnp.where(ended, 0, length),
         episode_return=jnp.where(ended, 0.0, episode_return),
     )
     return next_state, result
