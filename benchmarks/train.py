@@ -77,6 +77,12 @@ def evaluate_on(run: str, engine: str, folder: Path) -> dict:
     return json.loads(out.read_text(encoding="utf-8"))
 
 
+def later_passes(record: dict) -> list[bool]:
+    """Whether each evaluation after the first that passed did so too."""
+    solved = record["solved_steps"] or float("inf")
+    return [e["passed"] for e in record["evaluations"] if e["steps"] > solved]
+
+
 def table(records: list[dict], engines: tuple[str, ...]) -> str:
     """Two tables: the time to the five results, and the five results on each engine."""
     times = [
@@ -85,6 +91,7 @@ def table(records: list[dict], engines: tuple[str, ...]) -> str:
             "-" if r["solved_steps"] is None else f"{r['solved_steps'] / 1e6:.2f}",
             *[f"{r['seconds'][phase]:.1f}" for phase in PHASES],
             f"{r['total_seconds']:.1f}",
+            f"{sum(later)} of {len(later)}" if (later := later_passes(r)) else "-",
         ]
         for r in records
     ]
@@ -101,6 +108,7 @@ def table(records: list[dict], engines: tuple[str, ...]) -> str:
         for engine in engines
     ]
     time_header = ["seed", "solved, M steps", *[f"{phase} s" for phase in PHASES], "total s"]
+    time_header.append("later evaluations passed")
     result_header = [
         "seed",
         "engine",

@@ -222,6 +222,7 @@ def train(command: TrainCommand, console: Console) -> Outcome:
             "seconds": outcome.seconds,
             "device": device,
             **outcome.report.to_dict(),
+            "evaluations": progress.evaluations,
         },
     )
     return outcome
@@ -229,11 +230,12 @@ def train(command: TrainCommand, console: Console) -> Outcome:
 
 @dataclasses.dataclass
 class _Progress:
-    """The best evaluation of a run so far."""
+    """The evaluations of a run so far."""
 
     best: Report | None = None
     best_steps: int = 0
     solved_steps: int | None = None
+    evaluations: list[dict] = dataclasses.field(default_factory=list)
 
     @classmethod
     def of_run(cls, run: Path) -> "_Progress":
@@ -241,10 +243,17 @@ class _Progress:
         results = load_results(run)
         if results is None:
             return cls()
-        return cls(Report.from_dict(results), results["best_steps"], results["solved_steps"])
+        return cls(
+            Report.from_dict(results),
+            results["best_steps"],
+            results["solved_steps"],
+            results["evaluations"],
+        )
 
     def improves(self, report: Report, steps: int) -> bool:
         """Takes a new evaluation in, and tells whether it is the best."""
+        values = {result.name: result.value for result in report.results}
+        self.evaluations.append({"steps": steps, "passed": report.passed, **values})
         if report.passed and self.solved_steps is None:
             self.solved_steps = steps
         if self.best is not None and report.score < self.best.score:

@@ -1,5 +1,6 @@
 """The mjx engine: MuJoCo's own JAX implementation, for any model that has the task's names."""
 
+import contextlib
 from typing import NamedTuple
 
 import jax
@@ -37,14 +38,22 @@ def step(
     constants: MjxModel, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu]."""
-    data = mjx.make_data(constants.model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
-    data = jax.lax.fori_loop(
-        0, num_substeps, lambda _, carry: mjx.step(constants.model, carry), data
-    )
+    with _full_precision():
+        data = mjx.make_data(constants.model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
+        data = jax.lax.fori_loop(
+            0, num_substeps, lambda _, carry: mjx.step(constants.model, carry), data
+        )
     return PhysicsState(data.qpos, data.qvel)
 
 
 def paddle_position(constants: MjxModel, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    data = mjx.make_data(constants.model).replace(qpos=qpos)
-    return mjx.kinematics(constants.model, data).geom_xpos[constants.paddle_geom]
+    with _full_precision():
+        data = mjx.make_data(constants.model).replace(qpos=qpos)
+        return mjx.kinematics(constants.model, data).geom_xpos[constants.paddle_geom]
+
+
+def _full_precision() -> contextlib.AbstractContextManager:
+    """Keeps MJX's matrix products in float32: the default on a GPU is tf32, whose three digits
+    make the ball bounce wrong."""
+    return jax.default_matmul_precision("highest")
