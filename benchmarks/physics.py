@@ -40,7 +40,7 @@ class Command(pydantic.BaseModel):
     """Numbers of environments."""
     engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
     """fused, mjx, and c: MuJoCo's C engine on all processor cores."""
-    control_steps: Annotated[int, Field(ge=1)] = 20
+    control_steps: Annotated[int, Field(ge=1)] = 50
     """Control steps in one measurement of the fused engine; the others, far slower, do 2."""
     repeats: Annotated[int, Field(ge=1)] = 5
     """Measurements of each engine."""

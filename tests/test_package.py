@@ -100,3 +100,11 @@ print(resource_path(f"configs/{preset}.yaml"))
     same, preset = run_installed(site, script, tmp_path)
     assert same == "True"
     assert Path(preset).parent == site / "bounce_mjx" / "configs"
+
+
+def test_readme_example_runs(capsys):
+    """The environment's example, as it stands."""
+    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    example = readme.split("```python\n")[1].split("```")[0]
+    exec(compile(example, "README.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("(64, 29) ")

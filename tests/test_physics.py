@@ -13,7 +13,7 @@ import pytest
 from bounce_mjx.config import EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.model import Addresses, find_addresses, load_model
-from bounce_mjx.physics import PhysicsState, chain, fused, make_engine
+from bounce_mjx.physics import PhysicsState, chain, fused, make_engine, mjx_engine
 from bounce_mjx.resources import resource_path
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
@@ -292,6 +292,21 @@ def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):
     print(f"200 steps x {few} against MJX: {contacts} contact steps, difference {error:.1e}")
     assert contacts >= 20
     assert error < 1e-6
+
+
+def test_mjx_multiplies_in_full_precision(mj_model):
+    """A GPU's default, tf32, has three digits: a policy that bounces elsewhere failed with it."""
+    constants = mjx_engine.read_model(mj_model)
+    state = PhysicsState(jnp.array(mj_model.qpos0), jnp.zeros(mj_model.nv))
+
+    def step_and_look(state, ctrl):
+        state = mjx_engine.step(constants, state, ctrl)
+        return state, mjx_engine.paddle_position(constants, state.qpos)
+
+    program = jax.jit(step_and_look).lower(state, jnp.zeros(mj_model.nu)).as_text()
+    products = [line for line in program.splitlines() if "dot_general" in line]
+    assert products
+    assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)
 
 
 @pytest.mark.parametrize("ball", ["bouncing", "falling"])

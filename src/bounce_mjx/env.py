@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from brax.envs.base import Env, State
 
 from bounce_mjx.config import EnvConfig
@@ -82,25 +81,26 @@ class BounceBall(Env):
         config, at = self.config, self._addresses
         # One draw for everything: the keys of separate draws would cost more than the numbers.
         noise = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
-        angles = jnp.array(config.default_joint_angles, noise.dtype)
-        ball = jnp.array(config.ball_init_pos, noise.dtype)
+        zero = jnp.zeros((), noise.dtype)
         low, high = config.target_height_range
 
-        qpos = jnp.array(self.mj_model.qpos0, noise.dtype)
-        qpos = qpos.at[at.arm_qpos,].set(angles + config.joint_angle_noise * noise[:6])
-        qpos = qpos.at[at.ball_qpos[:3],].set(ball + config.ball_position_noise * noise[12:15])
-        qpos = qpos.at[at.ball_qpos[3:],].set(jnp.array([1.0, 0.0, 0.0, 0.0], noise.dtype))
-        qvel = jnp.zeros(self.mj_model.nv, noise.dtype)
-        qvel = qvel.at[at.arm_qvel,].set(config.joint_velocity_noise * noise[6:12])
-        physics = PhysicsState(qpos, qvel)
+        qpos = [jnp.asarray(q, noise.dtype) for q in self.mj_model.qpos0]
+        qvel = [zero] * self.mj_model.nv
+        for i, angle in enumerate(config.default_joint_angles):
+            qpos[at.arm_qpos[i]] = angle + config.joint_angle_noise * noise[i]
+            qvel[at.arm_qvel[i]] = config.joint_velocity_noise * noise[6 + i]
+        for i, coordinate in enumerate(config.ball_init_pos):
+            qpos[at.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
+        for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
+            qpos[at.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
+        physics = PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
-        zero = jnp.zeros((), noise.dtype)
         task = TaskState(
             target_height=low + (high - low) * 0.5 * (noise[15] + 1.0),
             last_action=jnp.zeros(self.action_size, noise.dtype),
             rising=jnp.zeros((), bool),
             n_bounces=zero,
-            apex=qpos[at.ball_qpos[2]],
+            apex=physics.qpos[at.ball_qpos[2]],
         )
         metrics = {f"reward/{name}": zero for name in TERM_NAMES}
         metrics |= dict.fromkeys(
@@ -108,7 +108,7 @@ class BounceBall(Env):
         )
         return State(
             pipeline_state=BounceState(physics, task),
-            obs=self._observation(physics, task, self.engine.paddle_position(qpos)),
+            obs=self._observation(physics, task, self.engine.paddle_position(physics.qpos)),
             reward=zero,
             done=zero,
             metrics=metrics,
@@ -127,10 +127,13 @@ class BounceBall(Env):
         """Servo targets ctrl [nu] (rad) of a clipped action [6]: the measured joint angles plus
         the scaled action, clipped to the joint ranges."""
         at = self._addresses
-        lower, upper = np.array(self.mj_model.jnt_range[at.arm_joints,].T, np.float32)
-        measured = jnp.stack([physics.qpos[i] for i in at.arm_qpos])
-        targets = jnp.clip(measured + self.config.action_scale * action, lower, upper)
-        return jnp.zeros(self.mj_model.nu, targets.dtype).at[at.actuators,].set(targets)
+        ranges = self.mj_model.jnt_range[at.arm_joints,]
+        targets = [jnp.zeros_like(action[0])] * self.mj_model.nu
+        # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
+        for i, actuator in enumerate(at.actuators):
+            target = physics.qpos[at.arm_qpos[i]] + self.config.action_scale * action[i]
+            targets[actuator] = jnp.clip(target, *(float(limit) for limit in ranges[i]))
+        return jnp.stack(targets)
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
         """The task's part of a step: bounces, reward, end and observation, given the clipped
