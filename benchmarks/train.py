@@ -69,11 +69,15 @@ def train_once(seed: int, folder: Path, stop_when_solved: bool, extra: list[str]
 def evaluate_on(run: str, engine: str, folder: Path) -> dict:
     """The five results of a run's policy on one engine."""
     out = folder / f"{engine}.json"
-    subprocess.run(
+    finished = subprocess.run(
         [sys.executable, "-m", "bounce_mjx.eval", run, "--physics", engine, "--json", str(out)],
         stdout=subprocess.DEVNULL,
-        check=False,
+        stderr=subprocess.PIPE,
+        text=True,
     )
+    # 1 says that a result failed, which is a measurement too.
+    if finished.returncode not in (0, 1):
+        raise UserError(f"the evaluation on {engine} failed: {finished.stderr[-500:]}")
     return json.loads(out.read_text(encoding="utf-8"))
 
 
@@ -143,8 +147,14 @@ def main() -> None:
                 }
                 records.append(record)
                 solved = record["solved_steps"]
+                verdicts = ", ".join(
+                    f"{engine} {'pass' if report['passed'] else 'FAIL'} "
+                    + "/".join(f"{result['value']:.2f}" for result in report["results"])
+                    for engine, report in record["engines"].items()
+                )
                 print(
-                    f"seed {seed}: {record['total_seconds']:.1f} s, solved at {solved}", flush=True
+                    f"seed {seed}: {record['total_seconds']:.1f} s, solved at {solved}, {verdicts}",
+                    flush=True,
                 )
         device = device_name()
         text = f"Device: {device}\n\n{table(records, command.engines)}"
