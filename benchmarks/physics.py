@@ -17,24 +17,20 @@ from typing import Annotated, Literal
 import jax
 import mujoco
 import numpy as np
-import pydantic
 from mujoco import rollout
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.cli import parse
+from bounce_mjx.config import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 
 EngineName = Literal["fused", "mjx", "c"]
 
 
-class Command(pydantic.BaseModel):
+class Command(StrictModel):
     """The command line."""
-
-    model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
-    )
 
     batch_sizes: tuple[Annotated[int, Field(ge=1)], ...] = (512, 4096, 32768)
     """Numbers of environments."""

@@ -15,22 +15,18 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal
 
-import pydantic
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx.cli import parse
+from bounce_mjx.config import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 
 PHASES = ("import", "setup", "compile", "train", "evaluate", "save")
 
 
-class Command(pydantic.BaseModel):
+class Command(StrictModel):
     """The command line."""
-
-    model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
-    )
 
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2, 3, 4)
     """Seeds of the trainings."""

@@ -25,7 +25,7 @@ Count = Annotated[int, Field(ge=1, lt=2**31)]
 Steps = Annotated[int, Field(ge=1, le=10**12)]
 
 
-class _Config(pydantic.BaseModel):
+class StrictModel(pydantic.BaseModel):
     """An immutable, strict group of settings."""
 
     model_config = pydantic.ConfigDict(
@@ -33,7 +33,7 @@ class _Config(pydantic.BaseModel):
     )
 
 
-class PositionReward(_Config):
+class PositionReward(StrictModel):
     """Horizontal position: stay above the target point, most of all when the ball is near."""
 
     weight: Finite = 2.0
@@ -46,7 +46,7 @@ class PositionReward(_Config):
     """How much wider the Gaussian is at the paddle, as a factor."""
 
 
-class OutOfPositionReward(_Config):
+class OutOfPositionReward(StrictModel):
     """Out of position: a smooth penalty for a large horizontal error."""
 
     weight: Finite = 1.0
@@ -59,7 +59,7 @@ class OutOfPositionReward(_Config):
     """Width of the sigmoid, m."""
 
 
-class VelocityMatchingReward(_Config):
+class VelocityMatchingReward(StrictModel):
     """Velocity matching: pass the target height at the desired speed."""
 
     weight: Finite = 2.0
@@ -78,7 +78,7 @@ class VelocityMatchingReward(_Config):
     """Width of the Gaussian of the velocity error, m/s."""
 
 
-class HeightReward(_Config):
+class HeightReward(StrictModel):
     """Height: be near the target height."""
 
     weight: Finite = 4.5
@@ -87,7 +87,7 @@ class HeightReward(_Config):
     """Width of the Gaussian of the height error, m."""
 
 
-class HeightProgressReward(_Config):
+class HeightProgressReward(StrictModel):
     """Height progress: be high at all, so that hitting is found early."""
 
     weight: Finite = 1.0
@@ -98,7 +98,7 @@ class HeightProgressReward(_Config):
     """Reward per metre above the base height."""
 
 
-class ControlledUpwardReward(_Config):
+class ControlledUpwardReward(StrictModel):
     """Controlled upward velocity: rise at the speed that reaches the target, in position."""
 
     weight: Finite = 1.5
@@ -117,7 +117,7 @@ class ControlledUpwardReward(_Config):
     """Upward velocity above which the term grows no more, m/s."""
 
 
-class ConsecutiveBouncesReward(_Config):
+class ConsecutiveBouncesReward(StrictModel):
     """Consecutive bounces: the logarithm of the count, in position."""
 
     weight: Finite = 0.8
@@ -128,7 +128,7 @@ class ConsecutiveBouncesReward(_Config):
     """Width of the Gaussian of the horizontal error, m."""
 
 
-class HighBounceCountReward(_Config):
+class HighBounceCountReward(StrictModel):
     """High bounce count: proportional to the count once it passes the threshold, in position."""
 
     weight: Finite = 0.3
@@ -143,7 +143,7 @@ class HighBounceCountReward(_Config):
     """Width of the sigmoid, bounces."""
 
 
-class AlignmentReward(_Config):
+class AlignmentReward(StrictModel):
     """Alignment: keep the paddle under the ball, most of all at the hit."""
 
     weight: Finite = 0.6
@@ -160,7 +160,7 @@ class AlignmentReward(_Config):
     """Overall factor."""
 
 
-class PaddleHomeReward(_Config):
+class PaddleHomeReward(StrictModel):
     """Paddle home: return to the home height while the ball is away."""
 
     weight: Finite = 1.5
@@ -175,7 +175,7 @@ class PaddleHomeReward(_Config):
     """Width of the sigmoid, m."""
 
 
-class ExcessiveUpwardReward(_Config):
+class ExcessiveUpwardReward(StrictModel):
     """Excessive upward velocity: a smooth penalty for a ball hit too hard."""
 
     weight: Finite = 1.0
@@ -188,7 +188,7 @@ class ExcessiveUpwardReward(_Config):
     """Width of the sigmoid, m/s."""
 
 
-class DownwardVelocityReward(_Config):
+class DownwardVelocityReward(StrictModel):
     """Downward velocity: positive for a falling ball as the seed's formula stands, though its
     text calls the term a penalty; a negative weight makes it one."""
 
@@ -204,7 +204,7 @@ class DownwardVelocityReward(_Config):
     """Width of the sigmoid, m/s."""
 
 
-class PaddleHeightViolationReward(_Config):
+class PaddleHeightViolationReward(StrictModel):
     """Paddle height violation: a linear penalty beyond the tolerance around home."""
 
     weight: Finite = 1.0
@@ -215,21 +215,21 @@ class PaddleHeightViolationReward(_Config):
     """Height error of the paddle that costs nothing, m."""
 
 
-class ActionRateReward(_Config):
+class ActionRateReward(StrictModel):
     """Action rate: minus the squared change of the action."""
 
     weight: Finite = 1e-4
     """Weight of the term."""
 
 
-class JointVelocityReward(_Config):
+class JointVelocityReward(StrictModel):
     """Joint velocity: minus the sum of the squared joint velocities."""
 
     weight: Finite = 1e-4
     """Weight of the term."""
 
 
-class RewardConfig(_Config):
+class RewardConfig(StrictModel):
     """The fifteen reward terms: each a weight and the constants of its formula."""
 
     position: PositionReward = PositionReward()
@@ -257,7 +257,7 @@ class RewardConfig(_Config):
     """Gravity in the ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
 
 
-class EnvConfig(_Config):
+class EnvConfig(StrictModel):
     """The task: the model, its time steps, the resets, the bounces, the ends and the reward."""
 
     physics: Literal["auto", "fused", "mjx"] = "auto"
@@ -339,7 +339,7 @@ class EnvConfig(_Config):
         return round(self.episode_seconds / self.control_dt)
 
 
-class PPOConfig(_Config):
+class PPOConfig(StrictModel):
     """Proximal policy optimisation (Schulman et al. 2017) with a KL-adaptive learning rate."""
 
     num_envs: Count = 4096
@@ -407,7 +407,7 @@ class PPOConfig(_Config):
         return self.num_envs * self.rollout_length
 
 
-class TrainConfig(_Config):
+class TrainConfig(StrictModel):
     """A training run: the task, the trainer, and how long and how often."""
 
     env: EnvConfig = EnvConfig()
@@ -434,7 +434,7 @@ class TrainConfig(_Config):
     """Folder in which the run makes its own, named by the time."""
 
 
-ConfigT = TypeVar("ConfigT", bound=_Config)
+ConfigT = TypeVar("ConfigT", bound=StrictModel)
 
 
 def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:
@@ -533,7 +533,7 @@ def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
 
 def _dotted_keys(config_class: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
     for name, field in config_class.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, _Config):
+        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
             yield from _dotted_keys(field.annotation, f"{prefix}{name}.")
         else:
             yield prefix + name

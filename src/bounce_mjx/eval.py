@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
-import pydantic
 import tyro
 from pydantic import Field
 from rich.console import Console
 
 from bounce_mjx.cli import parse
-from bounce_mjx.config import EnvConfig, TrainConfig, validate
+from bounce_mjx.config import EnvConfig, StrictModel, TrainConfig, validate
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import DEFAULT_EPISODES, DEFAULT_SEED, Report, judge, make_evaluator
@@ -24,12 +23,8 @@ from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config
 from bounce_mjx.train import enable_compilation_cache
 
 
-class EvalCommand(pydantic.BaseModel):
+class EvalCommand(StrictModel):
     """The command line."""
-
-    model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
-    )
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
     """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run."""
