@@ -10,9 +10,10 @@ from bounce_mjx.config import PPOConfig
 
 # A normalised observation beyond this many standard deviations is clipped.
 MAX_NORMALIZED = 10.0
-# Least variance of an observation. The ball does not spin in the fused physics, so the variance of
-# its spin is 0 there; another engine's rounding must not be magnified to a signal.
+# Added to the variance of every observation.
 MIN_VARIANCE = 1e-6
+# An observation whose standard deviation is no more than what MIN_VARIANCE gives it never varied.
+_MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 
 class Policy(NamedTuple):
@@ -55,8 +56,16 @@ def init_normalizer(observation_size: int) -> running_statistics.RunningStatisti
 def normalize(
     observation: jax.Array, normalizer: running_statistics.RunningStatisticsState
 ) -> jax.Array:
-    """Observations [..., 29] in standard deviations from their mean, clipped."""
-    return running_statistics.normalize(observation, normalizer, max_abs_value=MAX_NORMALIZED)
+    """Observations [..., 29] in standard deviations from their mean, clipped.
+
+    One that never varied is 0, whatever it is now. In the fused physics the ball's quaternion and
+    spin are constant; in another engine's float32 they drift by rounding, which must not be
+    magnified to a signal.
+    """
+    standardized = running_statistics.normalize(
+        observation, normalizer, max_abs_value=MAX_NORMALIZED
+    )
+    return jax.numpy.where(normalizer.std > _MIN_STD, standardized, 0.0)
 
 
 def act(networks: PPONetworks, policy: Policy, observation: jax.Array) -> jax.Array:
