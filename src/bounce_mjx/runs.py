@@ -3,7 +3,7 @@
     runs/bounce_ball/<time stamp>/
         config.yaml                     the resolved config
         events.out.tfevents.*           TensorBoard scalars
-        results.json                    the best evaluation, and where the time went
+        results.json                    all evaluations, the best whole, and where the time went
         checkpoints/latest/<steps>/     orbax; the newest state
         checkpoints/best/<steps>/       orbax; the state of the best evaluation
 
@@ -100,6 +100,15 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             newest = max(steps, key=lambda p: int(p.name))
             return Checkpoint(run, newest, int(newest.name))
     raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
+
+
+def latest_checkpoint(run: Path) -> Checkpoint:
+    """The newest state of a run, from which its training goes on.
+
+    Raises:
+      UserError: there is none.
+    """
+    return find_checkpoint(run / _CHECKPOINTS / "latest", run)
 
 
 def newest_run(log_dir: Path) -> Path:

@@ -27,6 +27,7 @@ from bounce_mjx.runs import (
     CheckpointWriter,
     create_run,
     find_checkpoint,
+    latest_checkpoint,
     load_results,
     load_run_config,
     load_training_state,
@@ -159,8 +160,8 @@ def train(command: TrainCommand, console: Console) -> Outcome:
     if command.resume:
         run = find_checkpoint(command.resume, command.resume).run
         progress = _Progress.of_run(run)
-        latest = find_checkpoint(run / "checkpoints" / "latest", run)
-        resumed = load_training_state(latest, jax.eval_shape(trainer.init, key))
+        template = jax.eval_shape(trainer.init, key)
+        resumed = load_training_state(latest_checkpoint(run), template)
         save_config(run, config)
     else:
         run, progress, resumed = create_run(config), _Progress(), None
