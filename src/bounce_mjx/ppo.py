@@ -25,7 +25,7 @@ from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
 _LEARNING_RATE_FACTOR = 1.1
 
 # What is checked to be finite, in the order in which an iteration computes it.
-CHECKED = ("reward", "observation", "loss/policy", "loss/value", "gradient", "parameters")
+CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
 
 Metrics = dict[str, jax.Array]
 
@@ -389,7 +389,7 @@ def first_fault(
       of_minibatches: metrics, each [epochs, minibatches].
       params: after the update.
     """
-    in_minibatch = ("loss/policy", "loss/value", "loss/gradient_norm")
+    in_minibatch = ("loss/value", "loss/policy", "loss/gradient_norm")
     flags = jnp.stack([jnp.isfinite(of_minibatches[n]).ravel() for n in in_minibatch], axis=-1)
     finite = jnp.concatenate(
         [

@@ -212,6 +212,21 @@ def load_progress(checkpoint: Checkpoint) -> dict[str, Any]:
     return _read_record(checkpoint)["progress"]
 
 
+def load_results(run: Path) -> dict[str, Any] | None:
+    """The run's results; None if it has none yet.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    path = run / RESULTS_FILE
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}); delete it to go on without it") from error
+
+
 def save_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's resolved config."""
     checkpoints.write_atomically(run / CONFIG_FILE, dump_config(config))
