@@ -481,6 +481,18 @@ def dump_config(config: TrainConfig) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
+def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:
+    """Dotted names of the settings in which two configs of one type differ."""
+    keys = set()
+    for name in type(one).model_fields:
+        a, b = getattr(one, name), getattr(other, name)
+        if isinstance(a, StrictModel):
+            keys |= {f"{name}.{inner}" for inner in differing_keys(a, b)}
+        elif a != b:
+            keys.add(name)
+    return keys
+
+
 def describe(
     error: pydantic.ValidationError,
     config_class: type[pydantic.BaseModel],

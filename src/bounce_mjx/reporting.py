@@ -1,5 +1,6 @@
 """What a training shows and writes while it runs: the progress line and the TensorBoard log."""
 
+import contextlib
 import math
 import typing
 from pathlib import Path
@@ -15,13 +16,53 @@ if typing.TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
 
-def open_log(run: Path) -> "SummaryWriter":
-    """Opens the TensorBoard log of a run."""
+def open_log(run: Path, first_step: int | None = None) -> "SummaryWriter":
+    """Opens the TensorBoard log of a run.
+
+    Args:
+      first_step: that from which a run is resumed; what was logged later is taken back.
+    """
     # tensorboardX imports PyTorch where that is installed, which takes seconds; this way they
     # pass beside the compilation.
     from tensorboardX import SummaryWriter
+    from tensorboardX.record_writer import register_writer_factory
 
-    return SummaryWriter(logdir=str(run))
+    register_writer_factory(_LOG_PREFIX, _LogFiles())
+    purge_step = None if first_step is None else first_step + 1
+    return SummaryWriter(logdir=f"{_LOG_PREFIX}:{run}", purge_step=purge_step, flush_secs=10)
+
+
+_LOG_PREFIX = "bounce_mjx"
+
+
+class _LogFiles:
+    """How tensorboardX opens the files of a log."""
+
+    def directory_check(self, path: str) -> None:
+        Path(path.removeprefix(f"{_LOG_PREFIX}:")).mkdir(parents=True, exist_ok=True)
+
+    def open(self, path: str) -> "_LogFile":
+        return _LogFile(Path(path.removeprefix(f"{_LOG_PREFIX}:")))
+
+
+class _LogFile:
+    """A file that keeps what a full disk does not take until it does. With an ordinary one, the
+    thread of tensorboardX would end, and with it, in silence, the training."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> None:
+        self._waiting += data
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError), self._path.open("ab", buffering=0) as file:
+            while self._waiting:
+                del self._waiting[: file.write(self._waiting)]
+
+    def close(self) -> None:
+        self.flush()
 
 
 class Reporter:
@@ -45,6 +86,7 @@ class Reporter:
             "training", total=total_steps, completed=first_step, figures=""
         )
         self._last = {"episode/return": math.nan, "episode/bounces": math.nan}
+        self._saving_problem = False
 
     def __enter__(self) -> "Reporter":
         self._progress.start()
@@ -67,6 +109,9 @@ class Reporter:
             present = values[np.isfinite(values)]
             if present.size:
                 means[name] = float(present.mean())
+        # A count, where a mean would hide one event in many iterations.
+        non_finite = int(np.sum(metrics.get("task/non_finite", 0)))
+        means["task/non_finite"] = float(non_finite)
         for name, value in means.items():
             self._writer.add_scalar(name, value, steps)
         self._last |= {name: means[name] for name in self._last if name in means}
@@ -81,6 +126,25 @@ class Reporter:
             left = (self._total_steps - steps) / rate
             line = f"{figures}  {seconds:.1f} s, {left:.0f} s left"
             self._console.print(line, highlight=False, soft_wrap=True)
+
+        if non_finite:
+            self.say(f"{non_finite:,} environments had a state that was not finite, and were reset")
+
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+    def saving_problem(
+        self,
+        problem: str | None,
+        until_then: str = "the training goes on, and saves at its next evaluation",
+    ) -> None:
+        """Tells once why the last save failed, and once when there is no such problem any more."""
+        if problem is not None and not self._saving_problem:
+            self.say(f"the state is not saved, as {problem}; make room: {until_then}")
+        if problem is None and self._saving_problem:
+            self.say("the state is saved again")
+        self._saving_problem = problem is not None
 
     def evaluation(self, steps: int, report: Report) -> None:
         """Reports an evaluation."""
