@@ -1,6 +1,6 @@
 """Prints the reference of every config key, taken from the types in `config.py`:
 
-    python -m bounce_mjx.config_reference > docs/config.md
+python -m bounce_mjx.config_reference > docs/config.md
 """
 
 import re
@@ -108,7 +108,13 @@ def _default(value: Any) -> str:
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, int):
         return f"{value:_}" if value >= 10_000 else str(value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        # YAML takes a number with an exponent but no point for a word.
+        digits, exponent, power = f"{value:.6g}".partition("e")
+        return (
+            f"{digits}.0e{power}" if exponent and "." not in digits else digits + exponent + power
+        )
+    return str(value)
 
 
 def _range(plain: dict[str, Any]) -> str:
