@@ -95,7 +95,7 @@ class HeightProgressReward(StrictModel):
     base_height: Finite = 0.2
     """Ball height above which the term grows, m."""
     gain: NonNegative = 2.0
-    """Reward per metre above the base height."""
+    """Reward for each metre above the base height, 1/m."""
 
 
 class ControlledUpwardReward(StrictModel):
@@ -210,7 +210,7 @@ class PaddleHeightViolationReward(StrictModel):
     weight: Finite = 1.0
     """Weight of the term."""
     gain: NonNegative = 20.0
-    """Penalty per metre beyond the tolerance."""
+    """Penalty for each metre beyond the tolerance, 1/m."""
     tolerance: NonNegative = 0.1
     """Height error of the paddle that costs nothing, m."""
 

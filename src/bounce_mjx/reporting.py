@@ -10,17 +10,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bounce_mjx.evaluation import Report
+from bounce_mjx.config import TrainConfig, dump_config
+from bounce_mjx.evaluation import Report, Result
 
 if typing.TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
 
-def open_log(run: Path, first_step: int | None = None) -> "SummaryWriter":
-    """Opens the TensorBoard log of a run.
+def open_log(run: Path, first_step: int | None = None, suffix: str = "") -> "SummaryWriter":
+    """Opens a TensorBoard log in a run's folder.
 
     Args:
       first_step: that from which a run is resumed; what was logged later is taken back.
+      suffix: of the file's name, which otherwise is that of any log opened in the same second.
     """
     # tensorboardX imports PyTorch where that is installed, which takes seconds; this way they
     # pass beside the compilation.
@@ -29,7 +31,12 @@ def open_log(run: Path, first_step: int | None = None) -> "SummaryWriter":
 
     register_writer_factory(_LOG_PREFIX, _LogFiles())
     purge_step = None if first_step is None else first_step + 1
-    return SummaryWriter(logdir=f"{_LOG_PREFIX}:{run}", purge_step=purge_step, flush_secs=10)
+    return SummaryWriter(
+        logdir=f"{_LOG_PREFIX}:{run}",
+        purge_step=purge_step,
+        flush_secs=10,
+        filename_suffix=suffix,
+    )
 
 
 _LOG_PREFIX = "bounce_mjx"
@@ -66,11 +73,14 @@ class _LogFile:
 
 
 class Reporter:
-    """Shows a progress bar on a terminal, a line a block elsewhere, and logs scalars."""
+    """Shows a progress bar on a terminal, a line a block elsewhere, and logs to TensorBoard."""
 
-    def __init__(self, log: "SummaryWriter", console: Console, total_steps: int, first_step: int):
+    def __init__(
+        self, log: "SummaryWriter", console: Console, config: TrainConfig, first_step: int
+    ):
         self._console = console
         self._writer = log
+        self._writer.add_text("config", f"```yaml\n{dump_config(config)}```", first_step)
         self._progress = Progress(
             TextColumn("[bold]training"),
             BarColumn(),
@@ -81,9 +91,9 @@ class Reporter:
             console=console,
             disable=not console.is_terminal,
         )
-        self._total_steps = total_steps
+        self._total_steps = config.total_steps
         self._task = self._progress.add_task(
-            "training", total=total_steps, completed=first_step, figures=""
+            "training", total=config.total_steps, completed=first_step, figures=""
         )
         self._last = {"episode/return": math.nan, "episode/bounces": math.nan}
         self._saving_problem = False
@@ -152,6 +162,7 @@ class Reporter:
             self._writer.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
         for name, value in report.details.items():
             self._writer.add_scalar(f"results/{name}", value, steps)
+        self._writer.add_text("results", results_markdown(report), steps)
         met = sum(result.passed is not False for result in report.results)
         figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
         self._console.print(
@@ -174,9 +185,30 @@ def results_table(report: Report, title: str) -> Table:
     ):
         table.add_column(column, justify=justify)
     for result in report.results:
-        verdict = {True: "[green]pass", False: "[red]FAIL", None: "not judged"}[result.passed]
-        table.add_row(result.name, result.measured, f"{result.value:.2f}", result.bound, verdict)
+        colour = {True: "[green]", False: "[red]", None: ""}[result.passed]
+        table.add_row(
+            result.name,
+            result.measured,
+            f"{result.value:.2f}",
+            result.bound,
+            colour + verdict(result),
+        )
     return table
+
+
+def results_markdown(report: Report) -> str:
+    """The five results as a Markdown table."""
+    lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
+    for result in report.results:
+        # A bare | would begin a new cell.
+        cells = (result.name, result.measured.replace("|", "&#124;"), f"{result.value:.2f}")
+        lines.append(f"| {' | '.join(cells)} | {result.bound} | {verdict(result)} |")
+    return "\n".join(lines)
+
+
+def verdict(result: Result) -> str:
+    """What became of a result, in a word or two."""
+    return {True: "pass", False: "FAIL", None: "not judged"}[result.passed]
 
 
 def details_line(report: Report) -> str:

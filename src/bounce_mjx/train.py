@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import importlib
 import os
 import shlex
 import shutil
@@ -21,9 +22,10 @@ from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig, differing_keys, load_config
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation import Report, judge, make_evaluator
-from bounce_mjx.policy import make_networks
+from bounce_mjx.evaluation import Report, judge, make_recording_evaluator
+from bounce_mjx.policy import Policy, make_networks
 from bounce_mjx.ppo import CHECKED, Trainer, TrainingState, make_trainer, policy_of
+from bounce_mjx.recording import RECORDED_EPISODES
 from bounce_mjx.reporting import Reporter, details_line, open_log, results_table
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import (
@@ -45,6 +47,9 @@ from bounce_mjx.signals import StopRequest
 # Time between two attempts to save on a full disk once the training is over.
 RETRY_SECONDS = 2.0
 
+# Imported by name, beside the compilation, as drawing takes half a second to import.
+_REPORT_MODULE = "bounce_mjx.report"
+
 
 class TrainCommand(TrainConfig):
     """The command line: the config's keys as flags, and where to start from."""
@@ -58,6 +63,8 @@ class TrainCommand(TrainConfig):
     """A run's folder to go on with, in place, from its latest checkpoint. The other flags may then
     change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
     stop-when-solved and log-dir, and mjcf where that file has moved."""
+    report: bool = True
+    """Leave report.html in the run's folder, drawn when the results are printed."""
 
 
 class Outcome(NamedTuple):
@@ -105,6 +112,23 @@ def main(args: Sequence[str] | None = None) -> None:
             highlight=False,
             soft_wrap=True,
         )
+        if command.report:
+            leave_report(outcome, console)
+
+
+def leave_report(outcome: Outcome, console: Console) -> None:
+    """Draws the report. The training is safe by now, so whatever fails is only told."""
+    started = time.perf_counter()
+    try:
+        report_module = importlib.import_module(_REPORT_MODULE)
+        page = report_module.report_training(outcome.run, outcome.report, outcome.best_steps)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        again = f"python -m {_REPORT_MODULE} {outcome.run}"
+        text = f"report: not drawn ({reason}); {again} draws it"
+    else:
+        text = f"report: {page}  ({time.perf_counter() - started:.1f} s)"
+    console.print(text, highlight=False, soft_wrap=True)
 
 
 def enable_compilation_cache() -> None:
@@ -165,12 +189,15 @@ def train(command: TrainCommand, console: Console) -> Outcome:
         stop = stack.enter_context(StopRequest())
         pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-        return _train(config_of(command), command.resume, console, stop, pool, stack)
+        return _train(
+            config_of(command), command.resume, command.report, console, stop, pool, stack
+        )
 
 
 def _train(
     config: TrainConfig,
     resume: Path | None,
+    report: bool,
     console: Console,
     stop: StopRequest,
     pool: concurrent.futures.Executor,
@@ -199,6 +226,8 @@ def _train(
     with console.status("compiling"):
         first_step = None if state is None else int(state.iteration) * config.ppo.batch_steps
         log = pool.submit(open_log, run, first_step)
+        if report:
+            log.add_done_callback(lambda _: importlib.import_module(_REPORT_MODULE))
         compiling = pool.submit(compile_programs, config, env, trainer, iterations, pool)
         if not stop.wait_for(compiling):
             if resume:
@@ -215,7 +244,7 @@ def _train(
     steps = int(state.iteration) * config.ppo.batch_steps
     writer = CheckpointWriter(run, config)
     stack.callback(writer.close)
-    reporter = stack.enter_context(Reporter(log.result(), console, config.total_steps, steps))
+    reporter = stack.enter_context(Reporter(log.result(), console, config, steps))
 
     def save(*names: str) -> None:
         plain = progress.to_dict()
@@ -428,7 +457,8 @@ def compile_programs(
     run = jax.jit(trainer.run, static_argnums=1, donate_argnums=0)
 
     def compile_evaluator(episodes: int):
-        return make_evaluator(env, networks, episodes).lower(policy, key).compile()
+        evaluator = make_recording_evaluator(env, networks, episodes, RECORDED_EPISODES)
+        return evaluator.lower(policy, key).compile()
 
     compiled_run = pool.submit(lambda: run.lower(state, iterations).compile())
     compiled_init = pool.submit(lambda: init.lower(key).compile())
@@ -440,13 +470,17 @@ def compile_programs(
     )
     eval_key, screening_key = jax.random.split(jax.random.PRNGKey(config.eval_seed))
 
+    def measure(program: concurrent.futures.Future, policy: Policy, key: jax.Array) -> Report:
+        statistics, recording = program.result()(policy, key)
+        return judge(env, statistics)._replace(recording=recording)
+
     def evaluate(state: TrainingState) -> Report:
         policy = policy_of(state)
         if screening is not None:
-            screened = judge(env, screening.result()(policy, screening_key))
+            screened = measure(screening, policy, screening_key)
             if not screened.passed:
                 return screened
-        return judge(env, evaluator.result()(policy, eval_key))
+        return measure(evaluator, policy, eval_key)
 
     return Programs(compiled_init.result(), compiled_run.result(), evaluate)
 
