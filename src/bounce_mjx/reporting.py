@@ -86,7 +86,7 @@ class Reporter:
             "training", total=total_steps, completed=first_step, figures=""
         )
         self._last = {"episode/return": math.nan, "episode/bounces": math.nan}
-        self._saving_problem = False
+        self._saving_problem: str | None = None
 
     def __enter__(self) -> "Reporter":
         self._progress.start()
@@ -128,7 +128,10 @@ class Reporter:
             self._console.print(line, highlight=False, soft_wrap=True)
 
         if non_finite:
-            self.say(f"{non_finite:,} environments had a state that was not finite, and were reset")
+            had = "environment had a state that was not finite, and was reset"
+            if non_finite > 1:
+                had = "environments had a state that was not finite, and were reset"
+            self.say(f"{non_finite:,} {had}")
 
     def say(self, line: str) -> None:
         """Prints a line."""
@@ -137,14 +140,13 @@ class Reporter:
     def saving_problem(
         self,
         problem: str | None,
-        until_then: str = "the training goes on, and saves at its next evaluation",
+        meanwhile: str = "the training goes on, and saves at its next evaluation",
     ) -> None:
         """Tells once why the last save failed, and once when there is no such problem any more."""
-        if problem is not None and not self._saving_problem:
-            self.say(f"the state is not saved, as {problem}; make room: {until_then}")
-        if problem is None and self._saving_problem:
-            self.say("the state is saved again")
-        self._saving_problem = problem is not None
+        sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
+        if sentence != self._saving_problem:
+            self.say(sentence or "the state is saved again")
+        self._saving_problem = sentence
 
     def evaluation(self, steps: int, report: Report) -> None:
         """Reports an evaluation."""
