@@ -145,6 +145,7 @@ def mutate(step: Path, other: Path, draw: random.Random) -> str:
     return f"{how} {path.relative_to(step)}"
 
 
+@pytest.mark.slow
 def test_damage_is_refused_or_does_no_harm(
     written: Path, tmp_path: Path, state: TrainingState
 ) -> None:
@@ -298,6 +299,7 @@ CRAFTED = {
     "huge shape": {"shape": [HUGE], "chunks": [30]},
     "huge shape in one chunk": {"shape": [HUGE], "chunks": [HUGE]},
     "huge chunk": {"chunks": [HUGE]},
+    "blosc": {"compressor": {"id": "blosc", "cname": "zstd", "clevel": 5, "shuffle": 0}},
     "other type": {"dtype": "<f8"},
     "objects": {"dtype": "|O"},
     "negative": {"shape": [-1]},

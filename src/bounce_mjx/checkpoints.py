@@ -122,13 +122,11 @@ def open_item(folder: Path, item: str) -> dict[str, tensorstore.TensorStore]:
 
     Not by orbax, whose readers print tracebacks from their threads where a file is damaged.
     """
-    metadata = _read_json(folder / item / "_METADATA")
-    driver = "zarr3" if metadata["use_zarr3"] else "zarr"
     database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder / item}/"}}
     keys = tensorstore.KvStore.open(database).result().list().result()
     opening = {
         name: tensorstore.open(
-            {"driver": driver, "kvstore": {**database, "path": f"{name}/"}}, open=True, read=True
+            {"driver": "zarr", "kvstore": {**database, "path": f"{name}/"}}, open=True, read=True
         )
         for name in {key.decode().rpartition("/")[0] for key in keys}
     }
@@ -146,6 +144,11 @@ def read_arrays(arrays: dict[str, tensorstore.TensorStore]) -> dict[str, np.ndar
         # The memory of a chunk is taken before its bytes are looked at.
         if math.prod(chunk) > math.prod(max(1, length) for length in array.shape):
             raise ValueError(f"{name} is stored in chunks of {chunk}, larger than itself")
+        # orbax writes zstd, whose reader stops at the size of the array; that of blosc takes what
+        # the file asks for, up to 2 GB.
+        compressor = array.codec.to_json()["compressor"]
+        if compressor is not None and compressor["id"] != "zstd":
+            raise ValueError(f"{name} is compressed by {compressor['id']}, not zstd")
     reading = {name: array.read() for name, array in arrays.items()}
     return {name: array.result() for name, array in reading.items()}
 
