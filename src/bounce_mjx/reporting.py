@@ -114,7 +114,7 @@ class Reporter:
         )
         unknown = np.full(config.num_seeds, math.nan)
         self._last = {"episode/return": unknown, "episode/bounces": unknown}
-        self._saving_problem = False
+        self._saving_problem: str | None = None
 
     def __enter__(self) -> "Reporter":
         self._progress.start()
@@ -155,9 +155,11 @@ class Reporter:
             line = f"{figures}  {seconds:.1f} s, {left:.0f} s left"
             self._console.print(line, highlight=False, soft_wrap=True)
 
-        if non_finite.any():
-            total = int(non_finite.sum())
-            self.say(f"{total:,} environments had a state that was not finite, and were reset")
+        if total := int(non_finite.sum()):
+            had = "environment had a state that was not finite, and was reset"
+            if total > 1:
+                had = "environments had a state that was not finite, and were reset"
+            self.say(f"{total:,} {had}")
 
     def say(self, line: str) -> None:
         """Prints a line."""
@@ -166,14 +168,13 @@ class Reporter:
     def saving_problem(
         self,
         problem: str | None,
-        until_then: str = "the training goes on, and saves at its next evaluation",
+        meanwhile: str = "the training goes on, and saves at its next evaluation",
     ) -> None:
         """Tells once why the last save failed, and once when there is no such problem any more."""
-        if problem is not None and not self._saving_problem:
-            self.say(f"the state is not saved, as {problem}; make room: {until_then}")
-        if problem is None and self._saving_problem:
-            self.say("the state is saved again")
-        self._saving_problem = problem is not None
+        sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
+        if sentence != self._saving_problem:
+            self.say(sentence or "the state is saved again")
+        self._saving_problem = sentence
 
     def evaluation(
         self, steps: int, reports: Sequence[Report], healthy: Sequence[bool] = (True,)

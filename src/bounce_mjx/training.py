@@ -7,6 +7,7 @@ import importlib
 import shlex
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -262,7 +263,7 @@ class _Job:
         stopping = self._stopping()
         if stopping and not self._evaluated():
             self._save(best=[])
-        self._wait_until_saved()
+        _wait_until_saved(self.writers, self.reporter, self.stop)
         self.clock.lap("save")
         if stopping:
             raise TrainingStopped(f"stopped after {self.steps:,} steps; {self.go_on}")
@@ -330,8 +331,8 @@ class _Job:
         rate = self.block_steps * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         self.reporter.block(self.steps, seconds, metrics)
-        for writer in self.writers:
-            self.reporter.saving_problem(writer.problem(wait=False))
+        problems = [writer.problem(wait=False) for writer in self.writers]
+        self.reporter.saving_problem(next(filter(None, problems), None))
         self._check_faults(faults)
         self.clock.lap("train")
 
@@ -399,21 +400,24 @@ class _Job:
             "evaluations": progress.evaluations,
         }
 
-    def _wait_until_saved(self) -> None:
-        """Keeps the process, and with it the training's state, until the state is on the disk."""
-        stopping = self.stop.requested
-        for writer in self.writers:
-            while (problem := writer.problem()) is not None:
-                if self.stop.requested and not stopping:
-                    raise UserError(
-                        f"{problem}, so the end of the training is lost; make room, and resume"
-                    )
-                self.reporter.saving_problem(
-                    problem, "it is kept in memory, and saved as soon as there is room"
+
+def _wait_until_saved(
+    writers: Sequence[CheckpointWriter], reporter: Reporter, stop: StopRequest
+) -> None:
+    """Keeps the process, and with it the training's state, until the state is on the disk."""
+    stopping = stop.requested
+    for writer in writers:
+        while (problem := writer.problem()) is not None:
+            if stop.requested and not stopping:
+                raise UserError(
+                    f"{problem}, so the end of the training is lost; make room, and resume"
                 )
-                time.sleep(RETRY_SECONDS)
-                writer.retry()
-        self.reporter.saving_problem(None)
+            reporter.saving_problem(
+                problem, "it is kept in memory, and saved as soon as there is room"
+            )
+            time.sleep(RETRY_SECONDS)
+            writer.retry()
+    reporter.saving_problem(None)
 
 
 def _write_config(run: Path, config: TrainConfig) -> None:
