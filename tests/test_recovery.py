@@ -41,7 +41,7 @@ from bounce_mjx.runs import (
     load_run_config,
 )
 from bounce_mjx.signals import StopRequest
-from tiny_runs import STEPS, TIMEOUT, TINY, Job, job
+from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, job
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -73,12 +73,6 @@ def train(log_dir: Path, steps: int, *flags: str) -> Path:
 
 def resume(run: Path, *flags: str) -> None:
     train_command.main(["--resume", str(run), *flags])
-
-
-def arrays(checkpoint) -> dict[str, np.ndarray]:
-    """Every array of the training state in a checkpoint."""
-    checkpoints.check_integrity(checkpoint.folder)
-    return checkpoints.read_arrays(checkpoints.open_item(checkpoint.folder, "training"))
 
 
 def evaluations(run: Path) -> list[dict]:

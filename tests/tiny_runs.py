@@ -8,6 +8,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
+from bounce_mjx import checkpoints
+from bounce_mjx.runs import Checkpoint
+
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
 STEPS = 256
 TINY = (
@@ -16,6 +21,12 @@ TINY = (
     "--no-stop-when-solved --episode-seconds 0.5"
 ).split()
 TIMEOUT = 120.0
+
+
+def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
+    """Every array of the training state in a checkpoint."""
+    checkpoints.check_integrity(checkpoint.folder)
+    return checkpoints.read_arrays(checkpoints.open_item(checkpoint.folder, "training"))
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

@@ -544,7 +544,7 @@ def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
     same_name = [key for key in known if key.split(".")[-1] == path[-1]]
     near = difflib.get_close_matches(path[-1], beside, n=1)
     if near or same_name:
-        return f"did you mean {prefix + near[0] if near else same_name[0]}?"
+        return f"did you mean {same_name[0] if same_name else prefix + near[0]}?"
     return f"known keys here are {', '.join(sorted(beside))}"
 
 

@@ -24,8 +24,8 @@ from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
-# Most groups that the environments are shuffled in.
-_MAX_GROUPS = 64
+# Environments are shuffled in so many groups, or in more of so many environments.
+_FEW_GROUPS, _GROUP_ENVS = 64, 64
 
 # What is checked to be finite, in the order in which an iteration computes it.
 CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
@@ -340,7 +340,7 @@ def num_groups(config: PPOConfig) -> int:
     device that holds whole groups shuffles its own samples alone, and as the groups do not depend
     on the devices, neither does the training.
     """
-    groups = _MAX_GROUPS
+    groups = max(_FEW_GROUPS, 2 ** (config.num_envs // _GROUP_ENVS).bit_length())
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
         groups //= 2
     return groups

@@ -1,0 +1,298 @@
+"""Several seeds in one program, several devices, several hosts: each like one of them alone."""
+
+import contextlib
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import devices, hosts, ppo, training
+from bounce_mjx import eval as eval_command
+from bounce_mjx import train as train_command
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs import best_checkpoint, find_checkpoint, latest_checkpoint, load_run_config
+from tiny_runs import STEPS, TINY, arrays, job
+
+# As many environments as eight devices can share.
+SHARED = [*TINY, "--num-envs", "16", "--total-steps", str(2 * STEPS), "--no-report"]
+SEEDS = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def train(log_dir: Path, *flags: str) -> Path:
+    """The folder of a new run."""
+    train_command.main([*SHARED, "--log-dir", str(log_dir), *flags])
+    (run,) = log_dir.iterdir()
+    return run
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of seed 0 on one device."""
+    return train(tmp_path_factory.mktemp("alone"))
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three seeds."""
+    return train(tmp_path_factory.mktemp("seeds"), "--num-seeds", str(SEEDS))
+
+
+def assert_alike(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> None:
+    """Equal but for the order of sums."""
+    assert ours.keys() == theirs.keys()
+    for name in theirs:
+        if name.startswith("params"):
+            # Adam magnifies the rounding of gradients near zero up to a step of the learning rate.
+            np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
+        elif name in ("key", "iteration", "env.clock", "env.length"):
+            np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+        elif name.endswith("qpos"):
+            np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
+
+
+def assert_trained(run: Path, before: dict[str, np.ndarray]) -> None:
+    after = arrays(latest_checkpoint(run))
+    assert any((after[n] != before[n]).any() for n in after if n.startswith("params"))
+
+
+# Shuffling in groups
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "rollout_length", "num_minibatches", "expected"),
+    [
+        (4096, 32, 8, 64),
+        (512, 32, 4, 64),
+        (16384, 32, 32, 256),
+        (16, 8, 2, 16),
+        (24, 8, 2, 8),
+        (7, 8, 4, 1),
+        (64, 1, 64, 1),
+    ],
+)
+def test_number_of_groups(num_envs, rollout_length, num_minibatches, expected):
+    config = PPOConfig(
+        num_envs=num_envs, rollout_length=rollout_length, num_minibatches=num_minibatches
+    )
+    assert ppo.num_groups(config) == expected
+
+
+def test_groups_hold_the_samples_of_their_environments():
+    length, batch, groups = 3, 8, 4
+    of_environment = jnp.broadcast_to(jnp.arange(batch), (length, batch))
+    at_time = jnp.broadcast_to(jnp.arange(length)[:, None], (length, batch))
+    dealt = ppo.group(jnp.stack([of_environment, at_time], axis=-1), groups)
+    for i, samples in enumerate(np.asarray(dealt)):
+        expected = {(env, t) for env in (2 * i, 2 * i + 1) for t in range(length)}
+        assert {tuple(sample) for sample in samples.tolist()} == expected
+        assert len(samples) == len(expected)
+
+
+# Several seeds
+
+
+@pytest.mark.slow
+def test_each_of_several_seeds_is_like_that_seed_alone(seeds: Path, alone: Path, tmp_path: Path):
+    together = arrays(latest_checkpoint(seeds))
+    for i, single in enumerate([alone, train(tmp_path / "1", "--seed", "1")]):
+        theirs = arrays(latest_checkpoint(single))
+        assert_alike({name: value[i] for name, value in together.items()}, theirs)
+    assert (together["params.policy.params.Dense_0.kernel"].std(axis=0) > 0).any()
+
+
+def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyPatch):
+    folders = [seeds / f"seed_{i:03d}" for i in range(SEEDS)]
+    assert sorted(p for p in seeds.iterdir() if p.name.startswith("seed")) == folders
+    scores = []
+    for i, folder in enumerate(folders):
+        config = load_run_config(folder)
+        assert (config.seed, config.num_seeds) == (i, 1)
+        results = json.loads((folder / "results.json").read_text())
+        assert [e["steps"] for e in results["evaluations"]] == [128, 256, 384, 512]
+        assert best_checkpoint(folder).steps == results["best_steps"]
+        met = sum(result["passed"] is not False for result in results["results"])
+        scores.append((met, results["details"]["mean_return"]))
+    best = folders[scores.index(max(scores))]
+    assert find_checkpoint(seeds, seeds.parent) == best_checkpoint(best)
+    assert find_checkpoint(None, seeds.parent) == best_checkpoint(best)
+
+
+def test_a_seed_is_evaluated(seeds: Path, tmp_path: Path):
+    with pytest.raises(SystemExit) as exit_:
+        eval_command.main(
+            [str(seeds / "seed_002"), "--episodes", "4", "--json", str(tmp_path / "out.json")]
+        )
+    assert exit_.value.code == 1
+    results = json.loads((tmp_path / "out.json").read_text())
+    assert "seed_002" in results["checkpoint"]
+    assert results["details"]["episodes"] == 4
+
+
+@pytest.mark.slow
+def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
+    run = train(tmp_path / "half", "--num-seeds", str(SEEDS), "--total-steps", str(STEPS))
+    train_command.main(["--resume", str(run), "--total-steps", str(2 * STEPS), "--no-report"])
+    ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))
+    for name in theirs:
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+    for i in range(SEEDS):
+        seed = f"seed_{i:03d}"
+        both = [json.loads((r / seed / "results.json").read_text()) for r in (run, seeds)]
+        assert both[0]["evaluations"] == both[1]["evaluations"]
+        assert both[0]["best_steps"] == both[1]["best_steps"]
+
+
+@pytest.mark.slow
+def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, monkeypatch, capsys):
+    compile_programs = training.compile_programs
+
+    def spoilt(*args):
+        programs = compile_programs(*args)
+
+        def run(state):
+            spoil = jnp.ones(SEEDS).at[1].set(jnp.nan) if int(state.iteration[0]) == 2 else 1.0
+            return programs.run(state._replace(learning_rate=state.learning_rate * spoil))
+
+        return programs._replace(run=run)
+
+    monkeypatch.setattr(training, "compile_programs", spoilt)
+    run = train(tmp_path / "runs", "--num-seeds", str(SEEDS))
+    said = capsys.readouterr().out
+    assert re.search(r"seed 1 diverged: .* was the first that was not finite, at iteration 3", said)
+    ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))
+    for name in theirs:
+        for i in (0, 2):
+            np.testing.assert_array_equal(ours[name][i], theirs[name][i], err_msg=name)
+    evaluated = json.loads((run / "seed_001/results.json").read_text())["evaluations"]
+    assert [e["steps"] for e in evaluated] == [128, 256]
+
+
+# Several devices
+
+
+@pytest.mark.slow
+def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
+    flags = [*SHARED, "--num-devices", "8", "--log-dir", tmp_path / "runs"]
+    with job(tmp_path / "log", *flags) as eight:
+        assert eight.wait() == 0, eight.said
+    assert "device: 8 x cpu" in eight.said
+    (run,) = (tmp_path / "runs").iterdir()
+    assert_alike(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
+
+
+MESSAGES = """
+import jax, re
+from bounce_mjx import BounceBall, devices, ppo
+from bounce_mjx.config import PPOConfig
+config = PPOConfig(num_envs=64, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
+env = BounceBall()
+trainer = ppo.make_trainer(config, env, 100)
+mesh = devices.make_mesh(8, config)
+shapes = jax.eval_shape(trainer.init, jax.random.PRNGKey(0))
+sharding = devices.state_sharding(mesh, shapes)
+run = jax.jit(
+    lambda state: trainer.run(state, 1),
+    in_shardings=(sharding,), out_shardings=(sharding, devices.replicated(mesh)),
+)
+text = run.lower(shapes).compile().as_text()
+names = r"(all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)(?:-start)?[(]"
+print(*re.findall(names, text))
+"""
+
+
+@pytest.mark.slow
+def test_devices_exchange_sums_alone(monkeypatch: pytest.MonkeyPatch):
+    """No device sends samples or environments to another: a minibatch is one message."""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
+    done = subprocess.run([sys.executable, "-c", MESSAGES], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    messages = done.stdout.split()
+    assert set(messages) == {"all-reduce"}
+    # One a minibatch, two for the advantages of an epoch, a few for the rollout's statistics.
+    assert len(messages) <= 8
+
+
+@pytest.mark.parametrize(
+    ("num_devices", "num_envs", "num_seeds", "sentence"),
+    [
+        (64, 4096, 1, "num_devices is 64, but there are"),
+        (3, 4096, 1, "num_envs 4096 cannot be divided among 3 devices; choose a power of two"),
+        (4, 4098, 1, "num_envs 4098 cannot be divided among 4 devices"),
+        (2, 4096, 3, "num_seeds 3 cannot be divided among 2 devices; choose a multiple of 2"),
+    ],
+)
+def test_devices_that_cannot_share(monkeypatch, num_devices, num_envs, num_seeds, sentence):
+    monkeypatch.setattr(jax, "devices", lambda: [jax.local_devices()[0]] * 8)
+    config = PPOConfig(num_envs=num_envs, num_minibatches=1)
+    with pytest.raises(UserError, match=sentence):
+        devices.make_mesh(num_devices, config, num_seeds)
+
+
+# Several hosts
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    flags = [*SHARED, "--log-dir", tmp_path / "runs", "--num-processes", "2"]
+    flags += ["--coordinator-address", f"127.0.0.1:{free_port()}"]
+    with contextlib.ExitStack() as stack:
+        processes = [
+            stack.enter_context(job(tmp_path / f"log{i}", *flags, "--process-id", i))
+            for i in range(2)
+        ]
+        for process in processes:
+            assert process.wait() == 0, process.said
+    leader, follower = (process.said for process in processes)
+    assert "device: 4 x cpu" in leader
+    assert "steps/s" in leader and "steps/s" not in follower
+    (run,) = (tmp_path / "runs").iterdir()
+    assert len(list(run.glob("events.*"))) == 1
+    assert_alike(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
+
+    # What two processes saved, one goes on from.
+    monkeypatch.delenv("XLA_FLAGS")
+    before = arrays(latest_checkpoint(run))
+    train_command.main(["--resume", str(run), "--total-steps", str(3 * STEPS), "--no-report"])
+    assert latest_checkpoint(run).steps == 3 * STEPS
+    assert_trained(run, before)
+
+
+def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_: pytest.fail("joined"))
+    with pytest.raises(
+        UserError, match="--num-processes needs --coordinator-address, --process-id"
+    ):
+        hosts.join(num_processes=2)
+
+
+def test_distributed_without_a_launcher_is_one_sentence(tmp_path: Path):
+    with job(tmp_path / "log", "--distributed") as alone:
+        assert alone.wait() == 2
+    assert alone.said.startswith("error: the processes of this training cannot be joined")
+    assert alone.said.count("\n") == 1
+    assert shutil.which("srun") is None or "Traceback" not in alone.said
