@@ -112,6 +112,8 @@ class _Page:
             brand_color=(230, 95, 20),
         )  # fmt: skip
         gui.set_panel_label("bounce_mjx")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(280)
         gui.add_markdown(f"**{title}**")
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, float(np.clip(speed, 0.1, 2.0)))
@@ -155,7 +157,11 @@ class _Page:
     def _add_plots(self) -> None:
         gui = self._server.gui
         axis = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
-        with gui.add_folder("ball height of the first robot, m"):
+        panel = gui.add_panel()
+        panel.dock_left()
+        panel.set_width(300)
+        with panel.add_tab("robot 1", viser.Icon.CHART_LINE):
+            gui.add_markdown("height, m, over the last seconds")
             self._heights = gui.add_uplot(
                 (np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)),
                 (
@@ -165,10 +171,11 @@ class _Page:
                     {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
                 ),
                 axes=({**axis, "size": 30}, {**axis, "size": 40}),
-                scales={"x": {"time": False}, "y": {"range": (0.0, 1.0)}},
+                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+                legend={"live": False},
                 height=190,
             )
-        with gui.add_folder("reward of the first robot, each term"):
+            gui.add_markdown("reward, by term")
             self._terms = gui.add_html(reward_bars(np.zeros(len(TERM_NAMES))))
 
     def _update_plots(self) -> None:
@@ -211,7 +218,7 @@ def reward_bars(terms: np.ndarray) -> str:
     """A bar chart of weighted reward terms [15] as HTML, and their sum."""
     rows = [
         (name.replace("_", " "), value, value / max(5.0, np.abs(terms).max()))
-        for name, value in zip(TERM_NAMES, terms, strict=True)
+        for name, value in zip(TERM_NAMES, np.round(terms, 2) + 0.0, strict=True)
     ]
     lines = []
     for name, value, share in rows:

@@ -13,12 +13,12 @@ from bounce_mjx.viewers.simulation import Frame
 
 MAX_ENVS = 16
 _SPACING = np.array([1.3, 0.9, 0.0])
-_LABEL_HEIGHT = 0.8
+_LABEL_HEIGHT = 0.74
 _TRAIL_SECONDS = 0.6
-_TRAIL_COLOR = np.array([255.0, 140.0, 30.0])
+_TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
 # A camera that sees one arm, its ball and the highest targets.
-_LOOK_AT = np.array([0.3, 0.0, 0.33])
+_LOOK_AT = np.array([0.34, 0.0, 0.38])
 _VIEW = np.array([0.95, -1.05, 0.40])
 _FIELD_OF_VIEW = math.radians(40.0)
 
@@ -115,7 +115,9 @@ class Scene:
                 handle.batched_positions = sites[name] + self._offsets
             self._line.points, self._line.colors = self._trails(frames)
             for i, label in enumerate(self._labels):
-                text = f"bounces {frame.n_bounces[i]:.0f}   target {frame.target_height[i]:.2f} m"
+                robot = f"{i + 1}:  " if number > 1 else ""
+                count, height = frame.n_bounces[i], frame.target_height[i]
+                text = f"{robot}bounces {count:.0f}   target {height:.2f} m"
                 if label.text != text:
                     label.text = text
 
@@ -159,7 +161,7 @@ def _grid(number: int) -> np.ndarray:
 
 def _add_lights(scene: viser.SceneApi) -> None:
     scene.add_light_hemisphere(
-        "/lights/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=1.0
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=1.3
     )
     scene.add_light_directional(
         "/lights/key", intensity=2.0, cast_shadow=True, position=(1.5, -2.0, 3.5)
