@@ -24,6 +24,9 @@ from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
+# Most groups that the environments are shuffled in.
+_MAX_GROUPS = 64
+
 Metrics = dict[str, jax.Array]
 
 
@@ -82,18 +85,18 @@ class Collection(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """What the update learns from; N samples."""
+    """What the update learns from: G groups of N samples (`num_groups`)."""
 
     seen: jax.Array
-    """Normalised observation and critic metrics [N, 29 + K]."""
+    """Normalised observation and critic metrics [G, N, 29 + K]."""
     action: jax.Array
-    """[N, 6]."""
+    """[G, N, 6]."""
     log_prob: jax.Array
-    """[N]."""
+    """[G, N]."""
     advantage: jax.Array
-    """[N]."""
+    """[G, N]."""
     value_target: jax.Array
-    """[N]."""
+    """[G, N]."""
 
 
 class Trainer(NamedTuple):
@@ -125,6 +128,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         )
     networks = make_networks(config, env.observation_size, env.action_size)
     distribution = networks.parametric_action_distribution
+    groups = num_groups(config)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
     )
@@ -185,7 +189,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
-            return (env_state, at_timeout), (step_of_rollout, raw, step_metrics(result))
+            metrics = step_metrics(result, groups)
+            return (env_state, at_timeout), (step_of_rollout, raw, metrics)
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
         first = see(vector.observe(state.env), state.env.env.metrics)
@@ -223,15 +228,13 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage=advantage,
             value_target=advantage + values[:-1],
         )
-        return jax.tree.map(lambda x: x.reshape((config.batch_steps,) + x.shape[2:]), samples)
+        return jax.tree.map(lambda x: group(x, groups), samples)
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         logits = policy_apply(params, samples.seen)
         log_ratio = distribution.log_prob(logits, samples.action) - samples.log_prob
         ratio = jnp.exp(log_ratio)
-        advantage = (samples.advantage - samples.advantage.mean()) / (
-            samples.advantage.std() + 1e-8
-        )
+        advantage = samples.advantage
         clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)
         policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
         values = value_apply(params, samples.seen)
@@ -254,8 +257,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
 
-        def minibatch(carry, batch: Samples):
+        def minibatch(carry, chosen):
             params, optimizer_state, learning_rate = carry
+            order, mean, deviation = chosen
+            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
+            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
             gradient, metrics = jax.grad(loss, has_aux=True)(params, batch)
             direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
             params = optax.apply_updates(
@@ -265,11 +271,19 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             return (params, optimizer_state, learning_rate), metrics
 
         def epoch(carry, epoch_key):
-            order = jax.random.permutation(epoch_key, config.batch_steps)
-            batches = jax.tree.map(
-                lambda x: x[order].reshape((config.num_minibatches, -1) + x.shape[1:]), samples
+            keys = jax.random.split(epoch_key, groups)
+            size = config.batch_steps // groups
+            order = jax.vmap(lambda key: jax.random.permutation(key, size))(keys)
+            order = order.reshape((groups, config.num_minibatches, -1))
+            # The advantages of all minibatches are measured at once: on several devices each
+            # measurement is a message, and there is one more in every minibatch anyhow.
+            advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
+            chosen = (
+                jnp.moveaxis(order, 1, 0),
+                jnp.mean(advantage, axis=(0, 2)),
+                jnp.std(advantage, axis=(0, 2)),
             )
-            return jax.lax.scan(minibatch, carry, batches)
+            return jax.lax.scan(minibatch, carry, chosen)
 
         carry = (state.params, state.optimizer, state.learning_rate)
         carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.num_epochs))
@@ -296,6 +310,37 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return jax.lax.scan(iteration, state, length=num_iterations)
 
     return Trainer(init, run)
+
+
+def population(trainer: Trainer) -> Trainer:
+    """The trainer of S independent trainings at once: keys [S, 2] -> states, their arrays with S
+    as the first axis; metrics are [S, I]."""
+    return Trainer(
+        jax.vmap(trainer.init),
+        lambda states, num_iterations: jax.vmap(lambda state: trainer.run(state, num_iterations))(
+            states
+        ),
+    )
+
+
+def num_groups(config: PPOConfig) -> int:
+    """Number of equal groups that the environments are dealt into, a power of two.
+
+    Samples are shuffled within their group, and every minibatch takes as many from each. So a
+    device that holds whole groups shuffles its own samples alone, and as the groups do not depend
+    on the devices, neither does the training.
+    """
+    groups = _MAX_GROUPS
+    while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
+        groups //= 2
+    return groups
+
+
+def group(x: jax.Array, groups: int) -> jax.Array:
+    """Deals samples [T, B, ...] into groups of environments [G, T * B / G, ...]."""
+    length, batch, *rest = x.shape
+    x = jnp.moveaxis(x.reshape((length, groups, batch // groups, *rest)), 1, 0)
+    return x.reshape((groups, length * batch // groups, *rest))
 
 
 def policy_of(state: TrainingState) -> Policy:
@@ -364,25 +409,33 @@ def adapt_learning_rate(
     return jnp.clip(learning_rate, config.min_learning_rate, limit)
 
 
-def step_metrics(result: vector.StepResult) -> Metrics:
-    """Means over the batch of one step, and sums over the episodes that ended on it."""
+def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
+    """Means over each group of environments [G] of one step, and sums over the episodes in it that
+    ended on the step."""
     ended = result.terminated | result.truncated
-    means = {name: jnp.mean(value) for name, value in result.metrics.items()}
+
+    def mean(x):
+        return jnp.mean(x.reshape(groups, -1), axis=1)
+
+    def total(x):
+        return jnp.sum(x.reshape(groups, -1), axis=1)
+
+    means = {name: mean(value) for name, value in result.metrics.items()}
     return means | {
-        "reward": jnp.mean(result.reward),
-        "ended": jnp.sum(ended),
-        "return": jnp.sum(jnp.where(ended, result.episode_return, 0.0)),
-        "length": jnp.sum(jnp.where(ended, result.episode_length, 0)),
-        "bounces": jnp.sum(jnp.where(ended, result.metrics["n_bounces"], 0.0)),
-        "apex_error": jnp.sum(result.metrics["apex_error"]),
-        "bounced": jnp.sum(result.metrics["bounced"]),
-        "non_finite": jnp.sum(result.metrics["non_finite"]),
+        "reward": mean(result.reward),
+        "ended": total(ended),
+        "return": total(jnp.where(ended, result.episode_return, 0.0)),
+        "length": total(jnp.where(ended, result.episode_length, 0)),
+        "bounces": total(jnp.where(ended, result.metrics["n_bounces"], 0.0)),
+        "apex_error": total(result.metrics["apex_error"]),
+        "bounced": total(result.metrics["bounced"]),
+        "non_finite": total(result.metrics["non_finite"]),
     }
 
 
 def rollout_metrics(steps: Metrics) -> Metrics:
-    """Metrics of a rollout from those of its steps [T]. Where no episode ended (or no bounce
-    happened), its means are not a number."""
+    """Metrics of a rollout from those of its steps and groups [T, G]. Where no episode ended (or
+    no bounce happened), its means are not a number."""
     ended, bounced = jnp.sum(steps["ended"]), jnp.sum(steps["bounced"])
     rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
     return rewards | {

@@ -1,0 +1,126 @@
+"""What more seeds and more devices cost: trainings side by side, and environments over devices.
+
+    python benchmarks/scaling.py --num-seeds 1 4 16 --num-devices 1 2 4
+
+Seeds: the time of one block of training with S seeds in one program, against that with one.
+Devices: environment steps per second on D devices with `--num-envs` environments on each, against
+one device. The compiled block alone is timed, and the fastest of the repeats counts, as other work
+on the machine only ever slows one down.
+"""
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import jax
+from pydantic import Field
+from tables import device_name, markdown_table, write
+
+from bounce_mjx import BounceBall
+from bounce_mjx.cli import parse
+from bounce_mjx.config import PPOConfig, StrictModel
+from bounce_mjx.devices import make_mesh, replicated, state_sharding
+from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.ppo import make_trainer, population
+
+Counts = tuple[Annotated[int, Field(ge=1)], ...]
+
+
+class Command(StrictModel):
+    """The command line."""
+
+    num_seeds: Counts = (1, 16)
+    """Numbers of seeds, each on one device."""
+    num_devices: Counts = (1,)
+    """Numbers of devices, each with one seed."""
+    num_envs: Annotated[int, Field(ge=1)] = 4096
+    """Environments on each device."""
+    iterations: Annotated[int, Field(ge=1)] = 8
+    """Iterations in one measured block."""
+    repeats: Annotated[int, Field(ge=1)] = 8
+    """Measurements of each block."""
+    out: Path = Path("benchmarks/results")
+    """Folder for scaling.json and scaling.md."""
+
+
+def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
+    """The time of one block of training."""
+    config = PPOConfig(num_envs=command.num_envs * num_devices)
+    mesh = make_mesh(num_devices, config, num_seeds)
+    env = BounceBall()
+    trainer = make_trainer(config, env, env.config.episode_steps)
+    key = jax.random.PRNGKey(0)
+    if num_seeds > 1:
+        trainer, key = population(trainer), jax.random.split(key, num_seeds)
+    sharding = state_sharding(mesh, jax.eval_shape(trainer.init, key), num_seeds)
+    started = time.perf_counter()
+    state = jax.jit(trainer.init, out_shardings=sharding)(key)
+    run = jax.jit(
+        lambda state: trainer.run(state, command.iterations),
+        in_shardings=(sharding,),
+        out_shardings=(sharding, replicated(mesh) if num_seeds == 1 else None),
+        donate_argnums=0,
+    )
+    state, metrics = jax.block_until_ready(run(state))
+    compile_seconds = time.perf_counter() - started
+    seconds = []
+    for _ in range(command.repeats):
+        started = time.perf_counter()
+        state, metrics = jax.block_until_ready(run(state))
+        seconds.append(time.perf_counter() - started)
+    steps = num_seeds * command.iterations * config.batch_steps
+    return {
+        "num_seeds": num_seeds,
+        "num_devices": num_devices,
+        "num_envs": config.num_envs,
+        "seconds": min(seconds),
+        "steps_per_second": steps / min(seconds),
+        "compile_seconds": compile_seconds,
+    }
+
+
+def table(records: list[dict]) -> str:
+    """Seconds a block and steps per second, against the first row's."""
+    first = records[0]
+    rows = [
+        [
+            str(r["num_seeds"]),
+            str(r["num_devices"]),
+            f"{r['num_envs']:,}",
+            f"{1e3 * r['seconds']:.1f}",
+            f"{r['steps_per_second'] / 1e6:.2f}",
+            f"{r['seconds'] / first['seconds']:.2f}",
+            f"{r['steps_per_second'] / first['steps_per_second']:.2f}",
+            f"{r['compile_seconds']:.1f}",
+        ]
+        for r in records
+    ]
+    header = [
+        "seeds",
+        "devices",
+        "environments a seed",
+        "ms a block",
+        "M steps/s",
+        "time x",
+        "steps/s x",
+        "compile and first block, s",
+    ]
+    return markdown_table(header, rows)
+
+
+def main() -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        command = parse(
+            Command, sys.argv[1:], prog="benchmarks/scaling.py", description=__doc__.split("\n")[0]
+        )
+        records = [measure(command, seeds, 1) for seeds in command.num_seeds]
+        records += [measure(command, 1, devices) for devices in command.num_devices if devices > 1]
+        device = device_name()
+        record = {"device": device, "jax": jax.__version__, "records": records}
+        write(command.out, "scaling", record, f"Device: {device}\n\n{table(records)}")
+
+
+if __name__ == "__main__":
+    main()
