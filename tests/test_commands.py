@@ -22,14 +22,8 @@ from bounce_mjx.policy import Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.rewards import TERM_NAMES
 from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config, newest_run
+from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents
 
-TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
-STEPS = 256
-TINY = (
-    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
-    "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
-    "--no-stop-when-solved --episode-seconds 0.5"
-).split()
 RESULT_NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
 Fails = Callable[..., str]
@@ -71,11 +65,6 @@ def fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd) -> Fails:
         return err
 
     return call
-
-
-def contents(folder: Path) -> dict[Path, bytes | None]:
-    """Every path under a folder, a file with its bytes."""
-    return {p: p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
 
 
 def assert_says(sentence: str, words: tuple[str, ...]) -> None:

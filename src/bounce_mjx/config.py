@@ -95,7 +95,7 @@ class HeightProgressReward(StrictModel):
     base_height: Finite = 0.2
     """Ball height above which the term grows, m."""
     gain: NonNegative = 2.0
-    """Reward per metre above the base height."""
+    """Reward for each metre above the base height, 1/m."""
 
 
 class ControlledUpwardReward(StrictModel):
@@ -210,7 +210,7 @@ class PaddleHeightViolationReward(StrictModel):
     weight: Finite = 1.0
     """Weight of the term."""
     gain: NonNegative = 20.0
-    """Penalty per metre beyond the tolerance."""
+    """Penalty for each metre beyond the tolerance, 1/m."""
     tolerance: NonNegative = 0.1
     """Height error of the paddle that costs nothing, m."""
 
@@ -479,6 +479,18 @@ def load_config(path: Path) -> TrainConfig:
 def dump_config(config: TrainConfig) -> str:
     """The whole config as YAML, for `load_config`."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:
+    """Dotted names of the settings in which two configs of one type differ."""
+    keys = set()
+    for name in type(one).model_fields:
+        a, b = getattr(one, name), getattr(other, name)
+        if isinstance(a, StrictModel):
+            keys |= {f"{name}.{inner}" for inner in differing_keys(a, b)}
+        elif a != b:
+            keys.add(name)
+    return keys
 
 
 def describe(

@@ -147,8 +147,13 @@ class BounceBall(Env):
         finite = jnp.array(True)
         for coordinates in physics:
             finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
+        # What came before is itself looked at, in case the memory was damaged.
         physics = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old), physics, before.physics
+            lambda new, old: jnp.where(
+                finite, new, jnp.where(jnp.abs(old) < _MAX_COORDINATE, old, 0.0)
+            ),
+            physics,
+            before.physics,
         )
         action = jnp.where(finite, action, before.task.last_action)
 

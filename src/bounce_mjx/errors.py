@@ -12,9 +12,17 @@ class UserError(Exception):
 
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Turns a `UserError` into that sentence on stderr and exit status 2, without a traceback."""
+    """Turns a `UserError` into that sentence on stderr and exit status 2, without a traceback; and
+    Ctrl-C into the shell's status 130."""
     try:
         yield
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _on_one_line(text: str) -> str:
+    """Text from a file or a flag may hold line breaks, or what a terminal would obey."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

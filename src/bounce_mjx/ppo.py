@@ -27,6 +27,9 @@ _LEARNING_RATE_FACTOR = 1.1
 # Most groups that the environments are shuffled in.
 _MAX_GROUPS = 64
 
+# What is checked to be finite, in the order in which an iteration computes it.
+CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
+
 Metrics = dict[str, jax.Array]
 
 
@@ -105,7 +108,8 @@ class Trainer(NamedTuple):
     init: Callable[[jax.Array], TrainingState]
     """key -> state; consumes the key."""
     run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
-    """(state, number of iterations I) -> (state, metrics, each [I])."""
+    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" tells what
+    was not finite (`first_fault`)."""
 
 
 def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
@@ -268,6 +272,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 params, jax.tree.map(lambda d: -learning_rate * d, direction)
             )
             learning_rate = adapt_learning_rate(config, learning_rate, metrics["policy/kl"], limit)
+            metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
             return (params, optimizer_state, learning_rate), metrics
 
         def epoch(carry, epoch_key):
@@ -288,13 +293,17 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         carry = (state.params, state.optimizer, state.learning_rate)
         carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.num_epochs))
         means = {name: jnp.mean(value) for name, value in metrics.items()}
-        return carry, means | {"policy/kl": jnp.mean(metrics["policy/kl"][-1])}
+        means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
+        return carry, means, metrics
 
     def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
         collection, metrics = collect(state, collect_key)
         samples = prepare(state.params, collection)
-        (params, optimizer_state, learning_rate), losses = update(state, samples, update_key)
+        (params, optimizer_state, learning_rate), losses, of_minibatches = update(
+            state, samples, update_key
+        )
+        fault = first_fault(metrics["reward"], collection.normalizer, of_minibatches, params)
         state = TrainingState(
             params=params,
             optimizer=optimizer_state,
@@ -304,7 +313,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             key=key,
             iteration=state.iteration + 1,
         )
-        return state, metrics | losses | {"policy/learning_rate": learning_rate}
+        metrics |= losses | {"policy/learning_rate": learning_rate, "fault": fault}
+        return state, metrics
 
     def run(state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
         return jax.lax.scan(iteration, state, length=num_iterations)
@@ -407,6 +417,39 @@ def adapt_learning_rate(
             ),
         )
     return jnp.clip(learning_rate, config.min_learning_rate, limit)
+
+
+def first_fault(
+    reward: jax.Array,
+    normalizer: running_statistics.RunningStatisticsState,
+    of_minibatches: Metrics,
+    params: Params,
+) -> jax.Array:
+    """Number [], from 1, of the one of `CHECKED` that was the first not to be finite in an
+    iteration; 0 if all were.
+
+    Args:
+      reward: mean of the rollout [].
+      normalizer: statistics with the rollout's observations.
+      of_minibatches: metrics, each [epochs, minibatches].
+      params: after the update.
+    """
+    in_minibatch = ("loss/value", "loss/policy", "loss/gradient_norm")
+    flags = jnp.stack([jnp.isfinite(of_minibatches[n]).ravel() for n in in_minibatch], axis=-1)
+    finite = jnp.concatenate(
+        [
+            jnp.stack([jnp.isfinite(reward), all_finite(normalizer)]),
+            flags.ravel(),
+            all_finite(params)[None],
+        ]
+    )
+    numbers = [1, 2] + [3, 4, 5] * flags.shape[0] + [6]
+    return jnp.where(finite.all(), 0, jnp.array(numbers)[jnp.argmin(finite)])
+
+
+def all_finite(tree: Any) -> jax.Array:
+    """Whether every number of a pytree of arrays is finite [], bool."""
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
 
 
 def step_metrics(result: vector.StepResult, groups: int) -> Metrics:

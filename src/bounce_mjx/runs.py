@@ -4,33 +4,52 @@
         config.yaml                     the resolved config
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, the best whole, and where the time went
-        checkpoints/latest/<steps>/     orbax; the newest state
-        checkpoints/best/<steps>/       orbax; the state of the best evaluation
+        checkpoints/latest/<steps>/     the newest state
+        checkpoints/best/<steps>/       the state of the best evaluation
 
-A checkpoint has two items: `policy` (what acting needs) and `training` (what going on needs).
+A checkpoint (checkpoints.py) has two items: `policy` (what acting needs) and `training` (what going
+on needs; left out where there is only a policy). It also holds the run's config and its
+evaluations so far, so that going on depends on one folder that is whole or not there.
 """
 
+import concurrent.futures
 import datetime
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
-import tensorstore
 
-from bounce_mjx.config import TrainConfig, dump_config, load_config
+from bounce_mjx import checkpoints
+from bounce_mjx.checkpoints import stored_checkpoints
+from bounce_mjx.config import TrainConfig, differing_keys, dump_config, load_config, validate
 from bounce_mjx.env import OBSERVATION_SIZE
 from bounce_mjx.errors import UserError
 from bounce_mjx.model import JOINT_NAMES
 from bounce_mjx.policy import Policy, init_normalizer, make_networks
-from bounce_mjx.ppo import TrainingState, policy_of
+from bounce_mjx.ppo import TrainingState
 
 CheckpointName = Literal["latest", "best"]
 CONFIG_FILE = "config.yaml"
 RESULTS_FILE = "results.json"
 _CHECKPOINTS = "checkpoints"
+
+# What may differ between a checkpoint and the training that goes on from it: everything else
+# shapes its state. The MJCF file may have moved, but must describe the same model.
+RESUMABLE_KEYS = frozenset(
+    {
+        "total_steps",
+        "eval_every",
+        "eval_episodes",
+        "screening_episodes",
+        "eval_seed",
+        "stop_when_solved",
+        "log_dir",
+        "env.mjcf",
+    }
+)
 
 
 class Checkpoint(NamedTuple):
@@ -92,13 +111,12 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             "that train_jax.py made"
         )
     at = path.absolute()
+    if at.parent.parent.name == _CHECKPOINTS and at in stored_checkpoints(at.parent).values():
+        return Checkpoint(run, at, int(at.name))
     for folder in (at, at / _CHECKPOINTS / "best", at / _CHECKPOINTS / "latest"):
-        if folder.name.isdigit() and folder.parent.parent.name == _CHECKPOINTS:
-            return Checkpoint(run, folder, int(folder.name))
-        steps = _steps(folder)
-        if steps:
-            newest = max(steps, key=lambda p: int(p.name))
-            return Checkpoint(run, newest, int(newest.name))
+        stored = stored_checkpoints(folder)
+        if stored:
+            return Checkpoint(run, stored[max(stored)], max(stored))
     raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
 
 
@@ -117,13 +135,28 @@ def newest_run(log_dir: Path) -> Path:
     Raises:
       UserError: there is none.
     """
-    runs = sorted(p.parent.parent for p in log_dir.glob(f"*/{_CHECKPOINTS}/*") if _steps(p))
+    found = (p for p in log_dir.glob(f"*/{_CHECKPOINTS}/*") if stored_checkpoints(p))
+    runs = sorted(p.parent.parent for p in found)
     if not runs:
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with train_jax.py or give "
             "a run's folder"
         )
     return runs[-1]
+
+
+def has_checkpoint(run: Path, name: CheckpointName, steps: int) -> bool:
+    """Whether a run holds that checkpoint."""
+    return steps in stored_checkpoints(run / _CHECKPOINTS / name)
+
+
+def best_checkpoint(run: Path) -> Checkpoint:
+    """That of the best evaluation of a run.
+
+    Raises:
+      UserError: there is none.
+    """
+    return find_checkpoint(run / _CHECKPOINTS / "best", run)
 
 
 def load_run_config(run: Path) -> TrainConfig:
@@ -147,24 +180,36 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))
         return Policy(init_normalizer(OBSERVATION_SIZE), params)
 
-    return _restore(checkpoint, "policy", jax.eval_shape(template))
+    return _restore(checkpoint, "policy", jax.eval_shape(template))[0]
 
 
-def load_training_state(checkpoint: Checkpoint, template: TrainingState) -> TrainingState:
-    """Restores the whole training state of a checkpoint.
+def load_training_state(
+    checkpoint: Checkpoint, template: TrainingState
+) -> tuple[TrainingState, dict[str, Any]]:
+    """Restores the whole training state of a checkpoint, and the evaluations up to it.
 
     Args:
       template: its shapes, as from `jax.eval_shape`.
 
     Raises:
-      UserError: the checkpoint is damaged or of another config.
+      UserError: the checkpoint is damaged or of another config, or holds only a policy.
     """
-    return _restore(checkpoint, "training", template)
+    if not (checkpoint.folder / "training").is_dir():
+        raise UserError(
+            f"the checkpoint {checkpoint.folder} holds no training state to go on from, only a "
+            "policy; give a run of train_jax.py"
+        )
+    state, record = _restore(checkpoint, "training", template)
+    return state, record["progress"]
 
 
-def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config."""
-    (run / CONFIG_FILE).write_text(dump_config(config), encoding="utf-8")
+def load_progress(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The evaluations up to a checkpoint, as they were given to the writer.
+
+    Raises:
+      UserError: the checkpoint is damaged.
+    """
+    return _read_record(checkpoint)["progress"]
 
 
 def load_results(run: Path) -> dict[str, Any] | None:
@@ -182,85 +227,158 @@ def load_results(run: Path) -> dict[str, Any] | None:
         raise UserError(f"{path} is damaged ({error}); delete it to go on without it") from error
 
 
-def save_results(run: Path, results: dict[str, Any]) -> None:
-    """Writes the run's results as JSON."""
-    text = json.dumps(results, indent=2) + "\n"
-    (run / RESULTS_FILE).write_text(text, encoding="utf-8")
+def save_config(run: Path, config: TrainConfig) -> None:
+    """Writes the run's resolved config."""
+    checkpoints.write_atomically(run / CONFIG_FILE, dump_config(config))
+
+
+class _Snapshot(NamedTuple):
+    """What one checkpoint is to hold."""
+
+    steps: int
+    items: dict[str, Any]
+    record: dict[str, Any]
 
 
 class CheckpointWriter:
-    """Saves the latest and the best checkpoint of a run, each replacing the one before."""
+    """Saves the latest and the best checkpoint of a run, each replacing the one before, and its
+    results, beside the training.
 
-    def __init__(self, run: Path):
-        options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
-        self._managers = {
-            name: ocp.CheckpointManager(
-                (run / _CHECKPOINTS / name).absolute(),
-                options=options,
-                item_names=("policy", "training"),
-            )
-            for name in ("latest", "best")
-        }
+    What could not be saved is kept until it is, or until something newer takes its place.
+    """
 
-    def save(self, name: CheckpointName, steps: int, state: TrainingState) -> None:
-        """Starts to save the state after `steps` environment steps; training may go on."""
-        # A copy, as the training reuses the memory of its state while orbax still writes.
-        state = jax.tree.map(np.array, state)
-        items = ocp.args.Composite(
-            policy=ocp.args.StandardSave(policy_of(state)),
-            training=ocp.args.StandardSave(state),
-        )
-        self._managers[name].save(steps, args=items, force=True)
+    def __init__(self, run: Path, config: TrainConfig):
+        self._run = run
+        self._config = config.model_dump(mode="json")
+        self._pending: dict[CheckpointName, _Snapshot] = {}
+        self._results: str | None = None
+        self._pool = concurrent.futures.ThreadPoolExecutor(1)
+        self._writing: concurrent.futures.Future | None = None
+        self._problem: str | None = None
+
+    def save(
+        self,
+        names: Sequence[CheckpointName],
+        steps: int,
+        policy: Policy,
+        training: TrainingState | None = None,
+        progress: dict[str, Any] | None = None,
+        results: dict[str, Any] | None = None,
+    ) -> None:
+        """Starts to save; waits only for the save before.
+
+        Args:
+          names: the checkpoints to write.
+          steps: environment steps trained.
+          training: left out where the checkpoint is only to act.
+          progress: the evaluations up to this checkpoint, plain data.
+          results: the run's results, plain data.
+        """
+        # A copy, as the training reuses the memory of its state while the writer still writes.
+        items = jax.tree.map(np.array, {"policy": policy, "training": training})
+        items = {name: tree for name, tree in items.items() if tree is not None}
+        record = {"steps": steps, "config": self._config, "progress": progress or {}}
+        self.problem()
+        # Plain data is not copied, so it is turned into text at once.
+        record = json.loads(json.dumps(record))
+        self._pending |= dict.fromkeys(names, _Snapshot(steps, items, record))
+        if results is not None:
+            self._results = json.dumps(results, indent=2) + "\n"
+        self.retry()
+
+    def retry(self) -> None:
+        """Starts to save what could not be saved."""
+        self._writing = self._pool.submit(self._write)
+
+    def problem(self, wait: bool = True) -> str | None:
+        """Why the last save failed, as part of a sentence; None if it did not.
+
+        Args:
+          wait: for a save that is going on; otherwise it is about the one before.
+        """
+        if self._writing is not None and (wait or self._writing.done()):
+            self._problem = None
+            try:
+                self._writing.result()
+            except OSError as error:
+                self._problem = f"{self._run} cannot be written ({error.strerror})"
+        return self._problem
 
     def close(self) -> None:
-        """Waits until everything is saved."""
-        for manager in self._managers.values():
-            manager.wait_until_finished()
-            manager.close()
+        """Waits until the save that is going on has ended."""
+        self._pool.shutdown()
+
+    def _write(self) -> None:
+        # The older first, so that no checkpoint on the disk names a best one that is not there
+        # yet, unless it holds that state itself.
+        order = sorted(self._pending, key=lambda name: (self._pending[name].steps, name == "best"))
+        for name in order:
+            steps, items, record = self._pending[name]
+            folder = self._run / _CHECKPOINTS / name / str(steps)
+            checkpoints.write_checkpoint(folder, items, record)
+            del self._pending[name]
+            for other in stored_checkpoints(folder.parent).values():
+                if other != folder:
+                    checkpoints.discard(other)
+        if self._results is not None:
+            checkpoints.write_atomically(self._run / RESULTS_FILE, self._results)
+            self._results = None
 
 
-def _steps(folder: Path) -> list[Path]:
-    """The checkpoints in a folder; one that is still being written has a longer name."""
-    return [p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()]
-
-
-def _restore(checkpoint: Checkpoint, item: str, template: Any) -> Any:
+def _read_record(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The plain data of a checkpoint that is whole and belongs to its run."""
     try:
-        stored = _read_arrays(checkpoint.folder.absolute() / item)
+        checkpoints.check_integrity(checkpoint.folder)
+        record = checkpoints.read_record(checkpoint.folder)
+        if record["steps"] != checkpoint.steps:
+            raise ValueError(f"it was written after {record['steps']:d} steps")
+        if not isinstance(record["progress"], dict):
+            raise ValueError("its progress is no mapping")
+        config = record["config"]
     # A damaged file raises many types; all of them mean the same here.
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
+        raise _damaged(checkpoint, error) from error
+    config = validate(TrainConfig, config, str(checkpoint.folder / checkpoints.RECORD_FILE))
+    differing = differing_keys(load_run_config(checkpoint.run), config) - RESUMABLE_KEYS
+    if differing:
         raise UserError(
-            f"the checkpoint {checkpoint.folder} is damaged ({reason}); give another checkpoint"
-        ) from error
+            f"the checkpoint {checkpoint.folder} is of another config than "
+            f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
+            "restore that file or give another checkpoint"
+        )
+    return record
+
+
+def _restore(checkpoint: Checkpoint, item: str, template: Any) -> tuple[Any, dict[str, Any]]:
+    """An item in the structure of `template`, and the record."""
+    record = _read_record(checkpoint)
+    try:
+        stored = checkpoints.open_item(checkpoint.folder.absolute(), item)
+    except Exception as error:
+        raise _damaged(checkpoint, error) from error
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     wanted = {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in leaves}
     for name in sorted(wanted.keys() | stored.keys()):
-        has, needs = (getattr(x.get(name), "shape", "nothing") for x in (stored, wanted))
+        has, needs = (
+            f"{x[name].dtype.name}{list(x[name].shape)}" if name in x else "nothing"
+            for x in (stored, wanted)
+        )
         if has != needs:
             raise UserError(
                 f"the checkpoint {checkpoint.folder} is damaged or of another config, as its "
                 f"{name} is {has} where {checkpoint.run / CONFIG_FILE} needs {needs}; restore "
                 "that file or give another checkpoint"
             )
-    arrays = [jax.numpy.asarray(stored[name], leaf.dtype) for name, leaf in wanted.items()]
-    return jax.tree_util.tree_unflatten(tree, arrays)
+    try:
+        arrays = checkpoints.read_arrays(stored)
+    except Exception as error:
+        raise _damaged(checkpoint, error) from error
+    leaves = [jax.numpy.asarray(arrays[name]) for name in wanted]
+    return jax.tree_util.tree_unflatten(tree, leaves), record
 
 
-def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
-    """The arrays of an item by dotted name.
-
-    Not by orbax, whose readers print tracebacks from their threads where a file is damaged.
-    """
-    metadata = json.loads((folder / "_METADATA").read_text(encoding="utf-8"))
-    driver = "zarr3" if metadata["use_zarr3"] else "zarr"
-    database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
-    keys = tensorstore.KvStore.open(database).result().list().result()
-    opening = {
-        name: tensorstore.open(
-            {"driver": driver, "kvstore": {**database, "path": f"{name}/"}}, open=True
-        )
-        for name in {key.decode().rpartition("/")[0] for key in keys}
-    }
-    reading = {name: array.result().read() for name, array in opening.items()}
-    return {name: array.result() for name, array in reading.items()}
+def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:
+    reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
+    return UserError(
+        f"the checkpoint {checkpoint.folder} is damaged ({reason}); give another checkpoint"
+    )

@@ -1,0 +1,193 @@
+"""A search over hyperparameters; each trial trains a population of seeds in one program.
+
+    python benchmarks/sweep.py --trials 20 --seeds 8 --storage runs/sweep.db
+
+A trial's value is the share of the five results that its evaluations met, over all evaluations and
+seeds: it rewards learning early as well as staying good. The study lies in the storage's file: the
+same command goes on with a search that was stopped, and runs a trial that was cut off again (so one
+process at a time). Needs optuna (the extra `sweep`). Evaluations use the training's evaluation
+seed, never that of `python -m bounce_mjx.eval`.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+from pydantic import Field
+from tables import device_name, markdown_table, write
+
+from bounce_mjx import BounceBall
+from bounce_mjx.cli import parse
+from bounce_mjx.config import PPOConfig, StrictModel, TrainConfig, load_config, validate
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation import Report, judge, make_evaluator
+from bounce_mjx.policy import make_networks
+from bounce_mjx.ppo import make_trainer, policy_of, population
+from bounce_mjx.resources import resource_path
+from bounce_mjx.train import enable_compilation_cache
+
+try:
+    import optuna
+except ImportError:
+    optuna = None
+
+# Range of each hyperparameter that is searched, and whether in equal ratios.
+SPACE = {
+    "max_learning_rate": (1e-3, 1e-2, True),
+    "decay_steps": (5e6, 5e7, True),
+    "discount": (0.96, 0.995, False),
+    "gae_lambda": (0.9, 0.98, False),
+    "target_kl": (0.004, 0.03, True),
+    "init_noise_std": (0.2, 0.8, True),
+}
+
+
+class Command(StrictModel):
+    """The command line."""
+
+    config: Path | None = None
+    """YAML file with all that is not searched; left out: the preset of the device at hand."""
+    trials: Annotated[int, Field(ge=1)] = 20
+    """Trials in all, those of earlier calls included."""
+    seeds: Annotated[int, Field(ge=1)] = 8
+    """Seeds of each trial."""
+    steps: Annotated[int, Field(ge=1)] = 20_000_000
+    """Environment steps of each seed."""
+    episodes: Annotated[int, Field(ge=1)] = 256
+    """Episodes of an evaluation."""
+    storage: Path = Path("runs/sweep.db")
+    """SQLite file of the study."""
+    out: Path = Path("benchmarks/results")
+    """Folder for sweep.json and sweep.md."""
+
+
+def search(command: Command, base: TrainConfig) -> "optuna.Study":
+    """Goes on with the study until it has its trials.
+
+    Raises:
+      UserError: the storage cannot be used.
+    """
+    try:
+        command.storage.parent.mkdir(parents=True, exist_ok=True)
+        study = optuna.create_study(
+            study_name="bounce_mjx",
+            storage=f"sqlite:///{command.storage}",
+            direction="maximize",
+            load_if_exists=True,
+        )
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"--storage {command.storage} cannot be used ({reason}); give another file"
+        ) from error
+    finished = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED)
+    done = len(study.get_trials(deepcopy=False, states=finished))
+    study.sampler = optuna.samplers.TPESampler(seed=done)
+    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=5)
+    if not study.trials:
+        # The search starts from what is used today.
+        study.enqueue_trial({name: getattr(base.ppo, name) for name in SPACE})
+    for cut_off in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
+        study.tell(cut_off.number, state=optuna.trial.TrialState.FAIL)
+        study.enqueue_trial(cut_off.params)
+
+    def count(study: "optuna.Study", _) -> None:
+        if len(study.get_trials(deepcopy=False, states=finished)) >= command.trials:
+            study.stop()
+
+    if done < command.trials:
+        study.optimize(lambda trial: run_trial(trial, command, base), callbacks=[count])
+    return study
+
+
+def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> float:
+    """Trains the population of one trial, and values it."""
+    chosen = {
+        name: trial.suggest_float(name, low, high, log=log)
+        for name, (low, high, log) in SPACE.items()
+    }
+    chosen["decay_steps"] = round(chosen["decay_steps"])
+    config = validate(PPOConfig, dict(base.ppo) | chosen, f"trial {trial.number}")
+    env = BounceBall(base.env)
+    trainer = population(make_trainer(config, env, env.config.episode_steps))
+    networks = make_networks(config, env.observation_size, env.action_size)
+    evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
+    iterations = max(1, round(base.eval_every / config.batch_steps))
+    run = jax.jit(lambda state: trainer.run(state, iterations), donate_argnums=0)
+    policies = jax.jit(jax.vmap(policy_of))
+
+    state = jax.jit(trainer.init)(
+        jax.vmap(jax.random.PRNGKey)(base.seed + np.arange(command.seeds))
+    )
+    eval_key = jax.random.PRNGKey(base.eval_seed)
+    met, steps = [], 0
+    while steps < command.steps:
+        state, _ = run(state)
+        steps += iterations * config.batch_steps
+        statistics = jax.device_get(evaluate(policies(state), eval_key))
+        reports = [
+            judge(env, jax.tree.map(lambda x, i=i: x[i], statistics)) for i in range(command.seeds)
+        ]
+        met.append([share_met(report) for report in reports])
+        trial.report(float(np.mean(met)), steps)
+        if trial.should_prune():
+            raise optuna.TrialPruned
+    trial.set_user_attr("solved_at_the_end", int(sum(r.passed for r in reports)))
+    trial.set_user_attr("spread_over_seeds", float(np.mean(met, axis=0).std()))
+    return float(np.mean(met))
+
+
+def share_met(report: Report) -> float:
+    """Share of the judged results that were met."""
+    judged = [result.passed for result in report.results if result.passed is not None]
+    return sum(judged) / len(judged)
+
+
+def table(study: "optuna.Study", seeds: int) -> str:
+    """The complete trials, the best first."""
+    complete = study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+    complete.sort(key=lambda trial: -trial.value)
+    rows = [
+        [
+            str(trial.number),
+            f"{100 * trial.value:.1f}",
+            f"{100 * trial.user_attrs['spread_over_seeds']:.1f}",
+            f"{trial.user_attrs['solved_at_the_end']} of {seeds}",
+            *[f"{trial.params[name]:.4g}" for name in SPACE],
+        ]
+        for trial in complete
+    ]
+    return markdown_table(["trial", "results met %", "+-", "solved at the end", *SPACE], rows)
+
+
+def main() -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        command = parse(
+            Command, sys.argv[1:], prog="benchmarks/sweep.py", description=__doc__.split("\n")[0]
+        )
+        if optuna is None:
+            raise UserError(
+                "benchmarks/sweep.py needs optuna, which is not installed; run "
+                "pip install 'bounce_mjx[sweep]'"
+            )
+        enable_compilation_cache()
+        preset = "cpu" if jax.default_backend() == "cpu" else "default"
+        base = load_config(command.config or resource_path(f"configs/{preset}.yaml"))
+        study = search(command, base)
+        device = device_name()
+        record = {
+            "device": device,
+            "seeds": command.seeds,
+            "steps": command.steps,
+            "trials": [
+                {"state": t.state.name, "value": t.value, "params": t.params} for t in study.trials
+            ],
+        }
+        write(command.out, "sweep", record, f"Device: {device}\n\n{table(study, command.seeds)}")
+
+
+if __name__ == "__main__":
+    main()

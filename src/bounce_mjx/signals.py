@@ -1,0 +1,49 @@
+"""Ctrl-C and SIGTERM as a request that the training answers when it can."""
+
+import concurrent.futures
+import os
+import signal
+import threading
+import time
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Launchers hand a Ctrl-C on to a process that the terminal has already told.
+_SAME_REQUEST_SECONDS = 0.5
+
+
+class StopRequest:
+    """While entered, the first SIGINT or SIGTERM only sets `requested`; the next ends the process
+    at once, as it would have without this."""
+
+    def __init__(self):
+        self._at: float | None = None
+        self._previous = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal has come."""
+        return self._at is not None
+
+    def __enter__(self) -> "StopRequest":
+        # Python hands signals to the main thread, and lets only that one say to whom.
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {number: signal.signal(number, self._handle) for number in _SIGNALS}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def wait_for(self, future: concurrent.futures.Future) -> bool:
+        """Waits until the future is done; False as soon as a stop is requested."""
+        while not self.requested:
+            if concurrent.futures.wait([future], timeout=0.1).done:
+                return True
+        return False
+
+    def _handle(self, number: int, _) -> None:
+        if self._at is None:
+            self._at = time.monotonic()
+        elif time.monotonic() - self._at > _SAME_REQUEST_SECONDS:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)

@@ -1,0 +1,258 @@
+"""The documentation: links resolve, commands and flags exist, and what it quotes is true."""
+
+import importlib
+import inspect
+import pkgutil
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pydantic
+import pytest
+import yaml
+
+import bounce_mjx
+from bounce_mjx import cli, config_reference
+from bounce_mjx import eval as eval_command
+from bounce_mjx import plot as plot_command
+from bounce_mjx import train as train_command
+from bounce_mjx.config import RewardConfig, StrictModel, TrainConfig, dump_config
+from bounce_mjx.resources import resource_path
+from bounce_mjx.rewards import TERM_NAMES
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
+
+
+def page_id(page: Path) -> str:
+    return str(page.relative_to(CHECKOUT))
+
+
+def code(page: Path) -> list[str]:
+    """The lines of a page's code blocks, and its pieces of code in a sentence."""
+    text = page.read_text(encoding="utf-8")
+    fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    rest = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    indented = re.findall(r"^ {4}(.+)$", rest, re.MULTILINE)
+    inline = re.findall(r"`([^`]+)`", rest)
+    return [line for block in fenced for line in block.splitlines()] + indented + inline
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_resolve(page: Path) -> None:
+    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    for link in links:
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def commands(page: Path) -> list[tuple[str, list[str]]]:
+    """The page's own commands: a script or a module, and its arguments."""
+    found = []
+    for line in code(page):
+        if line.startswith("$ "):  # shown with its error
+            continue
+        plain = re.sub(r"<[^>]*>", "x", line.replace("$seed", "1"))
+        for match in re.finditer(r"(?:uv run|python3?) [^;#>&|()]+", plain):
+            words = shlex.split(match[0])
+            script = next((i for i, word in enumerate(words) if word.endswith(".py")), None)
+            if "-m" in words and words[words.index("-m") + 1].startswith("bounce_mjx"):
+                at = words.index("-m") + 1
+                found.append((words[at], words[at + 1 :]))
+            elif script is not None:
+                found.append((words[script], words[script + 1 :]))
+    return found
+
+
+class Parsed(Exception):
+    """A command line was read."""
+
+
+COMMANDS = sorted({(name, *args) for page in PAGES for name, args in commands(page)})
+
+
+def test_the_documentation_shows_the_commands() -> None:
+    shown = {name for name, *_ in COMMANDS}
+    modules = {f"bounce_mjx.{name}" for name in ("eval", "plot", "report", "config_reference")}
+    assert shown >= modules | {"train_jax.py", "benchmarks/physics.py"}
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command's own parser; nothing else of it runs."""
+    name, *args = command
+    path = CHECKOUT / name
+    assert path.is_file() if name.endswith(".py") else importlib.util.find_spec(name)
+    if not args or args == ["--help"]:
+        return
+    if "--resume" in args:  # its run would have to exist
+        at = args.index("--resume")
+        args = args[:at] + args[at + 2 :]
+    real = cli.parse
+
+    def parse(*given, **named):
+        real(*given, **named)
+        raise Parsed
+
+    for module in [m for n, m in sys.modules.items() if n.startswith("bounce_mjx")]:
+        if getattr(module, "parse", None) is real:
+            monkeypatch.setattr(module, "parse", parse)
+    monkeypatch.setattr(sys, "argv", [name, *args])
+    monkeypatch.syspath_prepend(str(path.parent))
+    monkeypatch.chdir(CHECKOUT)
+    with pytest.raises(Parsed):
+        if name.endswith(".py"):
+            runpy.run_path(str(path), run_name="__main__")
+        else:
+            runpy.run_module(name, run_name="__main__")
+
+
+def known_flags() -> set[str]:
+    """The flags of every command of the package."""
+    flags = {"--help"}
+    for info in pkgutil.iter_modules(bounce_mjx.__path__):
+        module = importlib.import_module(f"bounce_mjx.{info.name}")
+        for name, member in vars(module).items():
+            is_command = inspect.isclass(member) and issubclass(member, StrictModel)
+            if is_command and name.endswith("Command"):
+                flags |= set(cli._flags(member))
+    return flags
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_flags_in_sentences_exist(page: Path) -> None:
+    shown = {re.split(r"[ =]", piece)[0] for piece in code(page) if piece.startswith("--")}
+    assert shown - known_flags() == set()
+
+
+def test_config_reference_is_fresh() -> None:
+    page = (CHECKOUT / "docs/config.md").read_text(encoding="utf-8")
+    assert page == config_reference.reference(), (
+        "docs/config.md is stale; run python -m bounce_mjx.config_reference > docs/config.md"
+    )
+
+
+def reference_rows() -> dict[str, list[str]]:
+    """The cells of every key of the config reference, behind the key."""
+    rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", config_reference.reference(), re.MULTILINE)
+    return {key: re.split(r" (?<!\\)\| ", cells) for key, cells in rows}
+
+
+def leaves(plain: dict, prefix: str = "") -> dict:
+    """The values of a nested mapping by dotted name."""
+    found = {}
+    for name, value in plain.items():
+        inner = leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        found |= inner if inner is not None else {prefix + name: value}
+    return found
+
+
+def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
+    rows, flags = reference_rows(), set(cli._flags(train_command.TrainCommand))
+    defaults = leaves(TrainConfig().model_dump(mode="json"))
+    assert rows.keys() == defaults.keys()
+    for key, (flag, kind, default, _, _, meaning) in rows.items():
+        assert flag.strip("`") in flags
+        assert kind and meaning
+        expected = defaults[key]
+        # Six digits of a number, in a list too.
+        if isinstance(np.ravel(expected)[0], float):
+            expected = pytest.approx(expected, rel=1e-5)
+        assert yaml.safe_load(default) == expected
+
+
+def refused(key: str, value: object) -> bool:
+    """Whether the config refuses the value of a key, naming it."""
+    *groups, name = key.split(".")
+    plain: dict = {name: value}
+    for group in reversed(groups):
+        plain = {group: plain}
+    try:
+        TrainConfig.model_validate(plain)
+    except pydantic.ValidationError as error:
+        return any(name in map(str, e["loc"]) for e in error.errors())
+    return False
+
+
+def test_config_reference_has_the_true_ranges() -> None:
+    """Right outside a bound the key itself is refused, inside it is not."""
+    checked = 0
+    for key, (_, kind, *_, limits, _) in reference_rows().items():
+        if kind not in ("number", "whole number"):
+            continue
+        step = 1 if kind == "whole number" else 1e-6
+        for sign, text in re.findall(r"([<>≤≥]) ([\d^.e+-]+)", limits):
+            bound = eval(text.replace("^", "**"))
+            outward = step if sign in "<≤" else -step
+            inside, outside = (bound, bound + outward) if sign in "≤≥" else (bound - outward, bound)
+            assert refused(key, outside), (key, outside)
+            assert not refused(key, inside), (key, inside)
+            checked += 1
+    assert checked > 50
+
+
+def test_task_page_has_the_weights() -> None:
+    page = (CHECKOUT / "docs/task.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| `", page, re.MULTILINE)
+    defaults = RewardConfig()
+    assert {name: float(weight) for name, weight in rows} == {
+        name: getattr(defaults, name).weight for name in TERM_NAMES
+    }
+
+
+MAINS = {
+    "train_jax.py": train_command.main,
+    "-m bounce_mjx.eval": eval_command.main,
+    "-m bounce_mjx.plot": plot_command.main,
+}
+TROUBLES = re.findall(
+    r"^ {4}\$ python (train_jax\.py|-m [\w.]+)(.*)\n {4}(error: .+)$",
+    (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
+
+
+def test_troubleshooting_shows_errors() -> None:
+    assert len(TROUBLES) >= 9
+
+
+@pytest.mark.parametrize(("name", "args", "error"), TROUBLES)
+def test_troubleshooting_quotes_the_errors(
+    name: str, args: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+) -> None:
+    mjcf = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    (tmp_path / "euler.xml").write_text(mjcf.replace('"implicitfast"', '"Euler"'))
+    (tmp_path / "nameless.xml").write_text(mjcf.replace('"blocker"', '"bat"'))
+    (tmp_path / "wrong.yaml").write_text("num_envs: 64")
+    (tmp_path / "run/checkpoints/latest/64").mkdir(parents=True)
+    (tmp_path / "run/config.yaml").write_text(dump_config(TrainConfig()))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_info:
+        MAINS[name](shlex.split(args))
+    assert exit_info.value.code == 2
+    # The documentation cannot know the folder.
+    assert capfd.readouterr().err.replace(f"{tmp_path}/", "") == error + "\n"
+
+
+def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
+    from bounce_mjx import BounceBall, EnvConfig
+
+    mjcf = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    (tmp_path / "euler.xml").write_text(mjcf.replace('"implicitfast"', '"Euler"'))
+    engine = BounceBall(EnvConfig(mjcf=tmp_path / "euler.xml")).engine
+    page = (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8")
+    assert f"    physics: {engine.name} ({engine.reason})\n" in page

@@ -1,0 +1,322 @@
+"""Learning curves, pictures, the report of a run, and what TensorBoard reads."""
+
+import base64
+import io
+import json
+import re
+import shutil
+import xml.etree.ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboardX import SummaryWriter
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx import plot as plot_command
+from bounce_mjx import report as report_command
+from bounce_mjx import train as train_command
+from bounce_mjx.config import PPOConfig, TrainConfig, load_config
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import Report
+from bounce_mjx.figures import CURVES, curves_figure, evaluation_figure, image, rewards_figure
+from bounce_mjx.learning_curves import group_runs, mean_and_band, read_curves
+from bounce_mjx.recording import Recording
+from bounce_mjx.reporting import results_markdown
+from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.runs import load_results, save_config
+
+TINY = (
+    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
+    "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
+    "--no-stop-when-solved --episode-seconds 0.5"
+).split()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of 256 steps."""
+    log_dir = tmp_path_factory.mktemp("trained") / "runs"
+    train_command.main([*TINY, "--total-steps", "256", "--log-dir", str(log_dir)])
+    (run,) = log_dir.iterdir()
+    return run
+
+
+def write_run(folder: Path, config: TrainConfig, scalars: dict[str, dict[int, float]]) -> Path:
+    """A run's folder with a config and a log, but no training."""
+    folder.mkdir(parents=True)
+    save_config(folder, config)
+    with SummaryWriter(logdir=str(folder)) as log:
+        for name, values in scalars.items():
+            for step, value in values.items():
+                log.add_scalar(name, value, step)
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Path]:
+    """Three seeds of one config, of different lengths, and one run of another config."""
+    rng = np.random.default_rng(0)
+    folders = []
+    for seed, num_envs, points in ((0, 4096, 5), (1, 4096, 4), (2, 4096, 5), (0, 2048, 5)):
+        names = [name for name, *_ in CURVES] + [f"reward/{name}" for name in TERM_NAMES]
+        scalars = {
+            name: {1000 * (i + 1): float(rng.random()) for i in range(points)} for name in names
+        }
+        config = TrainConfig(
+            seed=seed,
+            ppo=PPOConfig(num_envs=num_envs),
+            log_dir=tmp_path / str(num_envs),
+            total_steps=1000 * points,
+        )
+        folders.append(write_run(tmp_path / f"{seed}_{num_envs}", config, scalars))
+    return folders
+
+
+def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
+    groups = group_runs(runs)
+    assert [[run.run for run in group.runs] for group in groups] == [runs[:3], runs[3:]]
+    assert [group.label for group in groups] == [
+        "num_envs 4096 (3 seeds)",
+        "num_envs 2048 (one seed)",
+    ]
+    assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
+
+
+def test_a_curve_is_what_was_logged_last(tmp_path: Path) -> None:
+    """A run that went on from step 2 logs step 3 again."""
+    run = write_run(
+        tmp_path / "run", TrainConfig(), {"episode/return": {1: 10.0, 2: 20.0, 3: 30.0}}
+    )
+    with SummaryWriter(logdir=str(run), filename_suffix=".resumed") as log:
+        for step, value in ((3, 31.0), (4, 41.0)):
+            log.add_scalar("episode/return", value, step)
+    curve = read_curves(run).curves["episode/return"]
+    assert curve.steps.tolist() == [1, 2, 3, 4]
+    assert curve.values.tolist() == [10.0, 20.0, 31.0, 41.0]
+
+
+def test_a_run_without_a_log_is_an_error(tmp_path: Path) -> None:
+    save_config(tmp_path, TrainConfig())
+    with pytest.raises(UserError, match="no TensorBoard scalars"):
+        read_curves(tmp_path)
+
+
+def logged(run: Path, name: str) -> dict[int, float]:
+    """The values of a scalar by step, read from the file itself."""
+    (file,) = run.glob("events*")
+    return {event.step: event.value for event in EventAccumulator(str(file)).Reload().Scalars(name)}
+
+
+def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
+    """At the steps that all three seeds reached."""
+    seeds = [logged(run, "episode/return") for run in runs[:3]]
+    steps = [1000, 2000, 3000, 4000]
+    values = np.array([[seed[step] for step in steps] for seed in seeds])
+    (group,) = group_runs(runs[:3])
+    at, mean, deviation = mean_and_band([run.curves["episode/return"] for run in group.runs])
+    assert at.tolist() == steps
+    np.testing.assert_allclose(mean, values.mean(axis=0))
+    np.testing.assert_allclose(deviation, values.std(axis=0))
+
+    axes = curves_figure([group]).axes[0]
+    (band,) = axes.collections
+    corners = band.get_paths()[0].vertices
+    at_2000 = corners[corners[:, 0] == 2000.0, 1]
+    expected = values[:, 1].mean() + values[:, 1].std() * np.array([-1.0, 1.0])
+    np.testing.assert_allclose(sorted(set(at_2000)), expected)
+    lengths = sorted(len(line.get_xdata()) for line in axes.lines)
+    assert [n for n in lengths if n] == [4, 4, 5, 5]  # the mean, and each seed to its end
+
+
+def test_the_curves_have_their_units(runs: list[Path]) -> None:
+    """One run is one line; the apex error is in centimetres."""
+    figure = curves_figure(group_runs(runs[3:]))
+    for axes, (name, _, factor) in zip(figure.axes, CURVES, strict=True):
+        values = logged(runs[3], name)
+        line = next(line for line in axes.lines if len(line.get_xdata()))
+        np.testing.assert_allclose(line.get_ydata(), factor * np.array([*values.values()]))
+    assert "cm" in CURVES[2][1] and CURVES[2][2] == 100.0
+
+
+def test_there_is_a_panel_for_every_reward_term(runs: list[Path]) -> None:
+    figure = rewards_figure(group_runs(runs))
+    titles = [axes.get_title().replace(" ", "_") for axes in figure.axes]
+    assert titles == list(TERM_NAMES)
+    for axes, name in zip(figure.axes, TERM_NAMES, strict=True):
+        drawn = [line.get_ydata() for line in axes.lines if len(line.get_xdata()) == 5]
+        expected = [*logged(runs[3], f"reward/{name}").values()]
+        assert any(np.allclose(y, expected) for y in drawn)
+
+
+def test_an_evaluation_is_drawn_from_its_recording() -> None:
+    """4 s at 100 Hz of two made-up episodes, the second of which ends after 3 s."""
+    env = BounceBall(EnvConfig(episode_seconds=4.0))
+    observation = np.zeros((400, 29, 2), np.float32)
+    observation[:, 8] = np.linspace(0.1, 0.7, 400)[:, None]
+    observation[:, 28] = 0.5
+    bounced, running = np.zeros((400, 2), bool), np.ones((400, 2), bool)
+    bounced[[100, 250, 350]] = True
+    running[300:, 1] = False
+    recording = Recording(observation, bounced, np.full((400, 2), 0.53, np.float32), running)
+    heights, errors, hits = evaluation_figure(env, recording).axes
+
+    ball = next(line for line in heights.lines if line.get_label() == "ball")
+    np.testing.assert_allclose(ball.get_xdata(), 0.01 * np.arange(1, 401))
+    np.testing.assert_allclose(ball.get_ydata(), observation[:, 8, 0])
+    # Three bounces after 2 s and before an end, all with the apex 3 cm too high.
+    counts = [bar for bar in errors.patches if bar.get_height()]
+    (bar,) = counts
+    assert bar.get_height() == 3
+    assert bar.get_x() <= 3.0 <= bar.get_x() + bar.get_width()
+    (outline,) = hits.patches
+    assert sorted((outline.get_width(), outline.get_height())) == pytest.approx([10.0, 13.0])
+    points = next(line for line in hits.lines if line.get_marker() == ".")
+    assert len(points.get_xdata()) == 3
+
+
+def test_images_are_what_their_suffix_says(runs: list[Path]) -> None:
+    figure = curves_figure(group_runs(runs))
+    width, height = figure.get_size_inches()
+    assert Image.open(io.BytesIO(image(figure, "png"))).size == (150 * width, 150 * height)
+    root = xml.etree.ElementTree.fromstring(image(figure, "svg"))
+    assert root.tag.endswith("}svg")
+    assert image(figure, "svg") == image(curves_figure(group_runs(runs)), "svg")
+
+
+def test_plot_of_one_run(trained: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "a/plots"
+    plot_command.main([str(trained), "--out", str(out)])
+    names = {f"{name}.{x}" for name in ("curves", "rewards", "evaluation") for x in ("png", "svg")}
+    assert {path.name for path in out.iterdir()} == names
+    assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == names
+
+
+def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(trained, tmp_path / "other")
+    save_config(other, load_config(trained / "config.yaml").model_copy(update={"seed": 1}))
+    plot_command.main([str(trained), str(other), "--formats", "svg", "--out", str(tmp_path / "p")])
+    assert {path.name for path in (tmp_path / "p").iterdir()} == {"curves.svg", "rewards.svg"}
+
+
+BAD_PLOTS = {
+    "no run": ("nowhere", "nowhere", "give a run's folder"),
+    "unknown format": ("{run} --formats gif", "--formats", "gif", "{png,svg}"),
+    "no format": ("{run} --formats", "--formats", "at least 1 item"),
+    "out is a file": ("{run} --out {run}/config.yaml", "cannot be written", "--out"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PLOTS.values(), ids=BAD_PLOTS)
+def test_bad_plot(trained: Path, tmp_path: Path, monkeypatch, capfd, case) -> None:
+    args, *words = case
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_info:
+        plot_command.main(args.format(run=trained).split())
+    out, error = capfd.readouterr()
+    assert exit_info.value.code == 2
+    assert re.fullmatch(r"error: .+\n", error) and not out
+    assert [word for word in words if word not in error] == []
+    assert not list(tmp_path.iterdir())
+
+
+def check_report(run: Path) -> str:
+    """The text of a report, after checks that it is whole and needs nothing else."""
+    page = (run / "report.html").read_text(encoding="utf-8")
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert len(sources) == 3
+    for source in sources:
+        kind, _, data = source.partition(",")
+        assert kind == "data:image/svg+xml;base64"
+        xml.etree.ElementTree.fromstring(base64.b64decode(data))
+    assert "<script" not in page and "@import" not in page
+    results = load_results(run)
+    for result in results["results"]:
+        assert f">{result['name']}</td>" in page
+        assert f">{result['value']:.2f}</td>" in page
+    for phase, seconds in results["seconds"].items():
+        assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
+    assert len(re.findall(r">128</td>|>256</td>", page)) == 2
+    config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
+    assert TrainConfig.model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
+    return page
+
+
+def test_training_leaves_a_report(trained: Path) -> None:
+    page = check_report(trained)
+    met = sum(r["passed"] is not False for r in load_results(trained)["results"])
+    assert f"<h1>{met} of 5 results met</h1>" in page
+
+
+def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / "report.html").unlink()
+    report_command.main([str(run)])
+    check_report(run)
+    assert capsys.readouterr().out.endswith("run/report.html\n")
+
+
+def test_no_report(tmp_path: Path) -> None:
+    train_command.main([*TINY, "--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"])
+    (run,) = tmp_path.iterdir()
+    assert not (run / "report.html").exists()
+    assert len(list(run.glob("events*"))) == 1
+
+
+def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatch, capsys) -> None:
+    def fail(*_):
+        raise RuntimeError("no\nfonts")
+
+    monkeypatch.setattr(report_command, "write_report", fail)
+    train_command.main([*TINY, "--total-steps", "128", "--log-dir", str(tmp_path)])
+    (run,) = tmp_path.iterdir()
+    assert json.loads((run / "results.json").read_text())["trained_steps"] == 128
+    shown = capsys.readouterr().out
+    assert f"report: not drawn (no fonts); python -m bounce_mjx.report {run} draws it\n" in shown
+    assert shown.index("best checkpoint") < shown.index("report: not drawn")
+
+
+def test_tensorboard_reads_everything_back(trained: Path) -> None:
+    log = EventAccumulator(str(trained), size_guidance={"tensors": 0, "images": 0}).Reload()
+    tags = log.Tags()
+    assert set(tags["tensors"]) == {"config/text_summary", "results/text_summary"}
+    for name in tags["tensors"]:
+        assert log.SummaryMetadata(name).plugin_data.plugin_name == "text"
+    assert not any(tags[kind] for kind in ("audio", "histograms", "distributions"))
+    groups = {name.partition("/")[0] for name in tags["scalars"]}
+    assert groups == {"episode", "loss", "policy", "results", "reward", "speed", "task"}
+
+    (config,) = log.Tensors("config/text_summary")
+    text = config.tensor_proto.string_val[0].decode()
+    plain = yaml.safe_load(re.fullmatch(r"```yaml\n(.*)```", text, re.DOTALL)[1])
+    assert TrainConfig.model_validate(plain) == load_config(trained / "config.yaml")
+
+    tables = log.Tensors("results/text_summary")
+    assert [event.step for event in tables] == [128, 256]
+    results = load_results(trained)
+    best = next(event for event in tables if event.step == results["best_steps"])
+    rows = best.tensor_proto.string_val[0].decode().splitlines()
+    assert {row.count("|") for row in rows} == {6}
+    assert [row.split(" | ")[0].strip("| ") for row in rows[2:]] == [
+        result["name"] for result in results["results"]
+    ]
+    assert [row.split(" | ")[2] for row in rows[2:]] == [
+        f"{result['value']:.2f}" for result in results["results"]
+    ]
+
+    assert tags["images"] == ["evaluation"]
+    (picture,) = log.Images("evaluation")
+    assert picture.step == results["best_steps"]
+    pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+    assert pixels.shape == (picture.height, picture.width, 3)
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
+
+
+def test_a_result_that_is_not_judged_is_said_so(trained: Path) -> None:
+    report = Report.from_dict(load_results(trained))
+    speed = report.results[3]._replace(passed=None)
+    text = results_markdown(report._replace(results=(*report.results[:3], speed)))
+    assert text.splitlines()[-1].endswith("| not judged |")

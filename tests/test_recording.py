@@ -1,0 +1,137 @@
+"""Recordings of an evaluation's episodes: what they hold, and what is read off them."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.evaluation import make_recording_evaluator
+from bounce_mjx.policy import Policy, act, init_normalizer, make_networks
+from bounce_mjx.recording import Recording, apex_errors, hit_points, settled_bounces
+
+EPISODES, RECORDED = 6, 4
+
+
+@pytest.fixture(scope="module")
+def env() -> BounceBall:
+    """Episodes of 1.5 s: the ball bounces a few times, and falls off a paddle that is let sink."""
+    return BounceBall(EnvConfig(episode_seconds=1.5))
+
+
+@pytest.fixture(scope="module")
+def networks(env: BounceBall):
+    return make_networks(PPOConfig(hidden_layers=(8,)), env.observation_size, env.action_size)
+
+
+@pytest.fixture(scope="module")
+def policy(networks) -> Policy:
+    params = networks.policy_network.init(jax.random.PRNGKey(1))
+    return Policy(init_normalizer(29), jax.tree.map(lambda x: 3.0 * x, params))
+
+
+@pytest.fixture(scope="module")
+def evaluated(env: BounceBall, networks, policy: Policy):
+    """Statistics and recording."""
+    evaluate = make_recording_evaluator(env, networks, EPISODES, RECORDED)
+    return jax.device_get(evaluate(policy, jax.random.PRNGKey(2)))
+
+
+@pytest.fixture(scope="module")
+def stepped(env: BounceBall, networks, policy: Policy):
+    """States [T, ..., K] of the recorded episodes, by stepping the environment."""
+    keys = jax.random.split(jax.random.PRNGKey(2), EPISODES)[:RECORDED]
+    states = jax.jit(jax.vmap(env.reset))(keys)
+    step = jax.jit(lambda states: jax.vmap(env.step)(states, act(networks, policy, states.obs)))
+    history = []
+    for _ in range(env.config.episode_steps):
+        states = step(states)
+        history.append(jax.device_get(states))
+    return jax.tree.map(lambda *x: np.moveaxis(np.stack(x), 1, -1), *history)
+
+
+def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
+    statistics, recording = evaluated
+    ended = np.cumsum(stepped.done, axis=0) > 0
+    running = np.concatenate([np.ones((1, RECORDED), bool), ~ended[:-1]])
+    assert ended.any() and not ended[:50].any()
+    # The loop ends with the last of all episodes.
+    steps = int(statistics.steps.max())
+    np.testing.assert_array_equal(recording.running[:steps], running[:steps])
+    assert not recording.running[steps:].any()
+    up_to_end = np.broadcast_to(running[:, None], recording.observation.shape)
+    np.testing.assert_allclose(
+        recording.observation[up_to_end], stepped.obs[up_to_end], rtol=1e-3, atol=1e-3
+    )
+    bounces = (stepped.metrics["bounced"] > 0) & running
+    assert bounces.sum() >= RECORDED
+    np.testing.assert_array_equal(settled_bounces(recording, 0), bounces)
+    np.testing.assert_allclose(statistics.steps[:RECORDED], running.sum(axis=0))
+
+
+def test_apex_errors_are_those_of_the_environment(evaluated, stepped) -> None:
+    _, recording = evaluated
+    bounces = settled_bounces(recording, 0)
+    errors = apex_errors(recording, bounces)
+    np.testing.assert_allclose(np.abs(errors), stepped.metrics["apex_error"][bounces], atol=1e-3)
+    assert (errors < 0.0).any()  # a ball that only drops never reaches most targets
+
+
+def made_up(steps: int, episodes: int) -> Recording:
+    """A recording of nothing, in which a test writes."""
+    return Recording(
+        observation=np.zeros((steps, 29, episodes), np.float32),
+        bounced=np.zeros((steps, episodes), bool),
+        apex=np.zeros((steps, episodes), np.float32),
+        running=np.ones((steps, episodes), bool),
+    )
+
+
+def test_settled_bounces_are_late_and_before_the_end() -> None:
+    recording = made_up(6, 2)
+    recording.bounced[[0, 2, 4], :] = True
+    recording.running[3:, 1] = False
+    late = settled_bounces(recording, 2)
+    assert np.argwhere(late).tolist() == [[2, 0], [2, 1], [4, 0]]
+    assert not settled_bounces(recording, 0)[0].any()  # before it there was no flight
+    assert recording.bounced[0].all()
+
+
+def test_apex_errors_have_a_sign() -> None:
+    recording = made_up(4, 1)
+    recording.observation[:, 28] = 0.5
+    recording.apex[:, 0] = (0.3, 0.62, 0.1, 0.45)
+    bounces = np.array([[False], [True], [True], [False]])
+    np.testing.assert_allclose(apex_errors(recording, bounces), [-0.2, 0.12], atol=1e-6)
+
+
+def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
+    """A ball put over a known point of a turned paddle is found there."""
+    rng = np.random.default_rng(0)
+    recording = made_up(5, 3)
+    data = mujoco.MjData(env.mj_model)
+    points = rng.uniform(-0.05, 0.05, (5, 3, 2))
+    for step, episode in np.ndindex(5, 3):
+        data.qpos[:6] = rng.uniform(-1.0, 1.0, 6)
+        mujoco.mj_forward(env.mj_model, data)
+        paddle = data.geom("blocker")
+        local = [*points[step, episode], 0.0225]
+        recording.observation[step, :6, episode] = data.qpos[:6]
+        recording.observation[step, 6:9, episode] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+    bounces = rng.random((5, 3)) < 0.5
+    assert 0 < bounces.sum() < bounces.size
+    np.testing.assert_allclose(hit_points(env, recording, bounces), points[bounces], atol=1e-6)
+
+
+def test_only_so_many_episodes_are_recorded(env: BounceBall, networks) -> None:
+    policy = jax.eval_shape(
+        lambda key: Policy(init_normalizer(29), networks.policy_network.init(key)),
+        jax.random.PRNGKey(0),
+    )
+    for recorded, kept in ((2, 2), (9, EPISODES)):
+        evaluate = make_recording_evaluator(env, networks, EPISODES, recorded)
+        _, recording = jax.eval_shape(evaluate, policy, jax.random.PRNGKey(0))
+        assert recording.observation.shape == (150, 29, kept)
+        assert recording.running.dtype == jnp.bool

@@ -1,0 +1,65 @@
+"""A run so small that a test can make one, and a process that makes one."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
+STEPS = 256
+TINY = (
+    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
+    "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
+    "--no-stop-when-solved --episode-seconds 0.5"
+).split()
+TIMEOUT = 120.0
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Every path under a folder, a file with its bytes."""
+    return {p: p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+class Job:
+    """A process of train_jax.py."""
+
+    def __init__(self, log: Path, args: list[str]):
+        self._log = log
+        with log.open("wb") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, "-u", str(TRAIN_SCRIPT), *args],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            )
+
+    @property
+    def said(self) -> str:
+        """What the process has printed."""
+        return self._log.read_text()
+
+    def wait_until_said(self, text: str, times: int = 1) -> None:
+        """Waits until the process has printed a text so many times."""
+        deadline = time.monotonic() + TIMEOUT
+        while self.said.count(text) < times:
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < deadline, self.said
+            time.sleep(0.01)
+
+    def wait(self) -> int:
+        """The exit status."""
+        return self.process.wait(TIMEOUT)
+
+
+@contextlib.contextmanager
+def job(log: Path, *args: object) -> Iterator[Job]:
+    """Starts `train_jax.py args`, and leaves no process behind."""
+    started = Job(log, [str(arg) for arg in args])
+    try:
+        yield started
+    finally:
+        started.process.kill()
+        started.process.wait()
