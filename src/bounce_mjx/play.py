@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         console = Console()
         enable_compilation_cache()
-        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir)
+        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         console.print(f"checkpoint: {checkpoint.folder}", highlight=False, soft_wrap=True)
         changes = {} if command.physics == "config" else {"physics": command.physics}
