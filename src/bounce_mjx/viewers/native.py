@@ -77,6 +77,8 @@ class _Window:
             show_left_ui=False,
             show_right_ui=False,
         ) as viewer:
+            with viewer.lock():
+                mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
             while viewer.is_running() and left > 0:
                 while not self._keys.empty():
                     self._press(self._keys.get())
