@@ -46,12 +46,9 @@ def run_browser(
 
     Args:
       shown: environments shown at first; the page's slider goes up to all of the simulation.
-      port: the first one to try.
-
-    Raises:
-      UserError: the address cannot be used.
+      port: a free one.
     """
-    with open_server(host, _free_port(host, port)) as server:
+    with open_server(host, port) as server:
         _Page(server, simulation, shown, speed, title).run(seconds, console)
 
 
@@ -238,7 +235,7 @@ def reward_bars(terms: np.ndarray) -> str:
     )
 
 
-def _free_port(host: str, port: int) -> int:
+def free_port(host: str, port: int) -> int:
     """The first free port from `port` on.
 
     Raises:

@@ -83,6 +83,10 @@ def show(
         check_writable(options.html, "--html", SUFFIXES)
     if not recorded and viewer == "native":
         check_display()
+    if not recorded and viewer == "browser":
+        from bounce_mjx.viewers.browser import free_port, run_browser
+
+        port = free_port(options.host, options.port)
 
     num_envs = options.num_envs
     # The page's slider goes up to the simulated number. MJX simulates 16 too slowly on a CPU.
@@ -105,15 +109,13 @@ def show(
     elif viewer == "native":
         run_native(simulation, speed=options.speed, seconds=options.seconds)
     else:
-        from bounce_mjx.viewers.browser import run_browser
-
         run_browser(
             simulation,
             shown=options.num_envs,
             speed=options.speed,
             seconds=options.seconds,
             host=options.host,
-            port=options.port,
+            port=port,
             title=title,
             console=console,
         )

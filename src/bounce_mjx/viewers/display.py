@@ -26,6 +26,8 @@ class Display:
         self.data = mujoco.MjData(self.model)
         self._config = env.config
         self._target = self.model.site(TARGET_SITE).id
+        # MuJoCo leaves the position out where it was zero in the file.
+        self.model.site_sameframe[self._target] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
     def pose(self, qpos: np.ndarray, target_height: float) -> None:
         """Moves `data` to generalised positions [nq] and the marker to a target height, m."""
