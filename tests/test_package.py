@@ -109,7 +109,7 @@ from rich.console import Console
 from bounce_mjx import BounceBall
 from bounce_mjx.config import TrainConfig
 from bounce_mjx.policy import act, make_networks
-from bounce_mjx.pretrained import choose_checkpoint
+from bounce_mjx.checkpoint_choice import choose_checkpoint
 from bounce_mjx.runs import load_policy, load_run_config
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)

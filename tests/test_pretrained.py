@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from bounce_mjx import ship as ship_command
+from bounce_mjx.checkpoint_choice import choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.config import TrainConfig, load_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.eval import evaluate_policy
 from bounce_mjx.evaluation import Report
-from bounce_mjx.pretrained import choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import best_checkpoint, load_policy, load_run_config
 from bounce_mjx.train import read_command

@@ -11,6 +11,7 @@ import tyro
 from pydantic import Field
 from rich.console import Console
 
+from bounce_mjx.checkpoint_choice import choose_checkpoint
 from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, StrictModel, TrainConfig, validate
 from bounce_mjx.env import BounceBall
@@ -18,7 +19,6 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import DEFAULT_EPISODES, DEFAULT_SEED, Report, judge, make_evaluator
 from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
 from bounce_mjx.policy import Policy, make_networks
-from bounce_mjx.pretrained import choose_checkpoint
 from bounce_mjx.reporting import details_line, results_table
 from bounce_mjx.runs import load_policy, load_run_config
 from bounce_mjx.train import enable_compilation_cache

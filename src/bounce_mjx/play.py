@@ -10,12 +10,12 @@ import tyro
 from pydantic import Field
 from rich.console import Console
 
+from bounce_mjx.checkpoint_choice import choose_checkpoint
 from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, StrictModel, validate
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.policy import make_networks
-from bounce_mjx.pretrained import choose_checkpoint
 from bounce_mjx.runs import load_policy, load_run_config
 from bounce_mjx.train import enable_compilation_cache
 from bounce_mjx.viewers.command import ViewerOptions, show

@@ -11,12 +11,12 @@ import jax
 import tyro
 from rich.console import Console
 
+from bounce_mjx.checkpoint_choice import PRETRAINED
 from bounce_mjx.cli import parse
 from bounce_mjx.config import StrictModel, TrainConfig
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.eval import evaluate_policy
 from bounce_mjx.evaluation import DEFAULT_SEED
-from bounce_mjx.pretrained import PRETRAINED
 from bounce_mjx.reporting import details_line, results_table
 from bounce_mjx.runs import (
     CONFIG_FILE,
