@@ -86,6 +86,17 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
 
 
+def test_a_label_names_few_settings(tmp_path: Path) -> None:
+    many = {"num_envs": 64, "rollout_length": 16, "num_epochs": 2, "num_minibatches": 2}
+    logs = {"episode/return": {1: 1.0}}
+    runs = [
+        write_run(tmp_path / name, TrainConfig(ppo=PPOConfig(**changes)), logs)
+        for name, changes in (("plain", {}), ("changed", many))
+    ]
+    labels = [group.label for group in group_runs(runs)]
+    assert labels[1] == "num_envs 64, rollout_length 16, num_epochs 2 … (one seed)"
+
+
 def test_a_curve_is_what_was_logged_last(tmp_path: Path) -> None:
     """A run that went on from step 2 logs step 3 again."""
     run = write_run(

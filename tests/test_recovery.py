@@ -1,35 +1,62 @@
 """What a training survives: an end between any two steps, signals, full disks, numbers that are
 not finite. Going on leads to the very state of a training that nothing happened to."""
 
+import contextlib
+import io
 import json
 import multiprocessing
 import os
 import random
 import re
+import resource
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboardX import SummaryWriter
 
 from bounce_mjx import checkpoints
 from bounce_mjx import train as train_command
-from bounce_mjx.config import differing_keys
-from bounce_mjx.runs import RESUMABLE_KEYS, best_checkpoint, latest_checkpoint, load_run_config
-from tiny_runs import STEPS, TIMEOUT, TINY, job
+from bounce_mjx import training as training_job
+from bounce_mjx.config import TrainConfig, differing_keys
+from bounce_mjx.errors import UserError
+from bounce_mjx.ppo import CHECKED, first_fault
+from bounce_mjx.reporting import Reporter
+from bounce_mjx.runs import (
+    RESUMABLE_KEYS,
+    CheckpointWriter,
+    best_checkpoint,
+    latest_checkpoint,
+    load_run_config,
+)
+from bounce_mjx.signals import StopRequest
+from tiny_runs import STEPS, TIMEOUT, TINY, Job, job
 
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A cache of compiled programs, also for the processes that the tests start."""
+    """Compiled programs are kept: in this process by their config, for others in a cache."""
+    compile_programs, kept = training_job.compile_programs, {}
+
+    def compile_once(config, *args):
+        key = config.model_copy(update={"total_steps": 0, "eval_every": 0, "log_dir": None})
+        if repr(key) not in kept:
+            kept[repr(key)] = compile_programs(config, *args)
+        return kept[repr(key)]
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_job, "compile_programs", compile_once)
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
@@ -279,17 +306,23 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     log_dir = tmp_path / "runs"
     args = [*TINY, "--eval-every", "64", "--total-steps", str(10**6), "--log-dir", str(log_dir)]
     saved = 0
+
+    def written() -> list[int]:
+        """Changes whenever something is written to the folder of the latest checkpoint."""
+        return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints/latest")]
+
     for attempt in range(20):
+        before = written()
         process = processes.Process(target=_train_in_silence, args=(args,))
         process.start()
         if attempt % 5 == 4:
             time.sleep(moments.uniform(0.0, 3.0))
         else:
             deadline = time.monotonic() + TIMEOUT
-            while not any(p.name > f"{saved}" for p in log_dir.glob("*/checkpoints/latest/*")):
+            while written() == before:
                 assert process.is_alive() and time.monotonic() < deadline
                 time.sleep(0.005)
-            time.sleep(moments.uniform(0.0, 0.4))
+            time.sleep(moments.uniform(0.0, 2.0))
         process.kill()
         process.join()
         runs = list(log_dir.glob("*"))
@@ -309,3 +342,186 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     log = EventAccumulator(str(run)).Reload()
     logged = [event.step for event in log.Scalars("loss/value")]
     assert logged == sorted(set(logged))
+
+
+# Full disks
+
+
+@contextlib.contextmanager
+def tmpfs(folder: Path) -> Iterator[None]:
+    """A file system of 4 MB, mounted at a folder."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("a file system cannot be mounted here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def finish_once_there_is_room(training: Job, make_room: Callable[[], None], reason: str) -> None:
+    training.wait_until_said("the training goes on")
+    training.wait_until_said("it is kept in memory")
+    make_room()
+    assert training.wait() == 0, training.said
+    for sentence in ("the training goes on", "it is kept in memory", "the state is saved again"):
+        assert training.said.count(sentence) == 1
+    assert f"cannot be written ({reason})" in training.said
+    assert "Traceback" not in training.said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["full", "read-only"])
+def test_disk_without_room_loses_nothing(tmp_path: Path, straight: Path, what: str) -> None:
+    disk, filler = tmp_path / "disk", tmp_path / "disk/filler"
+    remount = ["mount", "-o", "remount,size=4m,"]
+    with (
+        tmpfs(disk),
+        job(
+            tmp_path / "log", *TINY, "--total-steps", STEPS, "--log-dir", disk / "runs"
+        ) as training,
+    ):
+        training.wait_until_said("device:")
+        if what == "full":
+            with contextlib.suppress(OSError):
+                filler.write_bytes(bytes(2**22))
+            finish_once_there_is_room(training, filler.unlink, "No space left on device")
+        else:
+            subprocess.run([*remount[:-1], remount[-1] + "ro", str(disk)], check=True)
+            finish_once_there_is_room(
+                training,
+                lambda: subprocess.run([*remount[:-1], remount[-1] + "rw", str(disk)], check=True),
+                "Read-only file system",
+            )
+        (run,) = (disk / "runs").iterdir()
+        assert_same_training(run, straight)
+        log = EventAccumulator(str(run)).Reload()
+        assert [event.step for event in log.Scalars("loss/value")] == [64, 128, 192, 256]
+
+
+@pytest.mark.slow
+def test_file_that_may_not_grow_loses_nothing(tmp_path: Path, straight: Path) -> None:
+    with job(
+        tmp_path / "log", *TINY, "--total-steps", STEPS, "--log-dir", tmp_path / "runs"
+    ) as training:
+        training.wait_until_said("device:")
+        process, limit = training.process.pid, resource.RLIMIT_FSIZE
+        old = resource.prlimit(process, limit, (2**16, resource.RLIM_INFINITY))
+        finish_once_there_is_room(
+            training, lambda: resource.prlimit(process, limit, old), "File too large"
+        )
+    (run,) = (tmp_path / "runs").iterdir()
+    assert_same_training(run, straight)
+
+
+def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    monkeypatch.setattr(training_job, "RETRY_SECONDS", 0.0)
+    said = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    reporter = Reporter([SummaryWriter(tmp_path)], Console(file=io.StringIO()), TrainConfig(), 0)
+    monkeypatch.setattr(reporter, "say", say)
+    writer = CheckpointWriter(blocked, TrainConfig())
+    writer.save(["latest"], 64, {"array": np.zeros(3)})
+    with StopRequest() as stop:
+        with pytest.raises(UserError, match=r"Not a directory.*make room, and resume"):
+            training_job._wait_until_saved([writer], reporter, stop)
+    assert len(said) == 1 and "it is kept in memory" in said[0]
+
+
+# Numbers that are not finite
+
+
+def diverge_at(monkeypatch, iteration: int) -> None:
+    """Spoils the parameters of every training before that iteration."""
+    compile_programs = training_job.compile_programs
+
+    def compile_spoilt(*args):
+        programs = compile_programs(*args)
+
+        def run(state):
+            if state.iteration == iteration - 1:
+                params = jax.tree.map(lambda x: x * jnp.nan, state.params.policy)
+                state = state._replace(params=state.params._replace(policy=params))
+            return programs.run(state)
+
+        return programs._replace(run=run)
+
+    monkeypatch.setattr(training_job, "compile_programs", compile_spoilt)
+
+
+def test_divergence_ends_the_training_and_keeps_the_last_good_state(
+    run: Path, half: Path, monkeypatch, capfd
+) -> None:
+    diverge_at(monkeypatch, 4)
+    with pytest.raises(SystemExit) as exit_info:
+        resume(run, "--total-steps", "100000")
+    assert exit_info.value.code == 2
+    sentence = capfd.readouterr().err
+    assert re.fullmatch(r"error: .+\n", sentence)
+    assert "loss/policy was the first that was not finite, at iteration 4;" in sentence
+    assert f"the last good checkpoint is {latest_checkpoint(run).folder}" in sentence
+    assert_same_training(run, half)
+
+
+@pytest.mark.parametrize("quantity", CHECKED)
+def test_first_fault_names_what_went_first(quantity: str) -> None:
+    def value(name: str):
+        """That of a quantity: broken from there on, as everything after it would be."""
+        return jnp.where(CHECKED.index(name) >= CHECKED.index(quantity), jnp.nan, 1.0)
+
+    def minibatches(name: str):
+        return jnp.ones((2, 3)).at[1, 1].set(value(name)).at[1, 2].set(value("parameters"))
+
+    of_minibatches = {
+        "loss/value": minibatches("loss/value"),
+        "loss/policy": minibatches("loss/policy"),
+        "loss/gradient_norm": minibatches("gradient"),
+    }
+    if quantity == "parameters":
+        of_minibatches = dict.fromkeys(of_minibatches, jnp.ones((2, 3)))
+    number = first_fault(
+        value("reward"), {"mean": value("observation")}, of_minibatches, value("parameters")
+    )
+    assert CHECKED[number - 1] == quantity
+
+
+def test_no_fault_where_all_is_finite() -> None:
+    of_minibatches = dict.fromkeys(
+        ("loss/value", "loss/policy", "loss/gradient_norm"), jnp.ones((2, 3))
+    )
+    assert first_fault(jnp.ones(()), jnp.ones(3), of_minibatches, jnp.ones(4)) == 0
+
+
+def test_state_that_is_not_finite_is_reset_told_and_stays_alone(
+    run: Path, straight: Path, monkeypatch, capfd
+) -> None:
+    compile_programs = training_job.compile_programs
+
+    def compile_spoilt(*args):
+        programs = compile_programs(*args)
+
+        def run(state):
+            if state.iteration == 2:
+                physics = state.env.env.pipeline_state.physics
+                broken = physics._replace(qvel=physics.qvel.at[2, 5].set(jnp.nan))
+                pipeline = state.env.env.pipeline_state._replace(physics=broken)
+                env = state.env.env.replace(pipeline_state=pipeline)
+                state = state._replace(env=state.env._replace(env=env))
+            return programs.run(state)
+
+        return programs._replace(run=run)
+
+    monkeypatch.setattr(training_job, "compile_programs", compile_spoilt)
+    resume(run, "--total-steps", str(STEPS))
+    assert "1 environment had a state that was not finite, and was reset" in capfd.readouterr().out
+    counts = EventAccumulator(str(run)).Reload().Scalars("task/non_finite")
+    assert {event.step: event.value for event in counts} == {64: 0, 128: 0, 192: 1, 256: 0}
+    for name, array in arrays(latest_checkpoint(run)).items():
+        assert np.isfinite(array).all(), name

@@ -25,6 +25,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import tensorstore
+from flax import traverse_util
 
 RECORD_FILE = "run.json"
 MANIFEST_FILE = "manifest.json"
@@ -56,7 +57,7 @@ def write_checkpoint(folder: Path, items: dict[str, Any], record: dict[str, Any]
             multiprocessing_options=only_here,
         )
         for name, tree in items.items():
-            checkpointer.save((partial / name).absolute(), args=ocp.args.PyTreeSave(tree))
+            checkpointer.save((partial / name).absolute(), args=ocp.args.PyTreeSave(_plain(tree)))
         (partial / RECORD_FILE).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         seal(partial)
         replaced = folder.with_name(folder.name + _REPLACED)
@@ -72,6 +73,18 @@ def write_checkpoint(folder: Path, items: dict[str, Any], record: dict[str, Any]
         # tensorstore reports a full disk as a ValueError.
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
     shutil.rmtree(replaced, ignore_errors=True)
+
+
+def _plain(tree: Any) -> Any:
+    """The pytree as nested dictionaries of numpy arrays. brax's counters turn theirs into JAX's,
+    and of those orbax does not take what lies on one of several hosts."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
+    arrays = {
+        tuple(name.split(".")): np.asarray(leaf)
+        for name, (_, leaf) in zip(names, leaves, strict=True)
+    }
+    return traverse_util.unflatten_dict(arrays)
 
 
 def seal(folder: Path) -> None:
@@ -122,13 +135,11 @@ def open_item(folder: Path, item: str) -> dict[str, tensorstore.TensorStore]:
 
     Not by orbax, whose readers print tracebacks from their threads where a file is damaged.
     """
-    metadata = _read_json(folder / item / "_METADATA")
-    driver = "zarr3" if metadata["use_zarr3"] else "zarr"
     database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder / item}/"}}
     keys = tensorstore.KvStore.open(database).result().list().result()
     opening = {
         name: tensorstore.open(
-            {"driver": driver, "kvstore": {**database, "path": f"{name}/"}}, open=True, read=True
+            {"driver": "zarr", "kvstore": {**database, "path": f"{name}/"}}, open=True, read=True
         )
         for name in {key.decode().rpartition("/")[0] for key in keys}
     }
@@ -146,6 +157,11 @@ def read_arrays(arrays: dict[str, tensorstore.TensorStore]) -> dict[str, np.ndar
         # The memory of a chunk is taken before its bytes are looked at.
         if math.prod(chunk) > math.prod(max(1, length) for length in array.shape):
             raise ValueError(f"{name} is stored in chunks of {chunk}, larger than itself")
+        # orbax writes zstd, whose reader stops at the size of the array; that of blosc takes what
+        # the file asks for, up to 2 GB.
+        compressor = array.codec.to_json()["compressor"]
+        if compressor is not None and compressor["id"] != "zstd":
+            raise ValueError(f"{name} is compressed by {compressor['id']}, not zstd")
     reading = {name: array.read() for name, array in arrays.items()}
     return {name: array.result() for name, array in reading.items()}
 

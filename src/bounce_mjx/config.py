@@ -416,6 +416,11 @@ class TrainConfig(StrictModel):
     """The trainer."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Seed of the whole training."""
+    num_seeds: Count = 1
+    """Independent trainings in one program, from seeds `seed`, `seed` + 1, ...; a folder each."""
+    num_devices: Count | None = None
+    """Devices that share the environments (with several seeds: the seeds); left out, one, and on
+    several hosts all. The training does not depend on it."""
     total_steps: Steps = 50_000_000
     """Environment steps to train for, rounded up to whole blocks."""
     block_steps: Steps = 1_000_000

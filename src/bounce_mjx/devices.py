@@ -4,8 +4,6 @@ The program is the same on any number of devices: arrays of environments are sha
 batch, all else is replicated, and XLA adds the reductions of gradients and statistics.
 """
 
-from typing import TypeVar
-
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -15,21 +13,29 @@ from bounce_mjx.ppo import TrainingState, num_groups
 
 _AXIS = "devices"
 
-Tree = TypeVar("Tree")
 
-
-def make_mesh(num_devices: int, config: PPOConfig, num_seeds: int = 1) -> Mesh:
+def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) -> Mesh:
     """A mesh of the first `num_devices` devices.
+
+    Args:
+      num_devices: None for one, and on several hosts for all.
 
     Raises:
       UserError: there are fewer, or the environments (one seed) or the seeds (several) cannot be
-        divided among them.
+        divided among them, or a device of another host is left out.
     """
     devices = jax.devices()
+    if num_devices is None:
+        num_devices = 1 if jax.process_count() == 1 else len(devices)
     if num_devices > len(devices):
         raise UserError(
             f"num_devices is {num_devices}, but there are {len(devices)} "
             f"({devices[0].device_kind}); choose at most that"
+        )
+    if jax.process_count() > 1 and num_devices < len(devices):
+        raise UserError(
+            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; leave "
+            "it out"
         )
     groups = num_groups(config)
     if num_seeds > 1 and num_seeds % num_devices:

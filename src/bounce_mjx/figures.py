@@ -157,7 +157,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], name: str, title: str, fact
     axes.set_xlabel("environment steps")
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(FuncFormatter(_steps_label))
-    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_formatter(FuncFormatter(_value_label))
 
 

@@ -62,12 +62,14 @@ def any_of(flag: bool) -> bool:
     return bool(multihost_utils.process_allgather(np.array(flag)).any())
 
 
-def from_leader(tree: Tree) -> Tree:
-    """The leader's pytree of arrays, as numpy arrays in every process; the others give one of the
-    same shapes."""
+def text_from_leader(text: str | None) -> str:
+    """The leader's text, in every process; the others give None."""
     if jax.process_count() == 1:
-        return tree
-    return multihost_utils.broadcast_one_to_all(tree)
+        return text
+    encoded = np.frombuffer((text or "").encode(), np.uint8)
+    length = int(multihost_utils.broadcast_one_to_all(np.int32(len(encoded))))
+    padded = encoded if is_leader() else np.zeros(length, np.uint8)
+    return bytes(multihost_utils.broadcast_one_to_all(padded)).decode()
 
 
 def gather(tree: Tree) -> Tree:

@@ -14,6 +14,8 @@ from bounce_mjx.runs import load_results, load_run_config
 
 # What may differ in a group: the seed, where the run lies, and when it ended.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved"))
+# Settings that a label names.
+_MAX_NAMED = 3
 
 
 class Curve(NamedTuple):
@@ -39,7 +41,7 @@ class Group(NamedTuple):
     """Runs whose configs differ in nothing but the seed, and how long they went on."""
 
     label: str
-    """The settings in which the groups differ, and the number of seeds."""
+    """The first settings in which the groups differ, and the number of seeds."""
     runs: list[RunCurves]
 
 
@@ -124,6 +126,7 @@ def _differences(settings: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _label(differences: dict[str, Any], runs: int) -> str:
-    values = ", ".join(f"{name.split('.')[-1]} {value}" for name, value in differences.items())
+    named = [f"{name.split('.')[-1]} {value}" for name, value in differences.items()]
+    values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
     seeds = f"{runs} seeds" if runs > 1 else "one seed"
     return f"{values} ({seeds})" if values else seeds

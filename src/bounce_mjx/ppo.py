@@ -354,13 +354,13 @@ def group(x: jax.Array, groups: int) -> jax.Array:
 
 
 def policy_of(state: TrainingState) -> Policy:
-    """What acting needs of a training state."""
+    """What acting needs of a training state, or of those of several seeds."""
     n = OBSERVATION_SIZE
     statistics = state.normalizer
     normalizer = statistics.replace(
-        mean=statistics.mean[:n],
-        std=statistics.std[:n],
-        summed_variance=statistics.summed_variance[:n],
+        mean=statistics.mean[..., :n],
+        std=statistics.std[..., :n],
+        summed_variance=statistics.summed_variance[..., :n],
     )
     return Policy(normalizer, state.params.policy)
 

@@ -7,6 +7,9 @@
         checkpoints/latest/<steps>/     the newest state
         checkpoints/best/<steps>/       the state of the best evaluation
 
+With several seeds, checkpoints/latest/ has the state of all, and each seed has a folder in the
+run's, such as seed_003/, which is like that of a run of one seed.
+
 A checkpoint (checkpoints.py) has two items: `policy` (what acting needs) and `training` (what going
 on needs; left out where there is only a policy). It also holds the run's config and its
 evaluations so far, so that going on depends on one folder that is whole or not there.
@@ -15,7 +18,7 @@ evaluations so far, so that going on depends on one folder that is whole or not 
 import concurrent.futures
 import datetime
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -27,6 +30,7 @@ from bounce_mjx.checkpoints import stored_checkpoints
 from bounce_mjx.config import TrainConfig, differing_keys, dump_config, load_config, validate
 from bounce_mjx.env import OBSERVATION_SIZE
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import Report
 from bounce_mjx.model import JOINT_NAMES
 from bounce_mjx.policy import Policy, init_normalizer, make_networks
 from bounce_mjx.ppo import TrainingState
@@ -35,6 +39,7 @@ CheckpointName = Literal["latest", "best"]
 CONFIG_FILE = "config.yaml"
 RESULTS_FILE = "results.json"
 _CHECKPOINTS = "checkpoints"
+_SEED = "seed_"
 
 # What may differ between a checkpoint and the training that goes on from it: everything else
 # shapes its state. The MJCF file may have moved, but must describe the same model.
@@ -47,6 +52,7 @@ RESUMABLE_KEYS = frozenset(
         "eval_seed",
         "stop_when_solved",
         "log_dir",
+        "num_devices",
         "env.mjcf",
     }
 )
@@ -97,8 +103,26 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
     Raises:
       UserError: there is none.
     """
-    if path is None:
-        path = newest_run(log_dir)
+    path = newest_run(log_dir) if path is None else path
+    run = find_run(path)
+    at = path.absolute()
+    if at.parent.parent.name == _CHECKPOINTS and at in stored_checkpoints(at.parent).values():
+        return Checkpoint(run, at, int(at.name))
+    if at == run.absolute():
+        at = run = _best_seed(run)
+    for folder in (at, at / _CHECKPOINTS / "best", at / _CHECKPOINTS / "latest"):
+        stored = stored_checkpoints(folder)
+        if stored:
+            return Checkpoint(run, stored[max(stored)], max(stored))
+    raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
+
+
+def find_run(path: Path) -> Path:
+    """The run's folder that a path is or lies in.
+
+    Raises:
+      UserError: there is none.
+    """
     if not path.is_dir():
         raise UserError(
             f"there is no checkpoint folder {path}; give a run's folder such as "
@@ -110,14 +134,19 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             f"{path} is no run's folder nor in one, as no {CONFIG_FILE} is there; give a folder "
             "that train_jax.py made"
         )
-    at = path.absolute()
-    if at.parent.parent.name == _CHECKPOINTS and at in stored_checkpoints(at.parent).values():
-        return Checkpoint(run, at, int(at.name))
-    for folder in (at, at / _CHECKPOINTS / "best", at / _CHECKPOINTS / "latest"):
-        stored = stored_checkpoints(folder)
-        if stored:
-            return Checkpoint(run, stored[max(stored)], max(stored))
-    raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
+    return run
+
+
+def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
+    """The folders of the seeds of a run, each like the folder of a run of one seed."""
+    return [run / f"{_SEED}{seed:03d}" for seed in seeds]
+
+
+def _best_seed(run: Path) -> Path:
+    """The folder of a run's best seed; the run itself if it has one seed."""
+    seeds = [(folder, load_results(folder)) for folder in sorted(run.glob(f"{_SEED}*"))]
+    scores = {folder: Report.from_dict(r).score for folder, r in seeds if r is not None}
+    return max(scores, key=scores.get) if scores else run
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:

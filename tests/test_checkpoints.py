@@ -1,0 +1,315 @@
+"""A checkpoint is data, and is what was written: or it is refused in one sentence."""
+
+import json
+import os
+import random
+import re
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import tensorstore
+
+from bounce_mjx import checkpoints
+from bounce_mjx.config import PPOConfig, TrainConfig, load_config
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError
+from bounce_mjx.policy import Policy
+from bounce_mjx.ppo import TrainingState, make_trainer, policy_of
+from bounce_mjx.runs import (
+    CheckpointWriter,
+    create_run,
+    find_checkpoint,
+    load_policy,
+    load_run_config,
+    load_training_state,
+)
+
+SOURCES = Path(checkpoints.__file__).parent
+CONFIG = TrainConfig(
+    ppo=PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, hidden_layers=(16,))
+)
+
+
+@pytest.fixture(scope="module")
+def state() -> TrainingState:
+    trainer = make_trainer(CONFIG.ppo, BounceBall(CONFIG.env), CONFIG.env.episode_steps)
+    return jax.jit(trainer.init)(jax.random.PRNGKey(0))
+
+
+def write_run(folder: Path, state: TrainingState, steps: int = 64) -> Path:
+    """A run with one checkpoint."""
+    run = create_run(CONFIG.model_copy(update={"log_dir": folder}))
+    writer = CheckpointWriter(run, CONFIG)
+    progress = {"best": None, "best_steps": 0, "solved_steps": None, "evaluations": []}
+    writer.save(["latest"], steps, policy_of(state), state, progress)
+    assert writer.problem() is None
+    writer.close()
+    return run
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory, state: TrainingState) -> Path:
+    return write_run(tmp_path_factory.mktemp("written"), state)
+
+
+@pytest.fixture
+def run(written: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may damage."""
+    return shutil.copytree(written, tmp_path / "run")
+
+
+def step_of(run: Path) -> Path:
+    return run / "checkpoints/latest/64"
+
+
+def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
+    """As `eval` loads the policy, and `--resume` the whole state."""
+    checkpoint = find_checkpoint(run, run)
+    policy = load_policy(checkpoint, load_run_config(run))
+    template = jax.eval_shape(lambda: state)
+    return policy, load_training_state(checkpoint, template)[0]
+
+
+def assert_identical(a, b) -> None:
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def assert_refused(run: Path, state: TrainingState, *words: str) -> None:
+    with pytest.raises(UserError) as error_info:
+        load_both(run, state)
+    assert all(word in str(error_info.value) for word in words), str(error_info.value)
+
+
+def test_what_is_written_is_read(run: Path, state: TrainingState) -> None:
+    assert_identical(load_both(run, state), (policy_of(state), state))
+
+
+def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -> None:
+    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
+    writer = CheckpointWriter(run, CONFIG)
+    writer.save(["best"], 64, policy_of(state))
+    writer.close()
+    checkpoint = find_checkpoint(run, run)
+    assert_identical(load_policy(checkpoint, CONFIG), policy_of(state))
+    with pytest.raises(UserError, match="holds no training state to go on from"):
+        load_training_state(checkpoint, state)
+
+
+def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingState) -> None:
+    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
+    writer = CheckpointWriter(run, CONFIG)
+    for steps in (64, 128, 128):
+        changed = state._replace(iteration=state.iteration + steps)
+        writer.save(["latest"], steps, policy_of(changed), changed, {})
+    writer.close()
+    assert [p.name for p in (run / "checkpoints/latest").iterdir()] == ["128"]
+    assert load_training_state(find_checkpoint(run, run), state)[0].iteration == 128
+
+
+# Damage
+
+
+def mutate(step: Path, other: Path, draw: random.Random) -> str:
+    """Damages one file of a checkpoint; what was done."""
+    files = sorted(p for p in step.rglob("*") if p.is_file())
+    path = draw.choice(files)
+    data = path.read_bytes()
+    how = draw.choice(("truncate", "flip", "flip", "delete", "swap", "foreign", "grow", "zero"))
+    if how == "truncate":
+        path.write_bytes(data[: draw.randrange(len(data) or 1)])
+    elif how == "flip" and data:
+        flipped = bytearray(data)
+        flipped[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        path.write_bytes(flipped)
+    elif how == "delete":
+        path.unlink()
+    elif how == "swap":
+        second = draw.choice(files)
+        path.write_bytes(second.read_bytes())
+        second.write_bytes(data)
+    elif how == "foreign":
+        theirs = sorted(p for p in other.rglob("*") if p.is_file())
+        path.write_bytes(draw.choice(theirs).read_bytes())
+    elif how == "grow":
+        path.write_bytes(data + draw.randbytes(draw.randrange(1, 100)))
+    else:
+        path.write_bytes(bytes(len(data)))
+    return f"{how} {path.relative_to(step)}"
+
+
+@pytest.mark.slow
+def test_damage_is_refused_or_does_no_harm(
+    written: Path, tmp_path: Path, state: TrainingState
+) -> None:
+    """200 mutations: what loads is bit for bit what was saved; all else is one sentence."""
+    other_state = state._replace(params=jax.tree.map(lambda x: x + 1.0, state.params))
+    other = step_of(write_run(tmp_path / "other", other_state))
+    draw = random.Random(1)
+    refused = 0
+    for i in range(200):
+        run = shutil.copytree(written, tmp_path / "run")
+        what = mutate(step_of(run), other, draw)
+        try:
+            loaded = load_both(run, state)
+        except UserError as error:
+            refused += 1
+            assert "\n" not in str(error) and len(str(error)) < 1000, (i, what)
+        else:
+            assert_identical(loaded, (policy_of(state), state))
+        shutil.rmtree(run)
+    assert refused > 150
+
+
+def test_checkpoint_of_another_place_is_refused(run: Path, state: TrainingState) -> None:
+    # A folder renamed to other steps would go on from a wrong count.
+    step_of(run).rename(step_of(run).with_name("128"))
+    assert_refused(run, state, "it was written after 64 steps")
+
+
+def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -> None:
+    config = load_config(run / "config.yaml").model_copy(update={"seed": 3})
+    shutil.rmtree(step_of(run))
+    writer = CheckpointWriter(run, config)
+    writer.save(["latest"], 64, policy_of(state), state, {})
+    writer.close()
+    assert_refused(run, state, "another config", "differs in seed;", "restore that file")
+
+
+# What a stranger may send
+
+
+def test_nothing_is_read_that_could_run(run: Path) -> None:
+    """No reader in the package can execute what it reads, and no file is of a format that could
+    hold code."""
+    banned = (
+        r"\b(c?pickle|cloudpickle|dill|joblib|marshal|shelve)\b|\beval\(|\bexec\(|__import__"
+        r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)?load\b|yaml\.Loader|Unsafe|FullLoader"
+    )
+    for path in SOURCES.rglob("*.py"):
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            assert not re.search(banned, line), f"{path}:{number}: {line}"
+    for path in step_of(run).rglob("*"):
+        if not path.is_file():
+            continue
+        data = path.read_bytes()
+        text = path.suffix == ".json" or path.name in ("_METADATA", "_CHECKPOINT_METADATA")
+        if text or path.parent.name == "array_metadatas" or path.name == "_sharding":
+            json.loads(data)
+        elif path.name == "commit_success.txt":
+            data.decode("ascii")
+        else:
+            # OCDBT: https://google.github.io/tensorstore/kvstore/ocdbt
+            magic = {0x0CDB3A2A, 0x0CDB1234, 0x0CDB20DE}
+            raw = path.parent.name == "d" and int.from_bytes(data[:4], "big") not in magic
+            assert raw or int.from_bytes(data[:4], "big") in magic, path
+            assert b"cposix\nsystem" not in data and not data.startswith(b"\x80\x04")
+
+
+class Payload:
+    """What pickle would run."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.target),)
+
+
+def payload(target: Path) -> bytes:
+    import pickle
+
+    return pickle.dumps(Payload(target))
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["as found", "with a valid manifest"])
+def test_code_in_any_file_is_not_run(
+    written: Path, tmp_path: Path, state: TrainingState, sealed: bool
+) -> None:
+    target = tmp_path / "ran"
+    names = sorted(p.relative_to(written) for p in written.rglob("*") if p.is_file())
+    tagged = f'!!python/object/apply:os.mkdir ["{target}"]\n'.encode()
+    for name in names:
+        for data in (payload(target), tagged):
+            run = shutil.copytree(written, tmp_path / "run")
+            (run / name).write_bytes(data)
+            if sealed and name.name != checkpoints.MANIFEST_FILE:
+                checkpoints.seal(step_of(run))
+            try:
+                loaded = load_both(run, state)
+            except UserError:
+                pass
+            else:
+                assert_identical(loaded, (policy_of(state), state))
+            assert not target.exists(), name
+            shutil.rmtree(run)
+
+
+def edit_json(path: Path, change: Callable[[dict], None]) -> None:
+    plain = json.loads(path.read_text())
+    change(plain)
+    path.write_text(json.dumps(plain))
+
+
+@pytest.mark.parametrize("name", ["../../../../secret", "/etc/passwd", "policy/../../secret"])
+def test_manifest_leads_nowhere(run: Path, state: TrainingState, name: str) -> None:
+    (run.parent / "secret").write_text("secret")
+    entry = {"size": 6, "sha256": checkpoints._sha256(run.parent / "secret")}
+    manifest = step_of(run) / checkpoints.MANIFEST_FILE
+    edit_json(manifest, lambda plain: plain["files"].update({name: entry}))
+    assert_refused(run, state, "damaged", "is missing")
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "/etc/passwd", "policy"])
+@pytest.mark.parametrize("name", ["manifest.json", "run.json", "policy/_METADATA", "policy"])
+def test_links_are_not_followed(run: Path, state: TrainingState, name: str, target: str) -> None:
+    path = step_of(run) / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path.symlink_to(target)
+    assert_refused(run, state, "damaged", "is not a regular file")
+
+
+def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
+    path = step_of(run) / "run.json"
+    path.unlink()
+    os.mkfifo(path)
+    assert_refused(run, state, "damaged", "is not a regular file")
+
+
+def write_array(run: Path, name: str, **metadata) -> None:
+    """Puts an array of another kind into the policy of a checkpoint, with a valid manifest."""
+    item = step_of(run) / "policy"
+    database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{item}/"}}
+    store = tensorstore.KvStore.open(database).result()
+    key = f"{name}/.zarray"
+    plain = json.loads(store.read(key).result().value) | metadata
+    store.write(key, json.dumps(plain).encode()).result()
+    checkpoints.seal(step_of(run))
+
+
+HUGE = 2**40
+CRAFTED = {
+    "huge shape": {"shape": [HUGE], "chunks": [30]},
+    "huge shape in one chunk": {"shape": [HUGE], "chunks": [HUGE]},
+    "huge chunk": {"chunks": [HUGE]},
+    "blosc": {"compressor": {"id": "blosc", "cname": "zstd", "clevel": 5, "shuffle": 0}},
+    "other type": {"dtype": "<f8"},
+    "objects": {"dtype": "|O"},
+    "negative": {"shape": [-1]},
+    "more dimensions": {"shape": [29] * 30, "chunks": [29] * 30},
+}
+
+
+@pytest.mark.parametrize("metadata", CRAFTED.values(), ids=CRAFTED)
+def test_crafted_array_takes_no_memory(run: Path, state: TrainingState, metadata: dict) -> None:
+    write_array(run, "normalizer.mean", **metadata)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert_refused(run, state, "damaged")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KB
