@@ -84,7 +84,7 @@ def test_a_run_is_preferred(tmp_path: Path, monkeypatch, console, capsys) -> Non
         folder.mkdir(parents=True)
         (LOG_DIR / name / "config.yaml").touch()
     chosen = choose_checkpoint(None, LOG_DIR, console)
-    assert chosen.folder == folder.absolute()
+    assert chosen.folder.absolute() == folder.absolute()
     assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
     assert choose_checkpoint(FOLDER, LOG_DIR, console) == pretrained_checkpoint()
 
