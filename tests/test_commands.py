@@ -214,7 +214,7 @@ BAD_EVAL_FLAGS = {
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
     "checkpoint missing": ("nowhere", "nowhere", "give a run's folder"),
-    "no runs": ("", "runs/bounce_ball", "train_jax.py"),
+    "no runs": ("--log-dir mine", "no run", "in mine", "train_jax.py"),
     "no run": (".", "config.yaml", "give a folder that train_jax.py made"),
 }
 

@@ -55,10 +55,10 @@ def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
         names = set(archive.namelist())
     source = CHECKOUT / "src"
     expected = {str(p.relative_to(source)) for p in (source / "bounce_mjx").rglob("*.py")}
-    for folder in ("mjcf", "configs"):
-        data = [p for p in (CHECKOUT / folder).iterdir() if p.is_file()]
+    for folder in ("mjcf", "configs", "pretrained"):
+        data = [p for p in (CHECKOUT / folder).rglob("*") if p.is_file()]
         assert data
-        expected |= {f"bounce_mjx/{folder}/{p.name}" for p in data}
+        expected |= {f"bounce_mjx/{p.relative_to(CHECKOUT)}" for p in data}
     assert expected <= names
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
 
@@ -100,6 +100,29 @@ print(resource_path(f"configs/{preset}.yaml"))
     same, preset = run_installed(site, script, tmp_path)
     assert same == "True"
     assert Path(preset).parent == site / "bounce_mjx" / "configs"
+
+
+def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
+    script = """
+import jax
+from rich.console import Console
+from bounce_mjx import BounceBall
+from bounce_mjx.config import TrainConfig
+from bounce_mjx.policy import act, make_networks
+from bounce_mjx.checkpoint_choice import choose_checkpoint
+from bounce_mjx.runs import load_policy, load_run_config
+checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
+config = load_run_config(checkpoint.run)
+env = BounceBall(config.env)
+state = env.reset(jax.random.PRNGKey(0))
+networks = make_networks(config.ppo, env.observation_size, env.action_size)
+action = act(networks, load_policy(checkpoint, config), state.obs)
+print(checkpoint.run)
+print(*action.shape, bool((abs(action) > 0.0).any()))
+"""
+    run, action = run_installed(site, script, tmp_path)
+    assert Path(run) == site / "bounce_mjx" / "pretrained"
+    assert action == "6 True"
 
 
 def test_readme_example_runs(capsys):

@@ -11,6 +11,7 @@ import tyro
 from pydantic import Field
 from rich.console import Console
 
+from bounce_mjx.checkpoint_choice import choose_checkpoint
 from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, StrictModel, TrainConfig, validate
 from bounce_mjx.env import BounceBall
@@ -19,7 +20,7 @@ from bounce_mjx.evaluation import DEFAULT_EPISODES, DEFAULT_SEED, Report, judge,
 from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
 from bounce_mjx.policy import Policy, make_networks
 from bounce_mjx.reporting import details_line, results_table
-from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.runs import load_policy, load_run_config
 from bounce_mjx.train import enable_compilation_cache
 
 
@@ -27,7 +28,8 @@ class EvalCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run."""
+    """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run, or
+    the policy that comes with the package where there is none."""
     episodes: Annotated[int, Field(ge=1)] = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
@@ -55,7 +57,8 @@ def main(args: Sequence[str] | None = None) -> None:
         if command.json_file is not None:
             _check_writable(command.json_file)
         enable_compilation_cache()
-        checkpoint = find_checkpoint(command.checkpoint, command.log_dir)
+        console = Console()
+        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
         report, engine = evaluate_policy(
@@ -66,7 +69,6 @@ def main(args: Sequence[str] | None = None) -> None:
             target_height=command.target_height,
             physics=command.physics,
         )
-        console = Console()
         console.print(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
             highlight=False,

@@ -1,4 +1,4 @@
-"""The data files that come with the package: `mjcf/` and `configs/`."""
+"""The data files that come with the package: `mjcf/`, `configs/` and `pretrained/`."""
 
 from pathlib import Path
 

@@ -1,0 +1,37 @@
+"""Files that a user names to be written."""
+
+import os
+from pathlib import Path
+
+from bounce_mjx.errors import UserError
+
+
+def check_writable(path: Path, flag: str, suffixes: tuple[str, ...]) -> None:
+    """Spares the user a recording that could not be written.
+
+    Raises:
+      UserError: the suffix is another one, or no file can be made there.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise UserError(f"the folder of {flag} {path} does not exist; make it")
+    if path.is_dir():
+        raise UserError(f"{flag} {path} is a folder; give a file")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise UserError(f"{flag} {path} may not be written; give another file")
+
+
+def replace_file(source: Path, path: Path, flag: str) -> None:
+    """Moves a finished file to where the user wants it.
+
+    Raises:
+      UserError: it cannot be.
+    """
+    try:
+        source.replace(path)
+    except OSError as error:
+        raise UserError(
+            f"{flag} {path} cannot be written ({error.strerror}); give another file"
+        ) from error

@@ -1,0 +1,135 @@
+"""MuJoCo's own viewer, where there is a display."""
+
+import os
+import queue
+import sys
+import time
+
+import mujoco
+import mujoco.viewer
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.offscreen import draw_trail
+from bounce_mjx.viewers.pace import Pace
+from bounce_mjx.viewers.simulation import Simulation
+
+_PICTURE_RATE = 60.0
+_TRAIL_SECONDS = 0.5
+_TARGET_STEP = 0.05
+_PUSH = 0.2
+# GLFW's key codes.
+_SPACE, _RIGHT, _LEFT, _DOWN, _UP = 32, 262, 263, 264, 265
+_HELP = {
+    "space": "pause",
+    "R": "reset",
+    "up / down": "target height",
+    "left / right": "speed",
+    "I K J L": "push the ball",
+}
+
+
+def has_display() -> bool:
+    """Whether a window can be opened, as far as the environment tells."""
+    if sys.platform == "linux":
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    # On a Mac, MuJoCo's viewer needs an interpreter of its own.
+    return sys.platform != "darwin" or "MJPYTHON_BIN" in os.environ
+
+
+def check_display() -> None:
+    """Raises:
+    UserError: no window can be opened.
+    """
+    if not has_display():
+        raise UserError(
+            "--viewer native needs a display"
+            + (" and mjpython" if sys.platform == "darwin" else ", but DISPLAY is not set")
+            + "; use --viewer browser"
+        )
+
+
+def run_native(simulation: Simulation, *, speed: float, seconds: float | None) -> None:
+    """Shows the first environment until the window is closed, or the simulated `seconds` are
+    over."""
+    _Window(simulation, speed).run(seconds)
+
+
+class _Window:
+    def __init__(self, simulation: Simulation, speed: float):
+        self._simulation = simulation
+        self._display = Display(simulation.env)
+        self._paused, self._speed = False, speed
+        # Keys arrive in the window's thread; they act between two steps.
+        self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def run(self, seconds: float | None) -> None:
+        simulation, display = self._simulation, self._display
+        dt = simulation.env.dt
+        pace, trail = Pace(dt), [simulation.frame.ball[0]]
+        left = float("inf") if seconds is None else round(seconds / dt)
+        display.pose(simulation.frame.qpos[0], simulation.frame.target_height[0])
+        with mujoco.viewer.launch_passive(
+            display.model,
+            display.data,
+            key_callback=self._keys.put,
+            show_left_ui=False,
+            show_right_ui=False,
+        ) as viewer:
+            with viewer.lock():
+                mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
+            while viewer.is_running() and left > 0:
+                while not self._keys.empty():
+                    self._press(self._keys.get())
+                due = 0 if self._paused else min(pace.due(self._speed), left)
+                left -= due
+                for _ in range(due):
+                    frame = simulation.step()
+                    trail.append(frame.ball[0])
+                    if frame.over[0]:
+                        trail.clear()
+                del trail[: -round(_TRAIL_SECONDS / dt)]
+                frame = simulation.frame
+                with viewer.lock():
+                    display.pose(frame.qpos[0], frame.target_height[0])
+                    viewer.user_scn.ngeom = 0
+                    draw_trail(viewer.user_scn, np.array(trail))
+                viewer.set_texts(self._texts())
+                viewer.sync()
+                time.sleep(1.0 / _PICTURE_RATE)
+                if self._paused:
+                    pace.forget()
+
+    def _press(self, key: int) -> None:
+        simulation = self._simulation
+        pushes = {"I": (0, 0, _PUSH), "K": (-_PUSH, 0, 0), "J": (0, _PUSH, 0), "L": (0, -_PUSH, 0)}
+        if key == _SPACE:
+            self._paused = not self._paused
+        elif key == ord("R"):
+            simulation.reset()
+        elif key in (_UP, _DOWN):
+            step = _TARGET_STEP if key == _UP else -_TARGET_STEP
+            present = float(simulation.frame.target_height[0])
+            simulation.target_height = max(_TARGET_STEP, present + step)
+        elif key in (_RIGHT, _LEFT):
+            self._speed = float(np.clip(self._speed * (1.25 if key == _RIGHT else 0.8), 0.1, 4.0))
+        elif chr(key) in pushes:
+            simulation.push(pushes[chr(key)])
+
+    def _texts(self) -> list[tuple]:
+        frame = self._simulation.frame
+        state = {
+            "bounces": f"{frame.n_bounces[0]:.0f}",
+            "target": f"{frame.target_height[0]:.2f} m",
+            "ball": f"{frame.ball[0, 2]:.2f} m",
+            "speed": "paused" if self._paused else f"{self._speed:.2g}",
+        }
+        font, corner = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
+        return [
+            (font, place, "\n".join(lines), "\n".join(lines.values()))
+            for place, lines in (
+                (corner.mjGRID_TOPLEFT, state),
+                (corner.mjGRID_BOTTOMLEFT, _HELP),
+            )
+        ]

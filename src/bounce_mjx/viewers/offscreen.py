@@ -1,0 +1,137 @@
+"""Pictures of the model without a screen."""
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError
+from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.simulation import Frame
+
+CAMERA = "overview"
+_TRAIL_RADIUS = 0.004
+_TRAIL_RGB = (1.0, 0.45, 0.05)
+_MAX_GEOMS = 2000
+_BACKENDS = ("egl", "osmesa")
+# In a process of its own: a library that fails to load would stay half loaded in this one.
+_PROBE = """
+import mujoco
+from mujoco.{backend} import GLContext
+context = GLContext(16, 16)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
+"""
+
+
+def choose_backend() -> str:
+    """The OpenGL library that works here: MUJOCO_GL's, or else EGL or OSMesa.
+
+    Raises:
+      UserError: none works.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    if sys.platform != "linux":
+        return wanted or ("cgl" if sys.platform == "darwin" else "glfw")
+    for backend in (wanted,) if wanted else _BACKENDS:
+        if backend not in (*_BACKENDS, "glfw"):
+            raise UserError(
+                f"the environment variable MUJOCO_GL is {wanted!r}, but pictures are made with "
+                "egl, osmesa or glfw; set it to one of them or unset it"
+            )
+        probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
+        if subprocess.run(probe, capture_output=True).returncode == 0:
+            return backend
+    tried = f"MUJOCO_GL={wanted} does" if wanted else "neither EGL nor OSMesa does"
+    raise UserError(
+        f"no picture can be made, as {tried} not work here; install an OpenGL library, on Debian "
+        "or Ubuntu with: apt-get install libegl1 libgl1-mesa-dri, or: apt-get install libosmesa6"
+    )
+
+
+class Renderer:
+    """Renders the first environment of frames. A context manager, which frees the GPU's memory."""
+
+    def __init__(self, env: BounceBall, width: int, height: int, backend: str):
+        self._display = Display(env)
+        model = self._display.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        # Half of what the model asks for: on a CPU that is twice as fast, and still smooth.
+        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2048)
+        model.vis.quality.offsamples = min(model.vis.quality.offsamples, 4)
+        self._gl = _gl_context(backend)(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
+        self._option = mujoco.MjvOption()
+        self._camera = _camera(model)
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._context.free()
+        self._gl.free()
+
+    def render(self, frame: Frame, trail: np.ndarray) -> np.ndarray:
+        """A picture [height, width, 3] (uint8).
+
+        Args:
+          frame: of environments [N, ...].
+          trail: positions of the ball [P, 3] that a line connects, the oldest first, m.
+        """
+        self._display.pose(frame.qpos[0], frame.target_height[0])
+        mujoco.mjv_updateScene(
+            self._display.model,
+            self._display.data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        draw_trail(self._scene, trail)
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+        picture = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
+        return np.flipud(picture)
+
+
+def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
+    """Adds a line through positions [P, 3] to a scene, the fainter the older."""
+    for i, (start, end) in enumerate(zip(trail[:-1], trail[1:], strict=True)):
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        rgba = np.array([*_TRAIL_RGB, (i + 1) / len(trail)], np.float32)
+        capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+        mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+        mujoco.mjv_connector(geom, capsule, _TRAIL_RADIUS, start, end)
+        scene.ngeom += 1
+
+
+def _camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
+    """The model's overview, or else the free camera that MuJoCo opens a viewer with."""
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA)
+    if index >= 0:
+        camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        camera.fixedcamid = index
+    return camera
+
+
+def _gl_context(backend: str):
+    # Only now: the import of one of them keeps the process from using the other.
+    if backend == "egl":
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        from mujoco.osmesa import GLContext
+    else:
+        from mujoco import GLContext
+    return GLContext

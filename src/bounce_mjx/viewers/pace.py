@@ -1,0 +1,28 @@
+"""How simulated time keeps up with the clock."""
+
+import time
+
+# A program that falls behind by more than this slows down instead of catching up, s.
+_MAX_LAG = 0.1
+
+
+class Pace:
+    """Counts the control steps that are due since the last call."""
+
+    def __init__(self, dt: float):
+        self._dt = dt
+        self._owed = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Lets the time since the last call pass without a step."""
+        self._last = time.monotonic()
+
+    def due(self, speed: float) -> int:
+        """Control steps to take now, at `speed` times real time."""
+        now = time.monotonic()
+        self._owed += speed * min(now - self._last, _MAX_LAG)
+        self._last = now
+        steps = int(self._owed / self._dt)
+        self._owed -= steps * self._dt
+        return steps

@@ -1,0 +1,188 @@
+"""The three-dimensional scene of the web page and of the replay page, made with viser."""
+
+import collections
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+
+from bounce_mjx.env import BounceBall
+from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, body_scenes, site_mesh
+from bounce_mjx.viewers.simulation import Frame
+
+MAX_ENVS = 16
+_SPACING = np.array([1.3, 0.9, 0.0])
+_LABEL_HEIGHT = 0.74
+_TRAIL_SECONDS = 0.6
+_TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
+_BACKGROUND = np.array([222.0, 228.0, 235.0])
+# A camera that sees one arm, its ball and the highest targets.
+_LOOK_AT = np.array([0.34, 0.0, 0.38])
+_VIEW = np.array([0.95, -1.05, 0.40])
+_FIELD_OF_VIEW = math.radians(40.0)
+
+
+class Scene:
+    """Up to 16 environments side by side on a viser server."""
+
+    def __init__(self, server: viser.ViserServer, env: BounceBall, num_envs: int):
+        self._server = server
+        self._env = env
+        self._display = Display(env)
+        self.show(num_envs)
+
+    def show(self, num_envs: int) -> None:
+        """Builds the scene for the first `num_envs` environments of the frames to come."""
+        self._num_envs = num_envs
+        self._offsets = _grid(num_envs)
+        scene = self._server.scene
+        scene.reset()
+        nowhere = np.zeros((num_envs, 3)), np.ones(num_envs, bool)
+        length = round(_TRAIL_SECONDS / self._env.dt)
+        self._passed = collections.deque([nowhere] * length, maxlen=length)
+        scene.set_up_direction("+z")
+        scene.configure_environment_map(hdri=None)
+        scene.configure_default_lights(False)
+        _add_lights(scene)
+        _add_floor(scene)
+        model = self._display.model
+        reward = self._env.config.reward
+        home = np.zeros((num_envs, 3)) + self._offsets
+        upright = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
+        self._bodies = {
+            body: scene.add_batched_glb(
+                f"/robot/{model.body(body).name}",
+                shapes.export(file_type="glb"),
+                batched_wxyzs=upright,
+                batched_positions=home,
+                lod="off",
+            )
+            for body, shapes in body_scenes(model)
+        }
+        self._markers = {}
+        for name in (TARGET_SITE, HOME_SITE):
+            mesh, rgba = site_mesh(model, name)
+            self._markers[name] = scene.add_batched_meshes_simple(
+                f"/markers/{name}",
+                mesh.vertices,
+                mesh.faces,
+                batched_wxyzs=upright,
+                batched_positions=home,
+                batched_colors=np.round(rgba[:3] * 255.0).astype(np.uint8),
+                opacity=0.55,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                lod="off",
+            )
+        self._line = scene.add_line_segments(
+            "/trail",
+            np.zeros((num_envs * (length - 1), 2, 3)),
+            np.zeros((num_envs * (length - 1), 2, 3), np.uint8),
+            thickness=0.006,
+        )
+        self._labels = [
+            scene.add_label(
+                f"/labels/{i}",
+                "",
+                position=offset + (reward.target_x, reward.target_y, _LABEL_HEIGHT),
+                anchor="bottom-center",
+                font_screen_scale=1.4 if num_envs == 1 else 1.0,
+            )
+            for i, offset in enumerate(self._offsets)
+        ]
+        self._look()
+
+    def update(self, frames: Sequence[Frame]) -> None:
+        """Shows the last of the frames since the last update; all of them make the trail."""
+        display, model, number = self._display, self._display.model, self._num_envs
+        frame = frames[-1]
+        positions = np.zeros((number, model.nbody, 3))
+        rotations = np.zeros((number, model.nbody, 4))
+        sites = {name: np.zeros((number, 3)) for name in self._markers}
+        for i in range(number):
+            display.pose(frame.qpos[i], frame.target_height[i])
+            positions[i], rotations[i] = display.data.xpos, display.data.xquat
+            for name, place in sites.items():
+                place[i] = display.data.site(name).xpos
+        with self._server.atomic():
+            for body, handle in self._bodies.items():
+                if model.body_weldid[body]:
+                    handle.batched_positions = positions[:, body] + self._offsets
+                    handle.batched_wxyzs = rotations[:, body]
+            for name, handle in self._markers.items():
+                handle.batched_positions = sites[name] + self._offsets
+            self._line.points, self._line.colors = self._trails(frames)
+            for i, label in enumerate(self._labels):
+                robot = f"{i + 1}:  " if number > 1 else ""
+                count, height = frame.n_bounces[i], frame.target_height[i]
+                text = f"{robot}bounces {count:.0f}   target {height:.2f} m"
+                if label.text != text:
+                    label.text = text
+
+    def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
+        """The balls' ways of the last moments as line segments [S, 2, 3] and their colours, which
+        fade with age; a reset cuts them."""
+        for frame in frames:
+            self._passed.append((frame.ball[: self._num_envs], frame.over[: self._num_envs]))
+        balls = np.stack([ball for ball, _ in self._passed])
+        cut = np.stack([over for _, over in self._passed])[:-1]
+        cut = np.flip(np.logical_or.accumulate(np.flip(cut, axis=0), axis=0), axis=0)
+        segments = np.stack([balls[:-1], balls[1:]], axis=2) + self._offsets[:, None]
+        # A segment of an episode that is over shrinks to the ball, as it may not be left out: the
+        # page draws the number of segments that it knew first.
+        segments = np.where(cut[..., None, None], (balls[-1] + self._offsets)[:, None], segments)
+        age = np.linspace(1.0, 0.0, len(balls))[:, None]
+        colors = age * _BACKGROUND + (1.0 - age) * _TRAIL_COLOR
+        colors = np.broadcast_to(
+            np.stack([colors[:-1], colors[1:]], axis=1)[:, None], segments.shape
+        )
+        return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
+
+    def _look(self) -> None:
+        """Turns the camera of every page to the environments."""
+        extent = 1.0 + 0.9 * np.linalg.norm(np.ptp(self._offsets, axis=0))
+        position = _LOOK_AT + extent * _VIEW
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(position), tuple(_LOOK_AT)
+        camera.up, camera.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, _LOOK_AT
+
+
+def _grid(number: int) -> np.ndarray:
+    """Places [number, 3] in rows across the view, around the origin, m."""
+    columns = math.ceil(math.sqrt(number))
+    row, column = np.divmod(np.arange(number), columns)
+    places = np.stack([row, column, np.zeros(number)], axis=1) * _SPACING
+    return places - 0.5 * (places.min(axis=0) + places.max(axis=0))
+
+
+def _add_lights(scene: viser.SceneApi) -> None:
+    scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=1.3
+    )
+    scene.add_light_directional(
+        "/lights/key", intensity=2.0, cast_shadow=True, position=(1.5, -2.0, 3.5)
+    )
+    scene.add_light_directional(
+        "/lights/fill", color=(210, 225, 255), intensity=0.5, position=(1.5, 2.5, 1.5)
+    )
+
+
+def _add_floor(scene: viser.SceneApi) -> None:
+    """Squares of 0.2 m, to read distances by."""
+    scene.set_background_image(np.full((1, 1, 3), _BACKGROUND, np.uint8))
+    scene.add_grid(
+        "/floor",
+        width=12.0,
+        height=12.0,
+        cell_size=0.2,
+        cell_color=(176, 184, 193),
+        section_size=1.0,
+        section_color=(140, 150, 162),
+        plane_color=(206, 213, 221),
+        plane_opacity=1.0,
+        shadow_opacity=0.35,
+    )

@@ -1,0 +1,164 @@
+"""Episodes as NumPy frames: stepped live for a viewer, or recorded."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+
+from bounce_mjx.env import BounceBall
+from bounce_mjx.model import find_addresses
+from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.viewers.controllers import Controller
+
+# Entries of the observation.
+_BALL, _BALL_VELOCITY, _PADDLE, _TARGET = slice(6, 9), slice(19, 22), slice(25, 28), 28
+
+
+class Frame(NamedTuple):
+    """N environments after a control step; a recording has a leading axis of T frames."""
+
+    time: np.ndarray
+    """Time since the episode's reset [N], s."""
+    qpos: np.ndarray
+    """Generalised positions [N, nq], in MuJoCo's order."""
+    ball: np.ndarray
+    """The ball's centre [N, 3], m."""
+    paddle: np.ndarray
+    """The paddle's centre [N, 3], m."""
+    target_height: np.ndarray
+    """[N], m."""
+    n_bounces: np.ndarray
+    """Consecutive bounces [N]."""
+    reward_terms: np.ndarray
+    """Weighted reward terms of the step [N, 15], in the order of `rewards.TERM_NAMES`."""
+    over: np.ndarray
+    """Whether the episode ended or was truncated with this step [N]; the next frame is in a new
+    one."""
+
+
+class Simulation:
+    """N environments under a controller, each reset when its episode is over."""
+
+    def __init__(self, env: BounceBall, controller: Controller, num_envs: int, seed: int):
+        """Compiles the programs, which takes seconds, and resets all environments."""
+        self.env = env
+        self.num_envs = num_envs
+        self.target_height: float | None = None
+        """One target height for all environments, m; None for the drawn ones."""
+        self._controller = controller
+        self._key = jax.random.PRNGKey(seed)
+        self._reset_program = jax.jit(self._fresh_states)
+        self._step_program = jax.jit(self._advance)
+        self._push = np.zeros(3, np.float32)
+        self.reset()
+        steps = self._steps, self._target(), self._push
+        self._step_program = self._step_program.lower(self._key, self._states, *steps).compile()
+
+    def reset(self) -> Frame:
+        """Starts a new episode in every environment; its first frame."""
+        self._key, key = jax.random.split(self._key)
+        self._states = self._reset_program(key)
+        self._steps = jnp.zeros(self.num_envs, jnp.int32)
+        self.frame = _frame(self.env.dt, self._states, self._steps, self._steps > 0)
+        return self.frame
+
+    def push(self, velocity: tuple[float, float, float]) -> None:
+        """Adds a velocity (m/s) to every ball at the start of the next step."""
+        self._push = self._push + np.asarray(velocity, np.float32)
+
+    def step(self) -> Frame:
+        """Advances one control step."""
+        self._key, self._states, self._steps, seen = self._step_program(
+            self._key, self._states, self._steps, self._target(), self._push
+        )
+        self._push = np.zeros(3, np.float32)
+        self.frame = _frame(self.env.dt, *seen)
+        return self.frame
+
+    def record(self, seconds: float) -> Frame:
+        """The present frame and those of the following `seconds`, stacked."""
+        frames = [self.frame]
+        frames += [self.step() for _ in range(round(seconds / self.env.dt))]
+        return Frame(*(np.stack(values) for values in zip(*frames, strict=True)))
+
+    def _target(self) -> np.float32:
+        return np.float32(np.nan if self.target_height is None else self.target_height)
+
+    def _fresh_states(self, key: jax.Array) -> State:
+        return jax.vmap(self.env.reset, out_axes=-1)(jax.random.split(key, self.num_envs))
+
+    def _advance(self, key, states, steps, target, push):
+        key, reset_key, action_key = jax.random.split(key, 3)
+        states = _influence(self.env, states, target, push)
+        actions = self._controller(states, action_key)
+        after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
+        steps = steps + 1
+        over = (after.done > 0) | (steps >= self.env.config.episode_steps)
+        fresh = self._fresh_states(reset_key)
+        following = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after)
+        return key, following, jnp.where(over, 0, steps), (after, steps, over)
+
+
+def resample(recording: Frame, dt: float, fps: float) -> Frame:
+    """A recording [T, N, ...] at another rate.
+
+    Positions are interpolated in time, but not across a reset; all else is that of the last
+    control step.
+
+    Args:
+      dt: time between the frames of the recording, s.
+      fps: frames per second wanted.
+
+    Returns:
+      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts: [F, N, ...].
+    """
+    last = len(recording.time) - 1
+    at = np.arange(int(last * dt * fps + 1e-6)) / (fps * dt)
+    before = np.minimum(at.astype(int), last)
+    after = np.minimum(before + 1, last)
+    fraction = (at - before)[:, None] * ~recording.over[before]
+    frames = Frame(*(values[before] for values in recording))
+
+    def blend(values):
+        return values[before] + fraction[..., None] * (values[after] - values[before])
+
+    return frames._replace(
+        time=frames.time + fraction * dt,
+        qpos=blend(recording.qpos),
+        ball=blend(recording.ball),
+        paddle=blend(recording.paddle),
+    )
+
+
+def _influence(env: BounceBall, states: State, target: jax.Array, push: jax.Array) -> State:
+    """States [.., N] with another target height [] (nan for the same) and a pushed ball [3]."""
+    physics, task = states.pipeline_state
+    velocity = list(find_addresses(env.mj_model).ball_qvel[:3])
+    heights = jnp.where(jnp.isnan(target), task.target_height, target)
+    return states.replace(
+        pipeline_state=states.pipeline_state._replace(
+            physics=physics._replace(
+                qvel=physics.qvel.at[jnp.array(velocity)].add(push[:, None]),
+            ),
+            task=task._replace(target_height=heights),
+        ),
+        obs=states.obs.at[_BALL_VELOCITY].add(push[:, None]).at[_TARGET].set(heights),
+    )
+
+
+def _frame(dt: float, states: State, steps: jax.Array, over: jax.Array) -> Frame:
+    """The NumPy view of states (batch last) `steps` control steps after their resets."""
+    states, steps, over = jax.device_get((states, steps, over))
+    obs, task = states.obs, states.pipeline_state.task
+    return Frame(
+        time=steps * dt,
+        qpos=states.pipeline_state.physics.qpos.T,
+        ball=obs[_BALL].T,
+        paddle=obs[_PADDLE].T,
+        target_height=task.target_height,
+        n_bounces=task.n_bounces,
+        reward_terms=np.stack([states.metrics[f"reward/{name}"] for name in TERM_NAMES], axis=-1),
+        over=over,
+    )

@@ -1,0 +1,129 @@
+"""An episode as a film: MP4, or an animated GIF for a web page."""
+
+import contextlib
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError
+from bounce_mjx.viewers.files import replace_file
+from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+
+SUFFIXES = (".mp4", ".gif")
+# A GIF counts time in 1/100 s, and browsers show no more than 50 frames a second.
+_DEFAULT_FPS = {".mp4": 60, ".gif": 25}
+_MAX_GIF_FPS = 50
+_TRAIL_SECONDS = 0.5
+_ENCODINGS = {
+    ".mp4": "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart".split(),
+    # One palette, made of what moves, and in each picture only what changed.
+    ".gif": (
+        "-filter_complex",
+        "split[a][b];[a]palettegen=max_colors=128:stats_mode=diff[p];"
+        "[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle",
+        "-loop",
+        "0",
+    ),
+}
+
+
+class VideoWriter:
+    """Films simulations to a file; everything that can fail beforehand does so at once."""
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: int | None):
+        """Chooses the OpenGL library.
+
+        Args:
+          size: width and height in pixels.
+          fps: frames per second; None for 60, or 25 for a GIF.
+
+        Raises:
+          UserError: the size or the rate does not fit the format, or OpenGL does not work.
+        """
+        self._path, self._size = path, size
+        self.fps = fps or _DEFAULT_FPS[path.suffix.lower()]
+        if any(pixels % 2 for pixels in size):
+            raise UserError(f"--size {size[0]} {size[1]} is odd; give even numbers of pixels")
+        if path.suffix.lower() == ".gif" and (self.fps > _MAX_GIF_FPS or 100 % self.fps):
+            raise UserError(
+                f"--fps {self.fps} does not suit a GIF, which counts time in 1/100 s; give 10, "
+                "20, 25 or 50"
+            )
+        self._backend = choose_backend()
+
+    def write(self, simulation: Simulation, recording: Frame) -> None:
+        """Writes a recording of the simulation, of its first environment.
+
+        Raises:
+          UserError: the file cannot be written.
+        """
+        frames = resample(recording, simulation.env.dt, self.fps)
+        unfinished = self._path.with_name(f".unfinished-{self._path.name}")
+        encoder = subprocess.Popen(
+            self._command(unfinished), stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        try:
+            # A broken pipe means that the encoder gave up; it says why.
+            with contextlib.suppress(BrokenPipeError):
+                for picture in self._pictures(simulation.env, frames):
+                    encoder.stdin.write(picture.tobytes())
+            _, complaint = encoder.communicate()
+            if encoder.returncode:
+                reason = " ".join(complaint.decode(errors="replace").split())
+                raise UserError(
+                    f"--video {self._path} cannot be written ({reason[-200:]}); give another file"
+                )
+            replace_file(unfinished, self._path, "--video")
+        finally:
+            encoder.kill()
+            encoder.communicate()
+            unfinished.unlink(missing_ok=True)
+
+    def _command(self, path: Path) -> list[str]:
+        """The encoder's command line, which reads pictures from its standard input."""
+        width, height = self._size
+        pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
+        encoding = _ENCODINGS[path.suffix.lower()]
+        ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+        return [*ffmpeg, *pictures.split(), *encoding, str(path)]
+
+    def _pictures(self, env: BounceBall, frames: Frame) -> Iterator[np.ndarray]:
+        """One picture [height, width, 3] for each frame."""
+        length = round(_TRAIL_SECONDS * self.fps)
+        with Renderer(env, *self._size, self._backend) as renderer:
+            for i in range(len(frames.time)):
+                frame = Frame(*(values[i] for values in frames))
+                start = max(0, i - length)
+                resets = np.flatnonzero(np.diff(frames.time[start : i + 1, 0]) < 0.0)
+                start += resets[-1] + 1 if resets.size else 0
+                yield caption(renderer.render(frame, frames.ball[start : i + 1, 0]), frame)
+
+
+def caption(picture: np.ndarray, frame: Frame) -> np.ndarray:
+    """A picture [height, width, 3] with the first environment's bounce count, target height and
+    ball height drawn in."""
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    unit = max(10, image.height // 24)
+    large, small = ImageFont.load_default(2 * unit), ImageFont.load_default(unit)
+    draw.rounded_rectangle((unit, unit, 11 * unit, 6.2 * unit), unit // 2, fill=(15, 20, 28, 170))
+    count = f"{frame.n_bounces[0]:.0f}"
+    draw.text((1.6 * unit, 1.2 * unit), count, font=large, fill="white")
+    after = 1.6 * unit + draw.textlength(count, font=large) + 0.5 * unit
+    draw.text((after, 2.1 * unit), "bounces", font=small, fill=(255, 255, 255, 220))
+    for row, (name, value, color) in enumerate(
+        (
+            ("target", frame.target_height[0], (120, 235, 140, 255)),
+            ("ball", frame.ball[0, 2], (255, 190, 120, 255)),
+        )
+    ):
+        at = 3.7 * unit + 1.15 * row * unit
+        draw.text((1.6 * unit, at), name, font=small, fill=color)
+        draw.text((10.4 * unit, at), f"{value:.2f} m", font=small, fill=color, anchor="ra")
+    return np.asarray(image)

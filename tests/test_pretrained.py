@@ -1,0 +1,144 @@
+"""The policy that comes with the package: what it promises, who takes it, and how it is made."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bounce_mjx import ship as ship_command
+from bounce_mjx.checkpoint_choice import choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.config import TrainConfig, load_config
+from bounce_mjx.errors import UserError
+from bounce_mjx.eval import evaluate_policy
+from bounce_mjx.evaluation import Report
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs import best_checkpoint, load_policy, load_run_config
+from bounce_mjx.train import read_command
+
+FOLDER = resource_path("pretrained")
+EPISODES = 128
+LOG_DIR = TrainConfig().log_dir
+
+
+@pytest.fixture(scope="module")
+def shipped() -> dict:
+    """What results.json promises."""
+    return json.loads((FOLDER / "results.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def measured() -> Report:
+    """The shipped policy's results over 128 episodes."""
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    return evaluate_policy(load_policy(checkpoint, config), config, episodes=EPISODES)[0]
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(width=200, no_color=True)
+
+
+@pytest.mark.slow
+def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
+    assert shipped["passed"]
+    assert shipped["details"]["episodes"] == 1024
+    promised = Report.from_dict(shipped)
+    for now, then in zip(measured.results, promised.results, strict=True):
+        assert (now.name, now.passed) == (then.name, True), now
+        # An eighth of the episodes: a share may differ by some points, a speed by centimetres.
+        tolerance = 0.05 if now.name == "upward speed" else 3.0
+        assert now.value == pytest.approx(then.value, abs=tolerance), now.name
+
+
+def test_it_is_small_and_holds_only_what_acting_needs() -> None:
+    files = [path for path in FOLDER.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 1_000_000
+    items = {path.name for path in pretrained_checkpoint().folder.iterdir() if path.is_dir()}
+    assert items == {"policy"}
+
+
+def test_the_command_that_made_it_gives_its_config(shipped: dict, monkeypatch) -> None:
+    monkeypatch.chdir(FOLDER.parent)
+    python, script, *flags = shipped["command"].split()
+    assert (python, script) == ("python", "train_jax.py")
+    command = read_command(flags)
+    config = load_config(FOLDER / "config.yaml")
+    assert (command.env, command.ppo, command.seed) == (config.env, config.ppo, shipped["seed"])
+    assert shipped["device"]
+
+
+def test_it_is_taken_where_there_is_no_run(tmp_path: Path, monkeypatch, console, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert choose_checkpoint(None, LOG_DIR, console) == pretrained_checkpoint()
+    assert "comes with the package" in capsys.readouterr().out
+
+
+def test_a_run_is_preferred(tmp_path: Path, monkeypatch, console, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("2026-01-01", "2026-01-02"):
+        folder = LOG_DIR / name / "checkpoints" / "best" / "64"
+        folder.mkdir(parents=True)
+        (LOG_DIR / name / "config.yaml").touch()
+    chosen = choose_checkpoint(None, LOG_DIR, console)
+    assert chosen.folder.absolute() == folder.absolute()
+    assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
+    assert choose_checkpoint(FOLDER, LOG_DIR, console) == pretrained_checkpoint()
+
+
+def test_it_stands_in_only_for_the_default_folder_of_runs(tmp_path: Path, console) -> None:
+    with pytest.raises(UserError, match="no run with a checkpoint"):
+        choose_checkpoint(None, tmp_path, console)
+
+
+@pytest.fixture
+def measure(monkeypatch, measured: Report):
+    """A function (report) that makes `ship` measure that report."""
+
+    def replace(report: Report) -> None:
+        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_: (report, "fused"))
+
+    replace(measured)
+    return replace
+
+
+@pytest.mark.slow
+def test_shipping_keeps_the_policy(tmp_path: Path, measure, shipped: dict) -> None:
+    out = tmp_path / "pretrained"
+    for _ in range(2):  # into nothing, and in place of an older one
+        ship_command.main([str(FOLDER), "--out", str(out)])
+    assert list(tmp_path.iterdir()) == [out]
+    config = load_run_config(out)
+    assert config == load_run_config(FOLDER)
+    policies = (load_policy(best_checkpoint(run), config) for run in (out, FOLDER))
+    jax.tree.map(np.testing.assert_array_equal, *policies)
+    made = json.loads((out / "results.json").read_text())
+    assert made.keys() == shipped.keys()
+    assert [made[key] for key in ("command", "seed", "device", "best_steps")] == [
+        shipped[key] for key in ("command", "seed", "device", "best_steps")
+    ]
+
+
+@pytest.mark.slow
+def test_a_policy_that_misses_a_result_is_not_shipped(
+    tmp_path: Path, measure, measured: Report, capsys
+) -> None:
+    first, *rest = measured.results
+    measure(measured._replace(results=(first._replace(passed=False), *rest)))
+    with pytest.raises(SystemExit) as exit_info:
+        ship_command.main([str(FOLDER), "--out", str(tmp_path / "out")])
+    assert exit_info.value.code == 2
+    assert "misses a result" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_shipping_replaces_no_foreign_folder(tmp_path: Path, capsys) -> None:
+    (tmp_path / "mine").write_text("mine")
+    with pytest.raises(SystemExit) as exit_info:
+        ship_command.main([str(FOLDER), "--out", str(tmp_path)])
+    assert exit_info.value.code == 2
+    assert f"--out {tmp_path}" in capsys.readouterr().err
+    assert (tmp_path / "mine").read_text() == "mine"

@@ -1,0 +1,209 @@
+"""The live page and the replay page in a browser, headless Chromium."""
+
+import io
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from bounce_mjx import view
+from bounce_mjx.viewers.browser import reward_bars
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed"),
+]
+
+# Without a GPU and as root; and it is to ask nothing of its own of the network.
+FLAGS = (
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist "
+    "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
+    "--disable-sync"
+).split()
+PATIENCE = 120.0
+
+
+class Watched:
+    """A page, with what it asked for and complained of."""
+
+    def __init__(self, page: Page):
+        self.page = page
+        self.requests: list[str] = []
+        self.complaints: list[str] = []
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("websocket", lambda socket: self.requests.append(socket.url))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on(
+            "console",
+            lambda message: (
+                self.complaints.append(message.text) if message.type == "error" else None
+            ),
+        )
+
+    def picture(self) -> np.ndarray:
+        """The page as it is now [height, width, 3]."""
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))
+
+    def wait_for_arm(self) -> np.ndarray:
+        """The first picture with an orange arm."""
+        return self.wait_until(lambda picture: arm_share(picture) > 0.005)
+
+    def wait_for_motion(self, picture: np.ndarray) -> np.ndarray:
+        """The first picture in which the canvas differs from another picture."""
+        return self.wait_until(lambda now: (canvas(now) != canvas(picture)).any(-1).sum() > 100)
+
+    def wait_until(self, holds: Callable[[np.ndarray], bool]) -> np.ndarray:
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            picture = self.picture()
+            if holds(picture):
+                return picture
+            self.page.wait_for_timeout(300)
+        raise AssertionError(f"it did not come about; the page said {self.complaints}")
+
+
+def canvas(picture: np.ndarray) -> np.ndarray:
+    """The part of a picture between the panels and above the player."""
+    height, width, _ = picture.shape
+    return picture[: int(0.85 * height), int(0.35 * width) : int(0.7 * width)]
+
+
+def arm_share(picture: np.ndarray) -> float:
+    """Share of the canvas that has the arm's orange."""
+    red, green, blue = np.moveaxis(canvas(picture).astype(int), -1, 0)
+    return float(((red > 130) & (green < 120) & (blue < 80)).mean())
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def watch(browser: Browser) -> Iterator[Callable[[str], Watched]]:
+    """A function (address) -> a page that has it open."""
+    pages = []
+
+    def watch(address: str) -> Watched:
+        watched = Watched(browser.new_page(viewport={"width": 900, "height": 560}))
+        pages.append(watched.page)
+        watched.page.goto(address)
+        return watched
+
+    yield watch
+    for page in pages:
+        page.close()
+
+
+def test_replay_page_moves_and_asks_for_nothing(watch, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    view.main("--actions scripted --num-envs 2 --seconds 3 --html replay.html".split())
+    assert os.listdir(tmp_path) == ["replay.html"]
+    watched = watch((tmp_path / "replay.html").as_uri())
+    watched.wait_for_motion(watched.wait_for_arm())
+    own = (tmp_path / "replay.html").as_uri()
+    assert own in watched.requests
+    strangers = [url for url in watched.requests if url != own and not url.startswith("blob:null")]
+    assert not strangers
+    assert not watched.complaints
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+    """`bounce_mjx.play`, without a display and a run, and the address that it prints."""
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "bounce_mjx.play", "--port", "8230"],
+        cwd=tmp_path,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        said = ""
+        for line in process.stdout:
+            said += line
+            found = re.search(r"http://\S+", line)
+            if found:
+                break
+        assert found, said
+        yield process, found[0]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def listening(port: int) -> set[str]:
+    """Local addresses that listen on a port, in the kernel's notation."""
+    lines = [
+        line.split()
+        for name in ("/proc/net/tcp", "/proc/net/tcp6")
+        if Path(name).exists()
+        for line in Path(name).read_text().splitlines()[1:]
+    ]
+    return {
+        local.rpartition(":")[0]
+        for _, local, _, state, *_ in lines
+        if state == "0A" and int(local.rpartition(":")[2], 16) == port
+    }
+
+
+def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
+    process, address = served
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+", address)
+    if sys.platform == "linux":
+        assert listening(int(address.rpartition(":")[2])) == {"0100007F"}
+    watched = watch(address)
+    page = watched.page
+    watched.wait_for_motion(watched.wait_for_arm())
+
+    # The panel tells the reward by its terms, and they change.
+    terms = page.get_by_text("consecutive bounces").locator("xpath=..")
+    before = terms.inner_text()
+    page.wait_for_function("([e, t]) => e.innerText != t", arg=[terms.element_handle(), before])
+    assert page.locator(".uplot").count() == 1
+
+    # Paused, nothing moves; a reset puts the ball elsewhere.
+    page.get_by_label("pause").click()
+    still = watched.picture()
+    for _ in range(20):
+        page.wait_for_timeout(500)
+        before, still = still, watched.picture()
+        if (canvas(before) == canvas(still)).all():
+            break
+    np.testing.assert_array_equal(canvas(before), canvas(still))
+    page.get_by_role("button", name="reset").click()
+    still = watched.wait_for_motion(still)
+
+    strangers = [
+        url
+        for url in watched.requests
+        if not url.startswith((address, address.replace("http", "ws"), f"blob:{address}"))
+    ]
+    assert not strangers
+    assert not watched.complaints
+
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=30)
+    assert (process.returncode, "Traceback" in said) == (0, False), said
+
+
+def test_reward_bars_tell_every_term() -> None:
+    text = reward_bars(np.array([2.0, -1.25, *[0.0] * 13]))
+    assert text.count("consecutive bounces") == 1
+    assert ">2.00<" in text and ">-1.25<" in text and "sum 0.75" in text
+    assert "-0.00" not in text

@@ -1,0 +1,397 @@
+"""What the viewers show: the simulated frames, the model's geometry, the clock, the recordings."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, EnvConfig, play, view
+from bounce_mjx.resources import resource_path
+from bounce_mjx.viewers import offscreen, pace
+from bounce_mjx.viewers.controllers import (
+    make_random_controller,
+    make_scripted_controller,
+    make_zero_controller,
+)
+from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, _primitive, body_scenes
+from bounce_mjx.viewers.offscreen import choose_backend
+from bounce_mjx.viewers.pace import Pace
+from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+
+GRAVITY = 9.81
+SECONDS = 3.0
+
+
+@pytest.fixture(scope="module")
+def env() -> BounceBall:
+    return BounceBall(EnvConfig(physics="fused", episode_seconds=SECONDS))
+
+
+@pytest.fixture(scope="module")
+def scripted(env: BounceBall) -> Simulation:
+    return Simulation(env, make_scripted_controller(env), 2, seed=0)
+
+
+@pytest.fixture(scope="module")
+def recording(scripted: Simulation) -> Frame:
+    """One step more than an episode."""
+    return scripted.record(SECONDS + scripted.env.dt)
+
+
+# The simulation
+
+
+def test_frames_are_of_one_state(env: BounceBall, recording: Frame) -> None:
+    """MuJoCo's kinematics find the ball and the paddle where the frame has them."""
+    display = Display(env)
+    for step in (0, 57, 123):
+        for i in range(2):
+            display.pose(recording.qpos[step, i], recording.target_height[step, i])
+            geom = display.data.geom
+            np.testing.assert_allclose(geom("ball").xpos, recording.ball[step, i], atol=1e-6)
+            np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
+
+
+def test_ball_flies_as_it_should(recording: Frame, env: BounceBall) -> None:
+    """Where it is high above the paddle it only falls: z'' = -g."""
+    z = recording.ball[:-2, 0, 2]
+    high = z[1:-1] > 0.2
+    assert high.sum() > 100
+    acceleration = (z[2:] - 2.0 * z[1:-1] + z[:-2]) / env.dt**2
+    np.testing.assert_allclose(acceleration[high], -GRAVITY, atol=0.02)
+
+
+def test_time_runs_until_the_episode_is_over(recording: Frame, env: BounceBall) -> None:
+    steps = round(SECONDS / env.dt)
+    np.testing.assert_allclose(recording.time[: steps + 1, 0], np.arange(steps + 1) * env.dt)
+    np.testing.assert_array_equal(np.flatnonzero(recording.over[:, 0]), [steps])
+    np.testing.assert_allclose(recording.time[steps + 1], env.dt)
+    start = np.asarray(env.config.ball_init_pos)
+    distance = np.abs(recording.ball[steps + 1] - start)
+    assert np.all(distance < env.config.ball_position_noise + 0.001)
+    assert np.all(recording.n_bounces[steps + 1] == 0)
+
+
+def test_environments_differ(recording: Frame) -> None:
+    assert np.all(recording.qpos[0, 0, :6] != recording.qpos[0, 1, :6])
+
+
+def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording: Frame) -> None:
+    held = Simulation(env, make_zero_controller(env), 2, seed=0).record(SECONDS)
+    moved = np.abs(held.qpos[20, :, :6] - held.qpos[0, :, :6])
+    assert np.all(moved < 0.01)
+    # The scripted actions keep both balls up from the same start.
+    np.testing.assert_array_equal(held.qpos[0], recording.qpos[0])
+    assert np.all(held.over[:-1].any(axis=0))
+    assert not recording.over[: len(held.over) - 1].any()
+
+
+def test_random_actions_are_uniform(env: BounceBall) -> None:
+    states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 500))
+    control = make_random_controller(env)
+    actions = np.asarray(control(states, jax.random.PRNGKey(1)))
+    assert actions.shape == (env.action_size, 500)
+    np.testing.assert_allclose(
+        np.quantile(actions, (0.0, 0.25, 0.75, 1.0)), (-1, -0.5, 0.5, 1), atol=0.05
+    )
+    assert np.all(control(states, jax.random.PRNGKey(2)) != actions)
+
+
+def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
+    scripted.reset()
+    drawn = scripted.frame.target_height
+    scripted.target_height = 0.77
+    assert np.all(drawn != np.float32(0.77))
+    np.testing.assert_allclose(scripted.step().target_height, 0.77)
+    scripted.reset()
+    np.testing.assert_allclose(scripted.step().target_height, 0.77)
+    scripted.target_height = None
+    scripted.reset()
+    low, high = scripted.env.config.target_height_range
+    assert np.all((scripted.step().target_height >= low) & (scripted.frame.target_height <= high))
+
+
+def test_a_push_adds_its_velocity_to_the_ball_once(scripted: Simulation) -> None:
+    steps, push = 5, np.array([0.2, -0.1, 0.3])
+    scripted.reset()
+    start = scripted.frame.ball
+    scripted.push(tuple(push))
+    for _ in range(steps):
+        scripted.step()
+    flight = steps * scripted.env.dt
+    # The sum of a semi-implicit integrator's steps, in place of g t^2 / 2.
+    fall = 0.5 * GRAVITY * flight * (flight + scripted.env.config.physics_dt)
+    expected = start + push * flight - np.array([0.0, 0.0, fall])
+    np.testing.assert_allclose(scripted.frame.ball, expected, atol=1e-5)
+
+
+# Resampling
+
+
+def ramp(over: tuple[int, ...] = ()) -> Frame:
+    """Eleven frames 0.01 s apart of one environment; every number is its time, in steps."""
+    value = np.arange(11.0)[:, None]
+    wide = np.repeat(value[..., None], 3, axis=-1)
+    ended = np.zeros((11, 1), bool)
+    ended[list(over)] = True
+    return Frame(value * 0.01, wide, wide, wide, value, value, wide, ended)
+
+
+def test_resampling_interpolates_positions() -> None:
+    frames = resample(ramp(), dt=0.01, fps=60)
+    assert len(frames.time) == 6
+    times = np.arange(6) / 60
+    np.testing.assert_allclose(frames.time[:, 0], times)
+    for positions in (frames.qpos, frames.ball, frames.paddle):
+        np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
+    # What counts or is drawn is that of the last step.
+    np.testing.assert_array_equal(frames.n_bounces[:, 0], np.floor(100 * times + 1e-9))
+
+
+def test_resampling_does_not_blend_two_episodes() -> None:
+    frames = resample(ramp(over=(3,)), dt=0.01, fps=60)
+    expected = 100 * np.arange(6) / 60
+    expected[2] = 3.0  # at 3.33 steps
+    np.testing.assert_allclose(frames.ball[:, 0, 0], expected)
+
+
+# Geometry
+
+SHAPES = """<mujoco><worldbody>
+  <geom type="sphere" size=".1"/><geom type="capsule" size=".1 .3"/>
+  <geom type="cylinder" size=".1 .3"/><geom type="box" size=".1 .3 .2"/>
+  <geom type="ellipsoid" size=".1 .3 .2"/>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("geom", range(5))
+def test_shapes_have_the_size_that_mujoco_gives_them(geom: int) -> None:
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    mesh = _primitive(model.geom_type[geom], model.geom_size[geom])
+    center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    np.testing.assert_allclose(mesh.bounds, [center - half, center + half], rtol=0.01, atol=1e-9)
+    # The faces look outward.
+    assert np.all(np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles_center) > 0.0)
+
+
+def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
+    model = Display(env).model
+    shapes = {model.body(body).name: len(s.geometry) for body, s in body_scenes(model)}
+    shown = {model.body(body).name: int(model.body_geomnum[body]) for body in range(model.nbody)}
+    shown["world"] -= 1  # the floor
+    assert shapes == shown
+
+
+def test_markers_are_where_the_task_has_them(env: BounceBall) -> None:
+    display = Display(env)
+    display.pose(env.mj_model.qpos0, 0.61)
+    reward = env.config.reward
+    np.testing.assert_allclose(
+        display.data.site(TARGET_SITE).xpos, [reward.target_x, reward.target_y, 0.61]
+    )
+    assert display.data.site(HOME_SITE).xpos[2] == pytest.approx(
+        reward.paddle_home_height, abs=1e-3
+    )
+
+
+def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    bare = tmp_path / "bare.xml"
+    bare.write_text(re.sub(r"<site [^>]*/>", "", text), encoding="utf-8")
+    env = BounceBall(EnvConfig(mjcf=bare))
+    assert env.mj_model.nsite == 0
+    display = Display(env)
+    display.pose(env.mj_model.qpos0, 0.5)
+    assert display.data.site(TARGET_SITE).xpos[2] == 0.5
+    assert display.data.site(HOME_SITE).xpos[2] == env.config.reward.paddle_home_height
+
+
+# The clock
+
+
+def test_steps_are_due_as_the_clock_goes(monkeypatch) -> None:
+    now = 0.0
+    monkeypatch.setattr(pace.time, "monotonic", lambda: now)
+    clock = Pace(0.01)
+    steps = []
+    for _ in range(60):
+        now += 1.0 / 60.0
+        steps.append(clock.due(0.5))
+    assert sum(steps) in (49, 50)
+    assert max(steps) == 1
+    now += 100.0  # a machine that slept
+    assert clock.due(1.0) <= 11
+    clock.due(1.0)
+    now += 100.0
+    clock.forget()
+    assert clock.due(1.0) == 0
+
+
+# The command lines
+
+
+def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
+    """Runs `python -m bounce_mjx.<command>` in a folder, without a display."""
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, "-m", *command], cwd=cwd, env=env | variables, capture_output=True,
+        text=True, timeout=300,
+    )  # fmt: skip
+
+
+def read_video(path: Path) -> tuple[float, np.ndarray]:
+    """The rate that ffmpeg finds in a video, and its frames [F, height, width, 3]."""
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
+    raw = "-f rawvideo -pix_fmt rgb24 -fps_mode passthrough -".split()
+    done = subprocess.run([*ffmpeg, *raw], capture_output=True, check=True)
+    stream = re.search(r"Stream .* (\d+)x(\d+).* ([\d.]+) fps", done.stderr.decode())
+    width, height = int(stream[1]), int(stream[2])
+    return float(stream[3]), np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+VIDEOS = {
+    "mp4 by EGL": ("egl", "a.mp4", "bounce_mjx.play", 60),
+    "gif by OSMesa": ("osmesa", "a.gif", "bounce_mjx.view --actions scripted", 25),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa are of Linux")
+@pytest.mark.parametrize("case", VIDEOS.values(), ids=VIDEOS)
+def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> None:
+    backend, name, command, fps = case
+    flags = f"--video {name} --size 320 240 --seconds 0.6".split()
+    done = run([*command.split(), *flags], tmp_path, MUJOCO_GL=backend)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert os.listdir(tmp_path) == [name]
+    rate, frames = read_video(tmp_path / name)
+    assert rate == fps
+    assert frames.shape == (round(0.6 * fps), 240, 320, 3)
+    red, green, blue = np.moveaxis(frames[0].astype(int), -1, 0)
+    orange = (red > 140) & (green < 140) & (blue < 90)
+    assert 0.01 < orange.mean() < 0.2
+    # The white ball falls: the middle of what is white beside the caption moves down.
+    rows = []
+    for frame in (frames[0], frames[len(frames) // 3]):
+        white = np.all(frame[:, 150:] > 215, axis=-1)
+        assert white.any()
+        rows.append(np.nonzero(white)[0].mean())
+    assert rows[1] > rows[0] + 10
+    # The caption is bright on dark.
+    assert frames[0][10:60, 10:110].max() > 230
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Xvfb is of Linux")
+def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
+    """On a virtual screen; the window fills it with floor, sky and an orange arm."""
+    from PIL import ImageGrab
+
+    log = (tmp_path / "xvfb").open("wb")
+    screen = subprocess.Popen(
+        ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24"],
+        stdout=subprocess.PIPE,
+        stderr=log,
+    )
+    try:
+        display = f":{int(screen.stdout.readline())}"
+        viewer = subprocess.Popen(
+            [sys.executable, "-m", "bounce_mjx.play", "--seconds", "60"],
+            cwd=tmp_path,
+            env=os.environ | {"DISPLAY": display},
+            stdout=log,
+            stderr=log,
+        )
+        try:
+            for _ in range(240):
+                picture = np.asarray(ImageGrab.grab(xdisplay=display)).astype(int)
+                red, green, blue = np.moveaxis(picture[..., :3], -1, 0)
+                orange = (red > 140) & (green < 140) & (blue < 90)
+                assert viewer.poll() is None, (tmp_path / "xvfb").read_text()
+                if orange.mean() > 0.003:
+                    break
+                pace.time.sleep(0.25)
+            assert 0.003 < orange.mean() < 0.2
+        finally:
+            viewer.kill()
+            viewer.wait()
+    finally:
+        screen.kill()
+        screen.wait()
+        log.close()
+
+
+MISTAKES = {
+    "suffix of a video": ("--video a.avi", "--video a.avi", ".mp4 or .gif", "rename"),
+    "suffix of a page": ("--html a.txt", "--html a.txt", ".html", "rename"),
+    "no folder": ("--video no/a.mp4", "no/a.mp4", "does not exist", "make it"),
+    "a folder": ("--html folder.html", "folder.html is a folder", "give a file"),
+    "odd size": ("--video a.mp4 --size 321 240", "--size 321 240", "even"),
+    "small size": ("--video a.mp4 --size 2 2", "--size is 2", "64"),
+    "rate of a gif": ("--video a.gif --fps 60", "--fps 60", "GIF", "25 or 50"),
+    "too many robots": ("--num-envs 17", "--num-envs is 17", "16"),
+    "two ways": ("--viewer browser --video a.mp4", "--viewer browser", "leave one out"),
+    "no screen": ("--viewer native", "--viewer native", "display", "--viewer browser"),
+    "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
+    "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
+    "speed": ("--speed 0", "--speed is 0", "0.1"),
+}
+
+
+@pytest.fixture
+def fails(tmp_path: Path, monkeypatch, capfd):
+    """A function (main, arguments) -> the sentence with which a command refuses them; it leaves an
+    empty directory as it is."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "folder.html").mkdir()
+
+    def call(main, args: list[str]) -> str:
+        with pytest.raises(SystemExit) as exit_info:
+            main(args)
+        err = capfd.readouterr().err
+        assert exit_info.value.code == 2
+        assert re.fullmatch(r"error: .+\n", err), err
+        assert os.listdir(tmp_path) == ["folder.html"]
+        return err
+
+    return call
+
+
+@pytest.mark.parametrize("main", [view.main, play.main])
+@pytest.mark.parametrize("case", MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_are_told_in_one_sentence(fails, main, case: tuple, monkeypatch) -> None:
+    # The compilation is not what is tested here, and no mistake may come to light only after it.
+    if "address" not in case[0]:
+        monkeypatch.setattr(Simulation, "__init__", None)
+    flags, *words = case
+    sentence = fails(main, flags.split())
+    assert not [word for word in words if word not in sentence], sentence
+
+
+def test_without_opengl_the_package_is_named(fails, monkeypatch) -> None:
+    monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
+    sentence = fails(view.main, ["--video", "a.mp4"])
+    assert "libosmesa6" in sentence and "libegl1" in sentence
+
+
+def test_a_backend_that_does_not_exist_is_told(fails, monkeypatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    assert "MUJOCO_GL is 'vulkan'" in fails(view.main, ["--video", "a.mp4"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa are of Linux")
+def test_the_backend_that_works_is_taken(tmp_path: Path, monkeypatch) -> None:
+    """EGL looks for its drivers in a folder that the environment may name."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))
+    assert choose_backend() == "osmesa"
