@@ -6,6 +6,7 @@ field (its docstring) give the unit; they are also the help text of the command 
 
 import difflib
 import math
+import reprlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -21,6 +22,15 @@ NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+def _check_path(path: Path) -> Path:
+    if "\0" in str(path):
+        raise ValueError("a path cannot hold the character 0; leave it out")
+    return path
+
+
+PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 Steps = Annotated[int, Field(ge=1, le=10**12)]
 
@@ -262,7 +272,7 @@ class EnvConfig(StrictModel):
 
     physics: Literal["auto", "fused", "mjx"] = "auto"
     """Physics engine: fused (straight-line, fast), mjx (any MJCF), auto (fused where it can)."""
-    mjcf: Path | None = None
+    mjcf: PlainPath | None = None
     """MJCF file to simulate; the project's own robot where it is left out."""
     physics_dt: Positive = 0.001
     """Physics time step, s."""
@@ -304,6 +314,11 @@ class EnvConfig(StrictModel):
     @pydantic.model_validator(mode="after")
     def _check_times_and_ranges(self):
         substeps = self.control_dt / self.physics_dt
+        if not max(substeps, self.episode_seconds / self.control_dt) < 2**31:
+            raise ValueError(
+                f"control_dt {self.control_dt} is too long for physics_dt {self.physics_dt} or too "
+                f"short for episode_seconds {self.episode_seconds}; choose times less far apart"
+            )
         if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
@@ -326,7 +341,10 @@ class EnvConfig(StrictModel):
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:
         """A run's config is read from other folders too."""
-        return None if path is None else path.expanduser().absolute()
+        try:
+            return None if path is None else path.expanduser().absolute()
+        except RuntimeError as error:
+            raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
 
     @property
     def num_substeps(self) -> int:
@@ -435,7 +453,7 @@ class TrainConfig(StrictModel):
     """Seed of the evaluations during the training."""
     stop_when_solved: bool = False
     """End at the first evaluation that meets all five results."""
-    log_dir: Path = Path("runs/bounce_ball")
+    log_dir: PlainPath = Path("runs/bounce_ball")
     """Folder in which the run makes its own, named by the time."""
 
 
@@ -454,7 +472,10 @@ def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -
     try:
         return config_class.model_validate(values)
     except pydantic.ValidationError as error:
-        raise UserError(f"{source}: {describe(error, config_class)}") from error
+        raise UserError(f"{shorten(source)}: {describe(error, config_class)}") from error
+
+
+_MAX_CONFIG_BYTES = 2**20
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -464,19 +485,24 @@ def load_config(path: Path) -> TrainConfig:
       UserError: the file is missing, is no YAML mapping, or holds an unknown key or a bad value.
     """
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
+        with path.open("rb") as file:
+            data = file.read(_MAX_CONFIG_BYTES + 1)
+        if len(data) > _MAX_CONFIG_BYTES:
+            raise ValueError(f"it is longer than {_MAX_CONFIG_BYTES} bytes")
+        values = yaml.safe_load(data.decode("utf-8"))
+    # PyYAML raises many types where a value has the form of a number or a date but is none.
+    except Exception as error:
+        reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())
         raise UserError(
-            f"the config file {path} cannot be read ({reason}); give a YAML file such as "
-            "configs/default.yaml"
+            f"the config file {shorten(str(path))} cannot be read ({shorten(reason, 300)}); give a "
+            "YAML file such as configs/default.yaml"
         ) from error
     if values is None:
         values = {}
     if not isinstance(values, dict):
         raise UserError(
-            f"the config file {path} holds a {type(values).__name__}, not a mapping of keys to "
-            "values; write it like configs/default.yaml"
+            f"the config file {shorten(str(path))} holds a {type(values).__name__}, not a mapping "
+            "of keys to values; write it like configs/default.yaml"
         )
     return validate(TrainConfig, values, str(path))
 
@@ -510,12 +536,36 @@ def describe(
     """
     first = error.errors()[0]
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        path = [str(part) for part in first["loc"]]
+        path = [shorten(str(part)) for part in first["loc"]]
         return f"unknown key {'.'.join(path)}; {_advice(config_class, path)}"
     path = [part for part in first["loc"] if isinstance(part, str)]
     if first["type"] == "value_error":
-        return ": ".join([*path[-1:], first["msg"].removeprefix("Value error, ")])
-    return f"{spell('.'.join(path))} is {first['input']!r}, but must {_wanted(error)}"
+        reason = first["msg"].removeprefix("Value error, ")
+        return ": ".join([*path[-1:], shorten(reason, 500)])
+    return f"{spell('.'.join(path))} is {_quote(first['input'])}, but must {_wanted(error)}"
+
+
+def shorten(text: str, length: int = 100) -> str:
+    """A text of a user, as far as it fits into a sentence."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+class _Repr(reprlib.Repr):
+    """Python's notation, cut short: a file can describe a value without an end."""
+
+    def __init__(self):
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = 80
+        self.maxlevel = 3
+
+    def repr_int(self, x: int, level: int) -> str:
+        # Python refuses to write an integer of many digits.
+        return super().repr_int(x, level) if x.bit_length() < 1000 else "a very large number"
+
+
+def _quote(value: Any) -> str:
+    """A value of a user, as far as it fits into a sentence."""
+    return shorten(_Repr().repr(value))
 
 
 def _wanted(error: pydantic.ValidationError) -> str:

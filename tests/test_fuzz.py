@@ -1,0 +1,253 @@
+"""Config files and command lines of any kind: each is a valid run or one sentence, and leaves the
+disk alone. 2,000 cases in all."""
+
+import contextlib
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pydantic
+import pytest
+import yaml
+from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import strategies as st
+
+from bounce_mjx import eval as eval_command
+from bounce_mjx import train as train_command
+from bounce_mjx.cli import _flags, parse
+from bounce_mjx.config import StrictModel, TrainConfig, dump_config, load_config
+from bounce_mjx.errors import exit_on_user_error
+from tiny_runs import contents
+
+FLAGS = sorted(_flags(train_command.TrainCommand))
+EVAL_FLAGS = sorted(_flags(eval_command.EvalCommand))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory):
+    """The working directory of all cases: a preset, a run without a checkpoint, and a file."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / "run").mkdir()
+    (folder / "run/config.yaml").write_text(dump_config(TrainConfig()))
+    (folder / "preset.yaml").write_text("seed: 3\n")
+    (folder / "fuzzed.yaml").write_bytes(b"")
+    with contextlib.chdir(folder):
+        yield folder
+
+
+def cases(number: int) -> Callable:
+    """So many cases, the same in every run."""
+    return settings(
+        max_examples=number,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        phases=(Phase.explicit, Phase.generate, Phase.shrink),
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
+    """What a command line gives; None for one that is refused in one sentence or asks for help."""
+    before = contents(folder)
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), exit_on_user_error():
+            return reader()
+    except SystemExit as end:
+        if end.code == 0:
+            assert "usage:" in out.getvalue() and not err.getvalue()
+        else:
+            assert end.code == 2
+            assert re.fullmatch(r"error: .+\n", err.getvalue()), err.getvalue()
+            assert len(err.getvalue()) < 5000
+            assert err.getvalue()[:-1].isprintable()
+        return None
+    finally:
+        assert contents(folder) == before
+
+
+def assert_valid_run(command: train_command.TrainCommand) -> None:
+    """Its config passes the validation again, and comes back from its file."""
+    config = train_command.config_of(command)
+    again = TrainConfig.model_validate(yaml.safe_load(dump_config(config)))
+    assert again == config
+
+
+# Config files
+
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.integers(min_value=10**300, max_value=10**301),
+    st.floats(),
+    st.text(max_size=20),
+    st.binary(max_size=20),
+    st.dates(),
+    st.datetimes(),
+    st.sampled_from([0, 1, 2**31, -1, 1e308, 5e-324, float("nan"), "1e400", "~nobody/a", "\0"]),
+)
+TREES = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=7)
+        | st.dictionaries(
+            SCALARS | st.sampled_from(["env", "ppo", "seed", "reward"]), inner, max_size=4
+        )
+    ),
+    max_leaves=12,
+)
+
+
+def groups(group: type[pydantic.BaseModel]) -> st.SearchStrategy[dict]:
+    """Trees with the keys of a config, some of them, and values of any kind."""
+    fields = {}
+    for name, field in group.model_fields.items():
+        inner = field.annotation
+        nested = isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)
+        plausible = st.sampled_from([1, 2, 0.5, [8, 8], field.get_default()])
+        fields[name] = (groups(inner) if nested else plausible) | TREES
+    return st.sets(st.sampled_from(sorted(fields)), max_size=4).flatmap(
+        lambda names: st.fixed_dictionaries({name: fields[name] for name in sorted(names)})
+    )
+
+
+LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n"
+    for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+EXAMPLES = (
+    b"",
+    b"\xff\xfe\x00",
+    b"\x00",
+    b"- 1",
+    b"3",
+    b"? [1]\n: 2",
+    b"? {a: 1}\n: 2",
+    b"<<: 1",
+    b"<<: {seed: 3}",
+    b"seed: !!int ''",
+    b"seed: !!timestamp a",
+    b"seed: !!float a",
+    b"seed: !!binary ab",
+    b"seed: !!python/object/apply:os.system [touch ran]",
+    b"seed: 2001-99-99",
+    b"seed: *a",
+    b"seed: &a [*a]",
+    b"env: &e {env: *e}",
+    b"seed: " + b"9" * 5000,
+    b"seed: 0x" + b"f" * 5000,
+    b"seed: " + b"[" * 5000,
+    b"{" * 5000,
+    LAUGHS.encode(),
+    (LAUGHS + "seed: *i\n").encode(),
+    (LAUGHS + "env: {ball_init_pos: *i}\n").encode(),
+    b"env: {mjcf: ~nobody/a.xml}",
+    b"env: {mjcf: ~nobody/a.xml, physics: mjx}",
+    b'log_dir: "a\\0b"',
+    b'"a\\nb\\e[31m": 1',
+    b"env: {control_dt: 1.0e+308, physics_dt: 1.0e-308}",
+    b"env: {episode_seconds: 1.0e+308, control_dt: 1.0e-308, physics_dt: 1.0e-308}",
+    b"ppo: {critic_metrics: [[]]}",
+    b"ppo: {hidden_layers: {}}",
+)
+
+
+def read_config(folder: Path, data: bytes) -> None:
+    (folder / "fuzzed.yaml").write_bytes(data)
+    command = read(folder, lambda: train_command.read_command(["--config", "fuzzed.yaml"]))
+    if command is not None:
+        assert_valid_run(command)
+
+
+@pytest.mark.slow
+@cases(500)
+@given(tree=TREES | groups(TrainConfig), style=st.booleans(), unicode=st.booleans())
+def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: bool) -> None:
+    text = yaml.safe_dump(tree, default_flow_style=style, allow_unicode=unicode)
+    read_config(folder, text.encode("utf-8", "surrogatepass"))
+
+
+@pytest.mark.slow
+@cases(500)
+@given(tree=groups(TrainConfig))
+def test_config_file_of_known_keys(folder: Path, tree: dict) -> None:
+    read_config(folder, yaml.safe_dump(tree).encode("utf-8", "surrogatepass"))
+
+
+@pytest.mark.slow
+@cases(300)
+@given(data=st.binary() | st.text(alphabet="ab:-[]{}&*!|>'\"%@,?# \n\t01.~<e").map(str.encode))
+def test_config_file_of_any_bytes(folder: Path, data: bytes) -> None:
+    read_config(folder, data)
+
+
+@pytest.mark.parametrize("data", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_config_file_that_once_broke_something(folder: Path, data: bytes) -> None:
+    read_config(folder, data)
+
+
+def test_endless_config_file(folder: Path) -> None:
+    assert read(folder, lambda: load_config(Path("/dev/zero"))) is None
+
+
+# Command lines
+
+WORDS = st.one_of(
+    st.text(st.characters(exclude_characters="\0", codec=None), max_size=12),
+    st.integers().map(str),
+    st.floats().map(str),
+    st.sampled_from(
+        ["", "-", "--", "-1", "1", "0.5", "nan", "inf", "9" * 5000, "None", "auto", "mjx", "a.xml"]
+        + ["preset.yaml", "fuzzed.yaml", "run", ".", "..", "~nobody", "/dev/null", "x" * 5000]
+        + ["a\nb", "\x1b[31m", "\udcff", "@preset.yaml", "--help", "-h", "True"]
+    ),
+)
+
+
+def command_lines(flags: list[str]) -> st.SearchStrategy[list[str]]:
+    flag = st.sampled_from([*flags, "--config", "--resume", "--help"]) | WORDS.map("--{}".format)
+    part = st.one_of(
+        st.tuples(flag, WORDS),
+        st.tuples(flag),
+        st.tuples(WORDS),
+        st.tuples(flag, WORDS, WORDS),
+        st.tuples(flag, WORDS).map(lambda pair: ("=".join(pair),)),
+    )
+    return st.lists(part, max_size=4).map(lambda parts: [word for part in parts for word in part])
+
+
+@pytest.mark.slow
+@cases(500)
+@given(args=command_lines(FLAGS))
+@example(args=["--config", "x" * 5000])
+@example(args=["--resume", "x" * 5000])
+@example(args=["--config", ""])
+@example(args=["--resume="])
+@example(args=["--config", "~nobody/x"])
+@example(args=["--mjcf", "~nobody/x"])
+@example(args=["--num-envs", "\udcff"])
+@example(args=["--control-dt", "1e308", "--physics-dt", "1e-308"])
+def test_training_command_line(folder: Path, args: list[str]) -> None:
+    (folder / "fuzzed.yaml").write_bytes(b"")
+    command = read(folder, lambda: train_command.read_command(args))
+    if command is not None:
+        assert_valid_run(command)
+
+
+@pytest.mark.slow
+@cases(200)
+@given(args=command_lines(EVAL_FLAGS))
+def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
+    (folder / "fuzzed.yaml").write_bytes(b"")
+    read(
+        folder,
+        lambda: parse(
+            eval_command.EvalCommand,
+            args,
+            prog="python -m bounce_mjx.eval",
+            description="Measures.",
+        ),
+    )
