@@ -107,7 +107,9 @@ def groups(group: type[pydantic.BaseModel]) -> st.SearchStrategy[dict]:
     for name, field in group.model_fields.items():
         inner = field.annotation
         nested = isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)
-        plausible = st.sampled_from([1, 2, 0.5, [8, 8], field.get_default()])
+        default = field.get_default()
+        default = str(default) if isinstance(default, Path) else default
+        plausible = st.sampled_from([1, 2, 0.5, [8, 8], default])
         fields[name] = (groups(inner) if nested else plausible) | TREES
     return st.sets(st.sampled_from(sorted(fields)), max_size=4).flatmap(
         lambda names: st.fixed_dictionaries({name: fields[name] for name in sorted(names)})

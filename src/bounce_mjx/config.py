@@ -15,7 +15,7 @@ import pydantic
 import yaml
 from pydantic import Field
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -543,11 +543,6 @@ def describe(
         reason = first["msg"].removeprefix("Value error, ")
         return ": ".join([*path[-1:], shorten(reason, 500)])
     return f"{spell('.'.join(path))} is {_quote(first['input'])}, but must {_wanted(error)}"
-
-
-def shorten(text: str, length: int = 100) -> str:
-    """A text of a user, as far as it fits into a sentence."""
-    return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
 class _Repr(reprlib.Repr):

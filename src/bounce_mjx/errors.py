@@ -25,4 +25,10 @@ def exit_on_user_error() -> Iterator[None]:
 
 def _on_one_line(text: str) -> str:
     """Text from a file or a flag may hold line breaks, or what a terminal would obey."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return shorten(line, 3000)
+
+
+def shorten(text: str, length: int = 100) -> str:
+    """A text of a user, as far as it fits into a sentence."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."

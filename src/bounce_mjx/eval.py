@@ -1,6 +1,7 @@
 """Measures the five results of a trained policy: `python -m bounce_mjx.eval [CHECKPOINT]`."""
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -91,9 +92,9 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _check_writable(json_file: Path) -> None:
     """Spares the user an evaluation whose results could not be written."""
-    if not json_file.absolute().parent.is_dir():
+    if not os.path.isdir(json_file.absolute().parent):
         raise UserError(f"the folder of --json {json_file} does not exist; make it")
-    if json_file.is_dir():
+    if os.path.isdir(json_file):
         raise UserError(f"--json {json_file} is a folder; give a file")
 
 

@@ -1,6 +1,6 @@
 """The simulated robot: the MJCF file, the names it must have, and where their data lie."""
 
-from pathlib import Path
+import os
 from typing import NamedTuple
 
 import mujoco
@@ -41,7 +41,7 @@ def load_model(config: EnvConfig) -> mujoco.MjModel:
       UserError: the file is missing, is no MJCF, or lacks a name that the task needs.
     """
     path = config.mjcf or resource_path("mjcf/bounce_ball.xml")
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
     try:
         mj_model = mujoco.MjModel.from_xml_path(str(path))

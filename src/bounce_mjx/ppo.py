@@ -340,7 +340,7 @@ def num_groups(config: PPOConfig) -> int:
     device that holds whole groups shuffles its own samples alone, and as the groups do not depend
     on the devices, neither does the training.
     """
-    groups = max(_FEW_GROUPS, 2 ** (config.num_envs // _GROUP_ENVS).bit_length())
+    groups = max(_FEW_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
         groups //= 2
     return groups

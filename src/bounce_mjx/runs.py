@@ -18,6 +18,7 @@ evaluations so far, so that going on depends on one folder that is whole or not 
 import concurrent.futures
 import datetime
 import json
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -123,7 +124,8 @@ def find_run(path: Path) -> Path:
     Raises:
       UserError: there is none.
     """
-    if not path.is_dir():
+    # Unlike Path.is_dir, false for a name that is too long.
+    if not os.path.isdir(path):
         raise UserError(
             f"there is no checkpoint folder {path}; give a run's folder such as "
             "runs/bounce_ball/<time stamp>"
