@@ -226,9 +226,9 @@ def test_signal_saves_and_says_how_to_go_on(
     steps = latest_checkpoint(run).steps
     assert f"stopped after {steps:,} steps" in said
     assert resume_command(said) == ["--resume", str(run)]
-    if steps > STEPS:
-        straight = train(tmp_path / "straight", steps + 64)
     total = max(STEPS, steps + 64)
+    if total > STEPS:
+        straight = train(tmp_path / "straight", total)
     train_command.main([*resume_command(said), "--total-steps", str(total)])
     assert_same_training(run, straight)
 
