@@ -13,7 +13,7 @@ MAX_NORMALIZED = 10.0
 # Added to the variance of every observation.
 MIN_VARIANCE = 1e-6
 # An observation whose standard deviation is no more than what MIN_VARIANCE gives it never varied.
-_MIN_STD = 1.01 * MIN_VARIANCE**0.5
+MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 
 class Policy(NamedTuple):
@@ -65,7 +65,7 @@ def normalize(
     standardized = running_statistics.normalize(
         observation, normalizer, max_abs_value=MAX_NORMALIZED
     )
-    return jax.numpy.where(normalizer.std > _MIN_STD, standardized, 0.0)
+    return jax.numpy.where(normalizer.std > MIN_STD, standardized, 0.0)
 
 
 def act(networks: PPONetworks, policy: Policy, observation: jax.Array) -> jax.Array:
