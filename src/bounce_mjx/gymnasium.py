@@ -4,6 +4,7 @@ The arrays are NumPy's; `bounce_mjx.torch.gymnasium` has the same with tensors t
 device. Keyword arguments are the settings of `EnvConfig`.
 """
 
+import copy
 import weakref
 from typing import Any
 
@@ -16,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 
 from bounce_mjx import vector
 from bounce_mjx.config import EnvConfig, validate
-from bounce_mjx.env import OBSERVATION_SIZE, BounceBall
+from bounce_mjx.env import OBSERVATION_SIZE, BounceBall, BounceState
 from bounce_mjx.errors import UserError
 from bounce_mjx.model import JOINT_NAMES
 from bounce_mjx.offscreen import make_renderer
@@ -83,7 +84,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """A picture [480, 640, 3], uint8; None without render_mode="rgb_array"."""
         if self._pictures is None:
             return None
-        return self._pictures.draw(jax.device_get(self._state.pipeline_state.physics.qpos))
+        return self._pictures.draw(jax.device_get(self._state.pipeline_state))
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -151,8 +152,11 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         """A picture [480, 640, 3], uint8, of each environment; None without a render mode."""
         if self._pictures is None:
             return None
-        positions = np.array(self._state.env.pipeline_state.physics.qpos).T
-        return tuple(self._pictures.draw(qpos) for qpos in positions)
+        states = jax.device_get(self._state.env.pipeline_state)
+        return tuple(
+            self._pictures.draw(jax.tree.map(lambda x, i=i: x[..., i], states))
+            for i in range(self.num_envs)
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
@@ -172,17 +176,22 @@ class Pictures:
     """Draws states of the environment."""
 
     def __init__(self, task: BounceBall):
-        self._model = task.mj_model
+        # Its own, as the marker is moved in it.
+        self._model = copy.copy(task.mj_model)
         self._data = mujoco.MjData(self._model)
         self._renderer = make_renderer(self._model, _HEIGHT, _WIDTH)
         # Also at the end of the process, where OpenGL would be gone before the renderer.
         self.close = weakref.finalize(self, self._renderer.close)
         names = [self._model.camera(i).name for i in range(self._model.ncam)]
         self._camera = "overview" if "overview" in names else -1
+        # Another robot's MJCF may lack the marker of the target height.
+        self._target = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, "target_height")
 
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """The picture [480, 640, 3], uint8, of generalised positions [nq]."""
-        self._data.qpos[:] = qpos
+    def draw(self, state: BounceState) -> np.ndarray:
+        """The picture [480, 640, 3], uint8, of one environment."""
+        self._data.qpos[:] = state.physics.qpos
+        if self._target >= 0:
+            self._model.site_pos[self._target, 2] = state.task.target_height
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()

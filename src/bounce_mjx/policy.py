@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import PPONetworks, make_ppo_networks
+from brax.training.types import PreprocessObservationFn, identity_observation_preprocessor
 
 from bounce_mjx.config import PPOConfig
 
@@ -24,12 +25,22 @@ class Policy(NamedTuple):
     """Parameters of the policy network."""
 
 
-def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
+def make_networks(
+    config: PPOConfig,
+    observation_size: int,
+    action_size: int,
+    preprocess: PreprocessObservationFn = identity_observation_preprocessor,
+) -> PPONetworks:
     """Networks on normalised inputs: a Gaussian with a learned, state-independent standard
-    deviation on the observation, and a value on the observation and the critic's metrics."""
+    deviation on the observation, and a value on the observation and the critic's metrics.
+
+    Args:
+      preprocess: what a trainer that hands over raw observations normalises them with.
+    """
     return make_ppo_networks(
         {"state": (observation_size,), "critic": (observation_size + len(config.critic_metrics),)},
         action_size,
+        preprocess_observations_fn=preprocess,
         policy_obs_key="state",
         value_obs_key="critic",
         policy_hidden_layer_sizes=config.hidden_layers,
