@@ -21,6 +21,17 @@ TINY = (
 ).split()
 
 
+# As where PyTorch is not installed; some libraries mind a None in sys.modules.
+NO_TORCH = """
+import sys
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, NoTorch())
+"""
+
+
 @pytest.fixture(scope="module", params=("rsl_rl", "skrl"))
 def run(request, tmp_path_factory) -> Path:
     """The folder of a run of each library."""
@@ -50,9 +61,7 @@ def test_run_is_evaluated_without_torch(run, tmp_path):
     """By the same command with the same table; the best checkpoint gives its results again."""
     out = tmp_path / "results.json"
     seed = load_config(run / "config.yaml").eval_seed
-    script = f"""
-import sys
-sys.modules["torch"] = None
+    script = f"""{NO_TORCH}
 from bounce_mjx.eval import main
 main([{str(run)!r}, "--episodes", "4", "--seed", "{seed}", "--json", {str(out)!r}])
 """
