@@ -125,9 +125,25 @@ print(*action.shape, bool((abs(action) > 0.0).any()))
     assert action == "6 True"
 
 
-def test_readme_example_runs(capsys):
-    """The environment's example, as it stands."""
-    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
-    example = readme.split("```python\n")[1].split("```")[0]
+README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "number, printed",
+    [
+        (0, "(64, 29) "),
+        (1, "torch.Size([64, 29]) "),
+        (2, "(29,) (480, 640, 3) (64, 29)\n"),
+        (3, "(64, 29) 0"),
+    ],
+    ids=["jax", "torch", "gymnasium", "brax"],
+)
+def test_readme_example_runs(number, printed, capsys):
+    """The examples for each kind of user, as they stand."""
+    example = README.split("```python\n")[1 + number].split("```")[0]
     exec(compile(example, "README.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("(64, 29) ")
+    assert capsys.readouterr().out.startswith(printed)
+
+
+def test_readme_has_no_other_examples():
+    assert README.count("```python\n") == 4

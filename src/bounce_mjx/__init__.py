@@ -9,5 +9,8 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 from bounce_mjx.config import EnvConfig
 from bounce_mjx.env import BounceBall
+from bounce_mjx.registration import register as _register
 
 __all__ = ["BounceBall", "EnvConfig"]
+
+_register()

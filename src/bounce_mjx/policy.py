@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import PPONetworks, make_ppo_networks
+from brax.training.types import PreprocessObservationFn, identity_observation_preprocessor
 
 from bounce_mjx.config import PPOConfig
 
@@ -13,7 +14,7 @@ MAX_NORMALIZED = 10.0
 # Added to the variance of every observation.
 MIN_VARIANCE = 1e-6
 # An observation whose standard deviation is no more than what MIN_VARIANCE gives it never varied.
-_MIN_STD = 1.01 * MIN_VARIANCE**0.5
+MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 
 class Policy(NamedTuple):
@@ -24,12 +25,22 @@ class Policy(NamedTuple):
     """Parameters of the policy network."""
 
 
-def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
+def make_networks(
+    config: PPOConfig,
+    observation_size: int,
+    action_size: int,
+    preprocess: PreprocessObservationFn = identity_observation_preprocessor,
+) -> PPONetworks:
     """Networks on normalised inputs: a Gaussian with a learned, state-independent standard
-    deviation on the observation, and a value on the observation and the critic's metrics."""
+    deviation on the observation, and a value on the observation and the critic's metrics.
+
+    Args:
+      preprocess: what a trainer that hands over raw observations normalises them with.
+    """
     return make_ppo_networks(
         {"state": (observation_size,), "critic": (observation_size + len(config.critic_metrics),)},
         action_size,
+        preprocess_observations_fn=preprocess,
         policy_obs_key="state",
         value_obs_key="critic",
         policy_hidden_layer_sizes=config.hidden_layers,
@@ -65,7 +76,7 @@ def normalize(
     standardized = running_statistics.normalize(
         observation, normalizer, max_abs_value=MAX_NORMALIZED
     )
-    return jax.numpy.where(normalizer.std > _MIN_STD, standardized, 0.0)
+    return jax.numpy.where(normalizer.std > MIN_STD, standardized, 0.0)
 
 
 def act(networks: PPONetworks, policy: Policy, observation: jax.Array) -> jax.Array:

@@ -119,16 +119,13 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     Raises:
       UserError: a flag or the preset is wrong, or a resumed run is to change what it may not.
     """
-    config_path, resume = _path_flag(args, "--config"), _path_flag(args, "--resume")
+    config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
     if config_path and resume:
         raise UserError("--config and --resume exclude each other; a resumed run has its config")
     if resume:
         base = load_run_config(find_run(resume))
-    elif config_path:
-        base = load_config(config_path)
     else:
-        preset = "cpu" if jax.default_backend() == "cpu" else "default"
-        base = load_config(resource_path(f"configs/{preset}.yaml"))
+        base = read_preset(config_path)
     command = parse(
         TrainCommand,
         args,
@@ -146,6 +143,18 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     return command
 
 
+def read_preset(path: Path | None) -> TrainConfig:
+    """The config of a preset; that for the machine at hand if none is given.
+
+    Raises:
+      UserError: the file is missing or wrong.
+    """
+    if path is None:
+        preset = "cpu" if jax.default_backend() == "cpu" else "default"
+        path = resource_path(f"configs/{preset}.yaml")
+    return load_config(path)
+
+
 def config_of(command: TrainCommand) -> TrainConfig:
     """The run's part of a command line."""
     return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
@@ -161,7 +170,7 @@ def _join_hosts(args: Sequence[str]) -> None:
         hosts.join(address, *[None if word is None else int(word) for word in numbers])
 
 
-def _path_flag(args: Sequence[str], flag: str) -> Path | None:
+def path_flag(args: Sequence[str], flag: str) -> Path | None:
     word = _flag(args, flag)
     return None if word is None else Path(word)
 

@@ -136,7 +136,7 @@ class _Job:
     ):
         self.config, self.console, self.resumed = config, console, resume is not None
         self.stop, self.pool, self.stack = stop, pool, stack
-        self.clock = _Clock()
+        self.clock = Clock()
         self.env = BounceBall(config.env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         # What is wrong with the config must be said before a folder is made.
@@ -444,7 +444,7 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     return progress
 
 
-class _Clock:
+class Clock:
     """Adds up the time between laps by name."""
 
     def __init__(self):

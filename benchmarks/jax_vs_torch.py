@@ -1,0 +1,356 @@
+"""Six PPO trainers on one task: environment steps/s, time and steps to the five results, return.
+
+    python benchmarks/jax_vs_torch.py                                    # all of it
+    python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # a part of it
+    python benchmarks/jax_vs_torch.py --methods --merge FILES            # tables of what there is
+
+ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax; the hyperparameters
+are the config's as far as each library has them (`trainers.py`, `bounce_mjx/torch/rsl_rl.py`,
+`bounce_mjx/torch/skrl.py`). Each training is a process of its own with an empty compilation cache.
+All start episodes with the task's resets, and every `eval_every` steps the policy without noise is
+judged by the same evaluation on the same resets, on the fused physics.
+
+- Training clock: time in the trainer, without evaluations and without compiling. The first two
+  blocks of a trainer may compile, so each is counted as no more than the median of the others.
+- From process start: all of it, evaluations too; the evaluation compiles beside the training.
+- Every evaluation is written to jax_vs_torch.jsonl as it ends; a run that is cut short is shown as
+  far as it came. A (method, seed) that is run again replaces what was there.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import tyro
+from pydantic import Field
+from tables import device_name, markdown_table
+from trainers import TRAINERS, Method
+
+from bounce_mjx.cli import parse
+from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig
+from bounce_mjx.env import BounceBall
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation import judge, make_evaluator
+from bounce_mjx.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.train import path_flag, read_preset
+
+METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
+_NAMES = {
+    "ours": "bounce_mjx (JAX)",
+    "brax": "brax ppo, fused physics",
+    "brax_mjx": "brax ppo, mjx physics",
+    "rsl_rl": "rsl_rl (PyTorch)",
+    "skrl": "skrl (PyTorch)",
+    "skrl_jax": "skrl (JAX)",
+}
+_STARTED = "BOUNCE_MJX_BENCHMARK_STARTED"
+_RECORDS = "jax_vs_torch.jsonl"
+# brax and skrl (JAX) compile some of what they run a second time, in their second block.
+_COMPILING_BLOCKS = 2
+
+Record = dict[str, Any]
+
+
+class Command(TrainConfig):
+    """The command line: the config's keys as flags, and what to run."""
+
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
+    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
+    total_steps: Annotated[int, Field(ge=1)] = 20_000_000
+    """Environment steps of each training."""
+    eval_every: Annotated[int, Field(ge=1)] = 1_000_000
+    """Environment steps between two evaluations, rounded to whole iterations."""
+    config: Path | None = None
+    """Preset: a YAML file. Left out: configs/default.yaml where there is an accelerator."""
+    methods: tuple[Method, ...] = METHODS
+    """What to train; none to show what there is."""
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2)
+    """Seeds of the trainings."""
+    max_seconds: Annotated[float, Field(gt=0.0)] = 570.0
+    """A training that lasts longer than this from its process's start ends at its next
+    evaluation, s."""
+    stop_at_solved: bool = False
+    """End each training at its first evaluation that meets all five results."""
+    merge: tuple[Path, ...] = ()
+    """Further .jsonl files whose records are shown too."""
+    out: Path = Path("benchmarks/results")
+    """Folder for jax_vs_torch.jsonl, .md and .png."""
+    worker: bool = False
+    """Train the one method and seed in this process, for the command itself."""
+
+
+def main() -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        args = sys.argv[1:]
+        command = read_command(args)
+        if command.worker:
+            train_here(command)
+            return
+        command.out.mkdir(parents=True, exist_ok=True)
+        for seed in command.seeds:
+            for method in command.methods:
+                train_in_a_process(command, args, method, seed)
+        files = [p for p in (*command.merge, command.out / _RECORDS) if p.is_file()]
+        records = [json.loads(line) for path in files for line in path.read_text().splitlines()]
+        runs = newest_runs(records)
+        if not runs:
+            raise UserError(f"{command.out / _RECORDS} holds no evaluation yet; name some methods")
+        text = table(runs)
+        (command.out / "jax_vs_torch.md").write_text(text + "\n", encoding="utf-8")
+        plot(runs, command.out / "jax_vs_torch.png")
+        print(text)
+
+
+def read_command(args: list[str]) -> Command:
+    """Reads the command line on top of the preset."""
+    base = dict(read_preset(path_flag(args, "--config")))
+    for key in ("total_steps", "eval_every"):
+        del base[key]
+    default = Command(**base)
+    doc = __doc__.split("\n")[0]
+    return parse(Command, args, prog="benchmarks/jax_vs_torch.py", description=doc, default=default)
+
+
+def train_in_a_process(command: Command, args: list[str], method: Method, seed: int) -> None:
+    """Trains one method with one seed, cold."""
+    own = ["--methods", method, "--seed", str(seed), "--worker", "--out", str(command.out)]
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            # JAX would take most of the accelerator's memory at once; PyTorch needs some of it.
+            "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+            _STARTED: str(time.time()),
+        }
+        finished = subprocess.run(
+            [sys.executable, __file__, *args, *own],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+    lines = finished.stdout.strip().splitlines()
+    if finished.returncode:
+        print(f"{method}, seed {seed}: failed: {' / '.join(lines[-6:])}", flush=True)
+    else:
+        print(lines[-1], flush=True)
+
+
+def train_here(command: Command) -> None:
+    """Trains in this process, and writes each evaluation as it ends."""
+    started = float(os.environ.get(_STARTED) or time.time())
+    (method,) = command.methods
+    config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+    env = BounceBall(config.env)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    key = jax.random.PRNGKey(config.eval_seed)
+    evaluator = _Background(
+        lambda: (
+            make_evaluator(env, networks, config.eval_episodes)
+            .lower(jax.eval_shape(lambda: _empty_policy(env, networks)), key)
+            .compile()
+        )
+    )
+    device = device_name()
+    run = f"{method}-{config.seed}-{started:.3f}"
+    with (command.out / _RECORDS).open("a", encoding="utf-8") as file:
+
+        def on_block(steps: int, seconds: float, policy: Policy) -> bool:
+            policy = jax.tree.map(
+                lambda x, like: jax.numpy.asarray(x, like.dtype),
+                policy,
+                jax.eval_shape(lambda: _empty_policy(env, networks)),
+            )
+            report = judge(env, evaluator.result()(policy, key))
+            record = {
+                "run": run,
+                "method": method,
+                "seed": config.seed,
+                "device": device,
+                "num_envs": config.ppo.num_envs,
+                "total_steps": config.total_steps,
+                "steps": steps,
+                "block_seconds": seconds,
+                "process_seconds": time.time() - started,
+                "passed": report.passed,
+                "return": report.details["mean_return"],
+                "results": {result.name: result.value for result in report.results},
+            }
+            file.write(json.dumps(record) + "\n")
+            file.flush()
+            print(
+                f"{method}, seed {config.seed}: {steps:,} steps, "
+                f"{record['process_seconds']:.1f} s from the start, return "
+                f"{record['return']:.0f}, {'passed' if report.passed else 'not passed'}",
+                flush=True,
+            )
+            return (
+                steps >= config.total_steps
+                or record["process_seconds"] > command.max_seconds
+                or (report.passed and command.stop_at_solved)
+            )
+
+        TRAINERS[method](config, on_block)
+
+
+def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]:
+    """The evaluations of the newest run of each method and seed, in order, with the training clock
+    `train_seconds` of each."""
+    runs: dict[str, list[Record]] = {}
+    for record in records:
+        runs.setdefault(record["run"], []).append(record)
+    newest: dict[tuple[Method, int], list[Record]] = {}
+    for run in sorted(runs.values(), key=lambda run: float(run[0]["run"].rsplit("-", 1)[1])):
+        run = sorted({record["steps"]: record for record in run}.values(), key=lambda r: r["steps"])
+        blocks = [record["block_seconds"] for record in run]
+        if len(blocks) > _COMPILING_BLOCKS:
+            usual = statistics.median(blocks[_COMPILING_BLOCKS:])
+            for i in range(_COMPILING_BLOCKS):
+                blocks[i] = min(blocks[i], usual)
+        for i, record in enumerate(run):
+            record["train_seconds"] = sum(blocks[: i + 1])
+        newest[run[0]["method"], run[0]["seed"]] = run
+    return newest
+
+
+def summarize(runs: dict[tuple[Method, int], list[Record]]) -> dict[Method, dict[str, list]]:
+    """Of each method the figures of each seed; None where a run did not get there."""
+    summary: dict[Method, dict[str, list]] = {}
+    for method in METHODS:
+        of_method = [run for (name, _), run in sorted(runs.items()) if name == method]
+        if not of_method:
+            continue
+        solved = [next((r for r in run if r["passed"]), None) for run in of_method]
+        ends = [run[-1] for run in of_method]
+        summary[method] = {
+            "rate": [end["steps"] / end["train_seconds"] for end in ends],
+            "solved_steps": [r and r["steps"] for r in solved],
+            "solved_train": [r and r["train_seconds"] for r in solved],
+            "solved_process": [r and r["process_seconds"] for r in solved],
+            "return": [
+                end["return"] if end["steps"] >= end["total_steps"] else None for end in ends
+            ],
+            "steps": [end["steps"] for end in ends],
+        }
+    return summary
+
+
+def table(runs: dict[tuple[Method, int], list[Record]]) -> str:
+    """One row a method: the mean over the seeds, and their range."""
+    summary = summarize(runs)
+    ours = summary.get("ours")
+    some = next(iter(runs.values()))[0]
+    rows = []
+    for method, of in summary.items():
+        solved = [value for value in of["solved_train"] if value is not None]
+        rows.append(
+            [
+                _NAMES[method],
+                f"{_mean(of['rate']) / 1e6:.3f}",
+                f"{len(solved)} of {len(of['solved_train'])}",
+                _spread(of["solved_steps"], 1e-6),
+                _spread(of["solved_train"]),
+                _ratio(of["solved_train"], ours and ours["solved_train"]),
+                _spread(of["solved_process"]),
+                _ratio(of["solved_process"], ours and ours["solved_process"]),
+                _spread(of["return"]),
+                f"{min(of['steps']) / 1e6:.1f}",
+            ]
+        )
+    header = [
+        "trainer",
+        "M env steps/s",
+        "seeds solved",
+        "solved, M steps",
+        "training clock, s",
+        "x ours",
+        "from process start, s",
+        "x ours",
+        f"return after {some['total_steps'] / 1e6:g} M steps",
+        "trained, M steps",
+    ]
+    return (
+        f"Device: {some['device']}, {some['num_envs']:,} environments. Mean over the seeds that "
+        f"got there (least to most).\n\n{markdown_table(header, rows)}"
+    )
+
+
+def plot(runs: dict[tuple[Method, int], list[Record]], path: Path) -> None:
+    """The return over the training clock and over the steps; a circle at the first evaluation that
+    meets all five results."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise UserError("the plot needs matplotlib; pip install matplotlib") from error
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True, layout="constrained")
+    for (method, _), run in sorted(runs.items(), key=lambda item: METHODS.index(item[0][0])):
+        color = f"C{METHODS.index(method)}"
+        label = _NAMES[method] if method not in axes[0].get_legend_handles_labels()[1] else None
+        for axis, key, scale in zip(axes, ("train_seconds", "steps"), (1.0, 1e-6), strict=True):
+            across = [scale * record[key] for record in run]
+            returns = [record["return"] for record in run]
+            named = axis.get_legend_handles_labels()[1]
+            axis.plot(across, returns, color=color, label=None if label in named else label)
+            solved = next((i for i, record in enumerate(run) if record["passed"]), None)
+            if solved is not None:
+                axis.plot(across[solved], returns[solved], "o", color=color, mec="black")
+    axes[0].set(xscale="log", xlabel="training clock, s", ylabel="mean return of an evaluation")
+    axes[1].set(xlabel="environment steps, M")
+    axes[0].set_title("circle: first evaluation that meets all five results", fontsize="medium")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    axes[1].legend(loc="lower right", fontsize="small")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+class _Background:
+    """A value that a thread computes. Not a pool, which would hold up the end of the process."""
+
+    def __init__(self, compute):
+        self._thread = threading.Thread(target=self._run, args=(compute,), daemon=True)
+        self._thread.start()
+
+    def _run(self, compute) -> None:
+        self._value = compute()
+
+    def result(self):
+        self._thread.join()
+        return self._value
+
+
+def _empty_policy(env: BounceBall, networks) -> Policy:
+    params = networks.policy_network.init(jax.random.PRNGKey(0))
+    return Policy(init_normalizer(env.observation_size), params)
+
+
+def _mean(values: list[float | None]) -> float:
+    return statistics.mean(value for value in values if value is not None)
+
+
+def _spread(values: list[float | None], scale: float = 1.0) -> str:
+    present = [scale * value for value in values if value is not None]
+    if not present:
+        return "-"
+    return f"{_mean(present):.4g} ({min(present):.4g} to {max(present):.4g})"
+
+
+def _ratio(values: list[float | None], ours: list[float | None] | None) -> str:
+    if not ours or None in values or None in ours:
+        return "-"
+    return f"{_mean(values) / _mean(ours):.1f}"
+
+
+if __name__ == "__main__":
+    main()

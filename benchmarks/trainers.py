@@ -1,0 +1,191 @@
+"""The trainers that `jax_vs_torch.py` compares, each as one function.
+
+Each trains on the environment of the config until `on_block` says that it is enough. `on_block`
+gets the environment steps done, the seconds that the block took, and the policy.
+
+For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of `torch/rsl_rl.py`,
+`torch/skrl.py` and `skrl_jax.py`. For brax, on the fused and on the mjx physics:
+
+| PPOConfig                         | brax                                             |
+|-----------------------------------|--------------------------------------------------|
+| networks, normalisation, critic_metrics, and all that is not named below | the same  |
+| value_cost                        | doubled, as brax halves it: the same             |
+| learning_rate, its limits, target_kl | the same; steered by 1.5 (here 1.1)           |
+| decay_steps                       | none                                             |
+| advantages                        | from the values of each minibatch's own network  |
+| resets                            | each environment always to its own first state   |
+"""
+
+import concurrent.futures
+import functools
+import time
+from collections.abc import Callable
+from typing import Literal
+
+import brax.training.agents.ppo.train as brax_ppo
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State, Wrapper
+
+from bounce_mjx.brax_interop import device_put_replicated
+from bounce_mjx.config import TrainConfig
+from bounce_mjx.env import BounceBall
+from bounce_mjx.policy import MIN_VARIANCE, Policy, init_normalizer, make_networks, normalize
+from bounce_mjx.ppo import make_trainer, policy_of
+
+Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]
+OnBlock = Callable[[int, float, Policy], bool]
+
+
+def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
+    """This project's trainer."""
+    env = BounceBall(config.env)
+    trainer = make_trainer(config.ppo, env, config.env.episode_steps)
+    iterations = block_iterations(config)
+    key = jax.random.PRNGKey(config.seed)
+    init, run = jax.jit(trainer.init), jax.jit(trainer.run, static_argnums=1, donate_argnums=0)
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        shapes = jax.eval_shape(init, key)
+        compiled_run = pool.submit(lambda: run.lower(shapes, iterations).compile())
+        compiled_init = pool.submit(lambda: init.lower(key).compile())
+        state = jax.block_until_ready(compiled_init.result()(key))
+        run_block = compiled_run.result()
+    steps, enough = 0, False
+    while not enough:
+        started = time.perf_counter()
+        state, _ = jax.block_until_ready(run_block(state))
+        seconds = time.perf_counter() - started
+        steps += iterations * config.ppo.batch_steps
+        # A copy, as the next block takes the memory of the state.
+        enough = on_block(steps, seconds, jax.tree.map(jnp.copy, policy_of(state)))
+
+
+def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
+    """A PyTorch library on the adapter."""
+    from bounce_mjx.torch.train import make_learner
+
+    learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
+    _train_learner(learner, config, on_block)
+
+
+def train_skrl_jax(config: TrainConfig, on_block: OnBlock) -> None:
+    """skrl's JAX side."""
+    from skrl_jax import SkrlJaxLearner
+
+    learner = SkrlJaxLearner(config.ppo, BounceBall(config.env), config.seed)
+    _train_learner(learner, config, on_block)
+
+
+def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
+    iterations = block_iterations(config)
+    steps, enough = 0, False
+    while not enough:
+        started = time.perf_counter()
+        learner.learn(iterations)
+        # Reading the policy waits until the device has computed it.
+        policy = jax.block_until_ready(learner.policy())
+        seconds = time.perf_counter() - started
+        steps += iterations * config.ppo.batch_steps
+        enough = on_block(steps, seconds, policy)
+
+
+class _Enough(Exception):
+    """Ends brax's training, which has no other way out."""
+
+
+class CriticObservation(Wrapper):
+    """Observations as this project's networks take them: for the policy, and for the critic."""
+
+    def __init__(self, env: BounceBall, critic_metrics: tuple[str, ...]):
+        super().__init__(env)
+        self._names = critic_metrics
+
+    def reset(self, rng: jax.Array) -> State:
+        return self._see(self.env.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._see(self.env.step(state.replace(obs=state.obs["state"]), action))
+
+    def _see(self, state: State) -> State:
+        extra = [state.metrics[name][None] for name in self._names]
+        return state.replace(
+            obs={"state": state.obs, "critic": jnp.concatenate([state.obs, *extra])}
+        )
+
+
+def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBlock) -> None:
+    """brax's PPO with its own wrappers."""
+    ppo = config.ppo
+    env = BounceBall(config.env.model_copy(update={"physics": physics}))
+    steps_per_epoch = block_iterations(config) * ppo.batch_steps
+    epochs = -(-config.total_steps // steps_per_epoch)
+    started = time.perf_counter()
+
+    def on_params(steps: int, _, params) -> None:
+        nonlocal started
+        seconds = time.perf_counter() - started
+        if steps:
+            statistics = params[0]
+            policy = Policy(
+                init_normalizer(env.observation_size).replace(
+                    mean=statistics.mean["state"], std=statistics.std["state"]
+                ),
+                params[1],
+            )
+            if on_block(steps, seconds, policy):
+                raise _Enough
+        started = time.perf_counter()
+
+    def networks(_, action_size: int, preprocess_observations_fn):
+        del preprocess_observations_fn
+        return make_networks(ppo, env.observation_size, action_size, normalize)
+
+    try:
+        with device_put_replicated():
+            brax_ppo.train(
+                environment=CriticObservation(env, ppo.critic_metrics),
+                num_timesteps=epochs * steps_per_epoch,
+                num_envs=ppo.num_envs,
+                episode_length=config.env.episode_steps,
+                unroll_length=ppo.rollout_length,
+                batch_size=ppo.num_envs // ppo.num_minibatches,
+                num_minibatches=ppo.num_minibatches,
+                num_updates_per_batch=ppo.num_epochs,
+                learning_rate=ppo.learning_rate,
+                learning_rate_schedule="ADAPTIVE_KL",
+                learning_rate_schedule_min_lr=ppo.min_learning_rate,
+                learning_rate_schedule_max_lr=ppo.max_learning_rate,
+                desired_kl=ppo.target_kl,
+                discounting=ppo.discount,
+                gae_lambda=ppo.gae_lambda,
+                clipping_epsilon=ppo.clip_epsilon,
+                entropy_cost=ppo.entropy_cost,
+                vf_loss_coefficient=2.0 * ppo.value_cost,
+                max_grad_norm=ppo.max_grad_norm,
+                reward_scaling=ppo.reward_scale,
+                normalize_observations=True,
+                normalize_observations_std_eps=MIN_VARIANCE,
+                network_factory=networks,
+                max_devices_per_host=1,
+                num_evals=epochs + 1,
+                run_evals=False,
+                policy_params_fn=on_params,
+                seed=config.seed,
+            )
+    except _Enough:
+        pass
+
+
+def block_iterations(config: TrainConfig) -> int:
+    """Iterations between two evaluations."""
+    return max(1, round(config.eval_every / config.ppo.batch_steps))
+
+
+TRAINERS: dict[Method, Callable[[TrainConfig, OnBlock], None]] = {
+    "ours": train_ours,
+    "brax": functools.partial(train_brax, "auto"),
+    "brax_mjx": functools.partial(train_brax, "mjx"),
+    "rsl_rl": functools.partial(train_torch, "rsl_rl"),
+    "skrl": functools.partial(train_torch, "skrl"),
+    "skrl_jax": train_skrl_jax,
+}

@@ -1,0 +1,96 @@
+"""The comparison of the trainers on a tiny scale, and what it makes of its records."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+TINY = (
+    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
+    "--total-steps 192 --eval-every 64 --eval-episodes 4 --episode-seconds 0.2 --seeds 0"
+).split()
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """The module of the benchmark."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import jax_vs_torch
+
+    return jax_vs_torch
+
+
+def evaluation(method, seed, steps, block_seconds, passed=False, run=1.0):
+    return {
+        "run": f"{method}-{seed}-{run}",
+        "method": method,
+        "seed": seed,
+        "device": "a device",
+        "num_envs": 8,
+        "total_steps": 400,
+        "steps": steps,
+        "block_seconds": block_seconds,
+        "process_seconds": 10.0 + steps,
+        "passed": passed,
+        "return": float(steps),
+        "results": {},
+    }
+
+
+def test_training_clock_leaves_compiling_out(benchmark):
+    seconds = (9.0, 3.0, 1.0, 2.0)
+    records = [evaluation("brax", 0, 100 * (i + 1), s) for i, s in enumerate(seconds)]
+    run = benchmark.newest_runs(records)["brax", 0]
+    assert [record["train_seconds"] for record in run] == [1.5, 3.0, 4.0, 6.0]
+
+
+def test_newest_run_counts_and_a_part_of_a_run_too(benchmark):
+    old = [evaluation("ours", 0, 100, 1.0, passed=True)]
+    new = [evaluation("ours", 0, steps, 1.0, steps > 200, run=2.0) for steps in (100, 200, 300)]
+    whole = [evaluation("rsl_rl", 0, steps, 2.0, steps > 300) for steps in (100, 200, 300, 400)]
+    summary = benchmark.summarize(benchmark.newest_runs([*whole, *new, *old, *new]))
+    assert summary["ours"]["solved_steps"] == [300]
+    assert summary["ours"]["solved_train"] == [3.0]
+    assert summary["ours"]["return"] == [None]
+    assert summary["rsl_rl"]["return"] == [400.0]
+    assert summary["rsl_rl"]["solved_process"] == [410.0]
+    assert summary["rsl_rl"]["rate"] == [50.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("methods", [("ours", "rsl_rl"), ("brax", "skrl"), ("skrl_jax",)])
+def test_trainers_are_compared(methods, tmp_path):
+    """Each in a process of its own; one table, one plot, one line an evaluation."""
+    command = [sys.executable, "jax_vs_torch.py", *TINY, "--out", tmp_path, "--methods", *methods]
+    done = subprocess.run(
+        command,
+        cwd=BENCHMARKS,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "jax_vs_torch.jsonl").read_text(encoding="utf-8").splitlines()
+    records = [json.loads(line) for line in lines]
+    for method in methods:
+        assert [r["steps"] for r in records if r["method"] == method] == [64, 128, 192]
+    rows = (tmp_path / "jax_vs_torch.md").read_text(encoding="utf-8").splitlines()[4:]
+    assert len(rows) == len(methods)
+    assert all("0 of 1" in row for row in rows)
+    assert (tmp_path / "jax_vs_torch.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_adapter_is_measured(tmp_path):
+    command = "adapter.py --num-envs 4 --steps 3 --rounds 2 --out".split()
+    done = subprocess.run(
+        [sys.executable, *command, tmp_path], cwd=BENCHMARKS, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads((tmp_path / "adapter.json").read_text(encoding="utf-8"))["records"]
+    assert set(record["seconds"]) == {"jitted step alone", "TorchVectorEnv", "RslRlVecEnv"}
+    assert all(seconds > 0.0 for seconds in record["seconds"].values())

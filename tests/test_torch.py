@@ -1,0 +1,402 @@
+"""The environment for PyTorch: shared memory, the same steps, and its libraries' own interfaces."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from skrl.trainers.torch import SequentialTrainer
+
+from bounce_mjx import BounceBall, EnvConfig, vector
+from bounce_mjx.config import PPOConfig
+from bounce_mjx.errors import UserError
+from bounce_mjx.policy import act, make_networks
+from bounce_mjx.torch import TorchVectorEnv
+from bounce_mjx.torch.gymnasium import TorchGymnasiumVectorEnv
+from bounce_mjx.torch.networks import Normalizer, init_weights, linears_of, make_mlp, to_policy
+from bounce_mjx.torch.rsl_rl import RslRlVecEnv, algorithm_config
+from bounce_mjx.torch.skrl import SkrlEnv
+from bounce_mjx.torch.train import make_learner, summarize
+
+NUM_ENVS = 4
+# Both a fall (the ball reaches the floor after 0.3 s) and time-outs come within a test.
+EPISODE_STEPS = 20
+PPO = PPOConfig(
+    num_envs=8, rollout_length=8, num_epochs=2, num_minibatches=2, hidden_layers=(16, 12)
+)
+LIBRARIES = ("rsl_rl", "skrl")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Threads of PyTorch that wait for a busy core slow tiny networks down a hundredfold."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def task() -> BounceBall:
+    return BounceBall(EnvConfig(physics="fused", episode_seconds=0.01 * EPISODE_STEPS))
+
+
+@pytest.fixture(scope="module")
+def env(task) -> TorchVectorEnv:
+    return TorchVectorEnv(task, NUM_ENVS, seed=3)
+
+
+@pytest.fixture(scope="module")
+def learners(task):
+    """Of each library a learner after two iterations."""
+    made = {library: make_learner(library, PPO, task, 0) for library in LIBRARIES}
+    return {library: (learner, learner.learn(2)) for library, learner in made.items()}
+
+
+def random_actions(steps: int) -> torch.Tensor:
+    """Some beyond the limits [steps, B, 6]."""
+    return 1.5 * torch.randn(steps, NUM_ENVS, 6, generator=torch.Generator().manual_seed(0))
+
+
+# Memory
+
+
+def test_observation_is_the_memory_of_jax(env):
+    env.reset()
+    result = env.step(torch.zeros(NUM_ENVS, 6))
+    names = [name for name in result._arrays._fields if name != "critic_metrics"]
+    for name in names:
+        array = getattr(result._arrays, name)
+        assert getattr(result, name).data_ptr() == array.unsafe_buffer_pointer(), name
+
+
+def test_action_reaches_jax_without_a_copy(env, monkeypatch):
+    seen = []
+    env.reset()
+    step = env._jit_step
+
+    def spy(carried, action):
+        seen.append(action.unsafe_buffer_pointer())
+        return step(carried, action)
+
+    monkeypatch.setattr(env, "_jit_step", spy)
+    # PyTorch aligns a tensor as JAX needs it where it is not a part of another.
+    action = torch.zeros(NUM_ENVS, 6)
+    env.step(action)
+    assert seen == [action.data_ptr()]
+
+
+def test_tensors_of_a_step_outlive_the_following_steps(env):
+    """Though the state is donated from step to step."""
+    first, _ = env.reset()
+    kept, copies = [first], [first.clone()]
+    for action in random_actions(2 * EPISODE_STEPS):
+        result = env.step(action)
+        kept += [result.observation, result.final_observation, result.reward, result.metrics]
+        copies += [tensor.clone() for tensor in kept[-4:]]
+    assert all(torch.equal(*pair) for pair in zip(kept, copies, strict=True))
+
+
+def test_clock_is_a_copy(env):
+    env.reset()
+    clock = env.clock
+    clock += 5
+    assert torch.equal(env.clock, torch.zeros(NUM_ENVS, dtype=torch.int32))
+    given = torch.arange(NUM_ENVS)
+    env.clock = given
+    given += 7
+    env.step(torch.zeros(NUM_ENVS, 6))
+    assert env.clock.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_step_waits_for_nothing_on_cuda(task):
+    env = RslRlVecEnv(TorchVectorEnv(task, NUM_ENVS))
+    action = torch.zeros(NUM_ENVS, 6, device="cuda")
+    env.step(action)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        with jax.transfer_guard("disallow"):
+            observations, rewards, dones, extras = env.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert {t.device.type for t in (rewards, dones, extras["time_outs"])} == {"cuda"}
+    assert observations["policy"].device == action.device
+
+
+# The same steps
+
+
+def test_steps_are_those_of_vector(task, env):
+    """The same resets and actions through `vector.step` give the same episodes."""
+    first, _ = env.reset(seed=11)
+    _, key = jax.random.split(jax.random.PRNGKey(11))
+    key, reset_key = jax.random.split(key)
+    state = vector.reset(task, reset_key, NUM_ENVS)
+    np.testing.assert_allclose(first, vector.observe(state), atol=1e-6)
+    step = jax.jit(lambda state, action, key: vector.step(task, state, action, key, EPISODE_STEPS))
+    ended = 0
+    for action in random_actions(2 * EPISODE_STEPS):
+        key, reset_key = jax.random.split(key)
+        state, expected = step(state, jnp.asarray(action.numpy()), reset_key)
+        result = env.step(action)
+        for name in ("observation", "final_observation", "reward", "terminated", "truncated"):
+            np.testing.assert_allclose(
+                getattr(result, name).numpy(), getattr(expected, name), atol=2e-4, err_msg=name
+            )
+        np.testing.assert_array_equal(result.done, result.terminated | result.truncated)
+        np.testing.assert_array_equal(
+            result.final_critic_metrics[:, 0], expected.metrics["n_bounces"]
+        )
+        at = env.metric_names.index("reward")
+        np.testing.assert_allclose(result.metrics[at], expected.reward.mean(), rtol=1e-4)
+        ended += int(result.done.sum())
+    assert ended >= 2 * NUM_ENVS
+
+
+def test_rewards_are_scaled(task, env):
+    scaled = TorchVectorEnv(task, NUM_ENVS, reward_scale=0.25, critic_metrics=())
+    for each in (env, scaled):
+        each.reset(seed=5)
+    action = torch.zeros(NUM_ENVS, 6)
+    torch.testing.assert_close(scaled.step(action).reward, 0.25 * env.step(action).reward)
+    assert scaled.step(action).critic_metrics.shape == (NUM_ENVS, 0)
+
+
+BAD_ACTIONS = {
+    "type": (torch.zeros(NUM_ENVS, 6, dtype=torch.float64), "torch.float64", "torch.float32"),
+    "shape": (torch.zeros(6, NUM_ENVS), "(6, 4)", "(4, 6)"),
+    "device": (torch.zeros(NUM_ENVS, 6, device="meta"), "on meta", "convert it"),
+}
+
+
+@pytest.mark.parametrize("action, given, advice", BAD_ACTIONS.values(), ids=BAD_ACTIONS)
+def test_wrong_action_is_refused(env, action, given, advice):
+    env.reset()
+    with pytest.raises(UserError) as error:
+        env.step(action)
+    assert given in str(error.value) and advice in str(error.value)
+
+
+def test_wrong_environment_is_refused(task):
+    with pytest.raises(UserError, match="device is meta, but JAX's arrays lie on"):
+        TorchVectorEnv(task, NUM_ENVS, device="meta")
+    with pytest.raises(UserError, match="'bounces', which is no metric .* choose from .*n_bounces"):
+        TorchVectorEnv(task, NUM_ENVS, critic_metrics=("bounces",))
+    with pytest.raises(UserError, match="call reset first"):
+        TorchVectorEnv(task, NUM_ENVS).step(torch.zeros(NUM_ENVS, 6))
+
+
+def test_package_works_without_torch():
+    script = """
+import sys
+sys.modules["torch"] = None
+import jax, bounce_mjx, bounce_mjx.train, bounce_mjx.eval
+print(bounce_mjx.BounceBall().reset(jax.random.PRNGKey(0)).obs.shape)
+try:
+    import bounce_mjx.torch
+except ImportError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    shape, sentence = done.stdout.splitlines()
+    assert shape == "(29,)"
+    assert "not installed; install it with pip install 'bounce_mjx[torch]'" in sentence
+
+
+# rsl_rl
+
+
+def test_rsl_rl_hands_on_time_outs_and_terminal_observations(env):
+    vec_env = RslRlVecEnv(env)
+    vec_env.episode_length_buf = torch.tensor([EPISODE_STEPS - 1, 0, 0, EPISODE_STEPS - 2])
+    assert vec_env.episode_length_buf.tolist() == [EPISODE_STEPS - 1, 0, 0, EPISODE_STEPS - 2]
+    before = vec_env.get_observations()["policy"]
+    after, rewards, dones, extras = vec_env.step(torch.zeros(NUM_ENVS, 6))
+    assert extras["time_outs"].tolist() == dones.tolist() == [True, False, False, False]
+    assert rewards.shape == (NUM_ENVS,)
+    assert after["policy"].shape == (NUM_ENVS, 29) and after["critic"].shape == (NUM_ENVS, 1)
+    assert vec_env.get_observations() is after
+    # In one step of 10 ms nothing moves far, but a reset draws another target height.
+    terminal = vec_env.terminal_observations()["policy"]
+    torch.testing.assert_close(terminal[:, 28], before[:, 28])
+    assert torch.equal(terminal[1:], after["policy"][1:])
+    assert terminal[0, 28] != after["policy"][0, 28]
+
+
+def test_rsl_rl_log_has_the_mean_reward_terms(env):
+    vec_env = RslRlVecEnv(env)
+    _, rewards, _, extras = vec_env.step(torch.zeros(NUM_ENVS, 6))
+    log = extras["log"]
+    terms = [value for name, value in log.items() if name.startswith("task/reward/")]
+    assert len(terms) == 15
+    torch.testing.assert_close(sum(terms), log["task/reward"])
+    torch.testing.assert_close(log["task/reward"], rewards.mean())
+
+
+def test_rsl_rl_runner_trains(task, tmp_path):
+    """rsl_rl's own runner, with its log and its check for numbers that are not finite."""
+    env = RslRlVecEnv(TorchVectorEnv(task, PPO.num_envs))
+    config = algorithm_config(PPO) | {"check_for_nan": True}
+    runner = OnPolicyRunner(env, config, log_dir=str(tmp_path), device=str(env.device))
+    before = [p.clone() for p in runner.alg.actor.parameters()]
+    runner.learn(2, init_at_random_ep_len=True)
+    assert any(
+        not torch.equal(*pair) for pair in zip(before, runner.alg.actor.parameters(), strict=True)
+    )
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+
+
+# skrl
+
+
+def test_skrl_hands_on_terminal_observations(env):
+    skrl_env = SkrlEnv(env)
+    skrl_env.reset()
+    env.clock = torch.tensor([EPISODE_STEPS - 1, 0, 0, 0])
+    after, rewards, terminated, truncated, _ = skrl_env.step(torch.zeros(NUM_ENVS, 6))
+    assert rewards.shape == terminated.shape == truncated.shape == (NUM_ENVS, 1)
+    assert truncated[:, 0].tolist() == [True, False, False, False]
+    observations, states = skrl_env.terminal_observations()
+    assert torch.equal(observations[1:], after[1:]) and not torch.equal(observations[0], after[0])
+    assert torch.equal(states[:, :29], observations) and states.shape[1:] == (30,)
+    assert skrl_env.state_space.shape == skrl_env.state().shape[1:]
+    assert torch.equal(skrl_env.state()[:, :29], after)
+
+
+def test_skrl_trainer_trains(learners):
+    """skrl's own trainer."""
+    learner, _ = learners["skrl"]
+    before = [p.clone() for p in learner.agent.policy.parameters()]
+    cfg = {
+        "timesteps": 2 * PPO.rollout_length,
+        "headless": True,
+        "disable_progressbar": True,
+        "close_environment_at_exit": False,
+    }
+    SequentialTrainer(cfg=cfg, env=learner.env, agents=learner.agent).train()
+    after = learner.agent.policy.parameters()
+    assert any(not torch.equal(*pair) for pair in zip(before, after, strict=True))
+
+
+def test_skrl_bootstraps_time_outs_from_the_terminal_observations(learners):
+    """What its memory holds is the reward plus the discounted value of the old episode's end."""
+    learner, _ = learners["skrl"]
+    agent, at = learner.agent, learner.agent.memory.memory_index
+    learner.vector.clock = torch.full((PPO.num_envs,), EPISODE_STEPS - 1, dtype=torch.int32)
+    learner._step()
+    result = learner.env._result
+    _, states = learner.env.terminal_observations()
+    with torch.no_grad():
+        value, _ = agent.value.act({"states": agent._state_preprocessor(states)}, role="value")
+    assert result.truncated.all()
+    expected = result.reward[:, None] + PPO.discount * value
+    torch.testing.assert_close(agent.memory.get_tensor_by_name("rewards")[at], expected)
+
+
+# Gymnasium
+
+
+def test_gymnasium_vector_env_stays_on_the_device(env):
+    made = TorchGymnasiumVectorEnv(env)
+    first, _ = made.reset(seed=2)
+    again, _ = made.reset(seed=2)
+    assert torch.equal(first, again)
+    env.clock = torch.tensor([EPISODE_STEPS - 1, 0, 0, 0])
+    after, reward, terminated, truncated, info = made.step(torch.zeros(made.action_space.shape))
+    assert isinstance(after, torch.Tensor) and after.shape == made.observation_space.shape
+    assert info["_final_obs"].tolist() == truncated.tolist() == [True, False, False, False]
+    torch.testing.assert_close(info["final_obs"][:, 28], first[:, 28])
+    assert after[0, 28] != first[0, 28]
+    assert after.numpy() in made.observation_space
+    assert reward.shape == terminated.shape == (made.num_envs,)
+
+
+# Networks
+
+
+def test_normalizer_is_that_of_jax():
+    """Over batches: the statistics and what they make of an observation, a constant one too."""
+    from brax.training.acme import running_statistics
+
+    from bounce_mjx.policy import init_normalizer, normalize
+
+    rng = np.random.default_rng(0)
+    normalizer, statistics = Normalizer(3), init_normalizer(3)
+    for count in (5, 40, 7):
+        batch = rng.normal([2.0, -300.0, 0.0], [1.0, 20.0, 0.0], (count, 3)).astype(np.float32)
+        seen = normalizer(torch.tensor(batch), train=True)
+        statistics = running_statistics.update(statistics, jnp.asarray(batch))
+        np.testing.assert_allclose(seen, normalize(batch, statistics), rtol=1e-3, atol=1e-4)
+    assert int(normalizer.count) == 52
+    np.testing.assert_allclose(normalizer.mean, statistics.mean, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(normalizer.std, statistics.std, rtol=1e-4)
+    far = torch.tensor([[1e6, 0.0, 1e6]])
+    np.testing.assert_allclose(normalizer(far), normalize(far.numpy(), statistics), rtol=1e-4)
+    assert normalizer(far)[0, [0, 2]].tolist() == [10.0, 0.0]
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_policy_acts_as_the_network_did(learners, library):
+    """The same actions for the same observations, in PyTorch and as a `Policy` in JAX."""
+    learner, _ = learners[library]
+    observation = 3.0 * torch.randn(64, 29, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        if library == "rsl_rl":
+            mean = learner.algorithm.get_policy()({"policy": observation})
+        else:
+            seen = learner.agent._observation_preprocessor(observation)
+            mean = learner.agent.policy.act({"observations": seen})[1]["mean_actions"]
+    expected = mean.clamp(-1.0, 1.0).numpy()
+    actions = act(make_networks(PPO, 29, 6), learner.policy(), observation.numpy())
+    assert np.abs(expected).max() > 0.01
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_learner_reports_what_the_trainer_in_jax_does(learners, library):
+    _, metrics = learners[library]
+    reported = summarize(metrics)
+    assert {"reward/height", "episode/return", "task/ball_xy_error"} < reported.keys()
+    assert {"loss/policy", "loss/value", "policy/learning_rate"} < reported.keys()
+    assert all(values.shape == (2,) for values in reported.values())
+    terms = [v for name, v in reported.items() if name.startswith("reward/")]
+    np.testing.assert_allclose(sum(terms), reported["reward"], rtol=1e-4)
+
+
+def test_initial_weights_are_those_of_jax():
+    """Orthogonal with the same gains, so with the same singular values."""
+    networks = make_networks(PPO, 29, 6)
+    params = networks.policy_network.init(jax.random.PRNGKey(0))["params"]
+    mlp = make_mlp(PPO, 29, 6)
+    init_weights(mlp, output_gain=0.01)
+    layers = [*params["MLP_0"].values(), params["Dense_0"]]
+    for linear, layer in zip(linears_of(mlp), layers, strict=True):
+        assert linear.weight.T.shape == layer["kernel"].shape
+        np.testing.assert_allclose(
+            torch.linalg.svdvals(linear.weight.detach()),
+            jnp.linalg.svd(layer["kernel"], compute_uv=False),
+            rtol=1e-4,
+        )
+
+
+def test_network_of_another_shape_is_no_policy():
+    mlp = make_mlp(PPO.model_copy(update={"hidden_layers": (16,)}), 29, 6)
+    with pytest.raises(UserError, match="hidden_layers"):
+        to_policy(PPO, Normalizer(29), linears_of(mlp), torch.zeros(6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_training_makes_episodes_longer(library):
+    task = BounceBall(EnvConfig(physics="fused", episode_seconds=5.0))
+    config = PPOConfig(
+        num_envs=256, rollout_length=24, num_minibatches=4, num_epochs=4, hidden_layers=(64, 64)
+    )
+    learner = make_learner(library, config, task, 0)
+    lengths = summarize(learner.learn(35))["episode/length"]
+    assert lengths[-5:].mean() > 1.3 * lengths[:5].mean()
