@@ -57,7 +57,7 @@ def write_checkpoint(folder: Path, items: dict[str, Any], record: dict[str, Any]
             multiprocessing_options=only_here,
         )
         for name, tree in items.items():
-            checkpointer.save((partial / name).absolute(), args=ocp.args.PyTreeSave(_plain(tree)))
+            checkpointer.save(_absolute(partial / name), args=ocp.args.PyTreeSave(_plain(tree)))
         (partial / RECORD_FILE).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         seal(partial)
         replaced = folder.with_name(folder.name + _REPLACED)
@@ -73,6 +73,11 @@ def write_checkpoint(folder: Path, items: dict[str, Any], record: dict[str, Any]
         # tensorstore reports a full disk as a ValueError.
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
     shutil.rmtree(replaced, ignore_errors=True)
+
+
+def _absolute(path: Path) -> Path:
+    """The path without "..", which tensorstore does not take."""
+    return Path(os.path.abspath(path))
 
 
 def _plain(tree: Any) -> Any:
@@ -135,7 +140,8 @@ def open_item(folder: Path, item: str) -> dict[str, tensorstore.TensorStore]:
 
     Not by orbax, whose readers print tracebacks from their threads where a file is damaged.
     """
-    database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder / item}/"}}
+    base = {"driver": "file", "path": f"{_absolute(folder / item)}/"}
+    database = {"driver": "ocdbt", "base": base}
     keys = tensorstore.KvStore.open(database).result().list().result()
     opening = {
         name: tensorstore.open(

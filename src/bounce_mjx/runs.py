@@ -106,11 +106,12 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
     """
     path = newest_run(log_dir) if path is None else path
     run = find_run(path)
-    at = path.absolute()
+    at = Path(os.path.abspath(path))
     if at.parent.parent.name == _CHECKPOINTS and at in stored_checkpoints(at.parent).values():
         return Checkpoint(run, at, int(at.name))
-    if at == run.absolute():
-        at = run = _best_seed(run)
+    if at == Path(os.path.abspath(run)):
+        run = _best_seed(run)
+        at = Path(os.path.abspath(run))
     for folder in (at, at / _CHECKPOINTS / "best", at / _CHECKPOINTS / "latest"):
         stored = stored_checkpoints(folder)
         if stored:
@@ -130,7 +131,8 @@ def find_run(path: Path) -> Path:
             f"there is no checkpoint folder {path}; give a run's folder such as "
             "runs/bounce_ball/<time stamp>"
         )
-    run = next((p for p in (path, *path.absolute().parents) if (p / CONFIG_FILE).is_file()), None)
+    above = Path(os.path.abspath(path)).parents
+    run = next((p for p in (path, *above) if (p / CONFIG_FILE).is_file()), None)
     if run is None:
         raise UserError(
             f"{path} is no run's folder nor in one, as no {CONFIG_FILE} is there; give a folder "
@@ -384,7 +386,7 @@ def _restore(checkpoint: Checkpoint, item: str, template: Any) -> tuple[Any, dic
     """An item in the structure of `template`, and the record."""
     record = _read_record(checkpoint)
     try:
-        stored = checkpoints.open_item(checkpoint.folder.absolute(), item)
+        stored = checkpoints.open_item(checkpoint.folder, item)
     except Exception as error:
         raise _damaged(checkpoint, error) from error
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)

@@ -1,0 +1,94 @@
+"""The studies in benchmarks/: the search over hyperparameters, and ten minutes on end."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import optuna
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+CONFIG = """
+env: {episode_seconds: 0.2}
+ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 2, num_epochs: 1, hidden_layers: [16]}
+eval_every: 64
+"""
+
+
+@pytest.fixture
+def sweep(monkeypatch, tmp_path: Path):
+    """The module of the search, and its command with two trials."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import sweep
+
+    (tmp_path / "tiny.yaml").write_text(CONFIG)
+    command = sweep.Command(
+        config=tmp_path / "tiny.yaml",
+        trials=2,
+        seeds=2,
+        steps=128,
+        episodes=2,
+        storage=tmp_path / "sweep.db",
+        out=tmp_path,
+    )
+    return sweep, command
+
+
+def states(storage: Path) -> list[str]:
+    study = optuna.load_study(study_name="bounce_mjx", storage=f"sqlite:///{storage}")
+    return [trial.state.name for trial in study.trials]
+
+
+def test_a_search_goes_on_where_it_was_cut_off(sweep, monkeypatch):
+    module, command = sweep
+    base = module.load_config(command.config)
+    tried = []
+
+    def killed(trial, *_):
+        trial.suggest_float("discount", *module.SPACE["discount"][:2])
+        raise SystemExit
+
+    def value(trial, *_):
+        discount = trial.suggest_float("discount", *module.SPACE["discount"][:2])
+        tried.append(discount)
+        trial.set_user_attr("spread_over_seeds", 0.0)
+        trial.set_user_attr("solved_at_the_end", 0)
+        return discount
+
+    monkeypatch.setattr(module, "run_trial", killed)
+    with pytest.raises(SystemExit):
+        module.search(command, base)
+    monkeypatch.setattr(module, "run_trial", value)
+    module.search(command, base)
+    # The one that was cut off is made up for with the same values, which are today's.
+    assert tried[0] == base.ppo.discount
+    assert states(command.storage).count("COMPLETE") == 2
+    module.search(command, base)
+    assert len(tried) == 2, "a finished search tries nothing more"
+
+
+@pytest.mark.slow
+def test_a_trial_trains_a_population(sweep):
+    module, command = sweep
+    base = module.load_config(command.config)
+    study = module.search(command.model_copy(update={"trials": 1}), base)
+    (trial,) = study.trials
+    assert trial.state.name == "COMPLETE"
+    assert 0.0 <= trial.value < 1.0, "so short a training cannot meet all results"
+    assert list(trial.intermediate_values) == [64, 128]
+    assert "0 of 2" in module.table(study, command.seeds)
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_keeps_the_ball_up(tmp_path: Path):
+    """For three times as long as an episode that it was trained on."""
+    done = subprocess.run(
+        [sys.executable, "endurance.py", "../pretrained", "--num-envs", "16", "--minutes", "1",
+         "--out", tmp_path],
+        cwd=BENCHMARKS, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (minute,) = json.loads((tmp_path / "endurance.json").read_text())["records"]
+    assert minute["up_share"] == 1.0
+    assert minute["results"]["height"] >= 95.0
