@@ -4,13 +4,11 @@ The arrays are NumPy's; `bounce_mjx.torch.gymnasium` has the same with tensors t
 device. Keyword arguments are the settings of `EnvConfig`.
 """
 
-import copy
 import weakref
 from typing import Any
 
 import gymnasium
 import jax
-import mujoco
 import numpy as np
 from brax.envs.base import State
 from gymnasium.vector import AutoresetMode
@@ -20,7 +18,7 @@ from bounce_mjx.config import EnvConfig, validate
 from bounce_mjx.env import OBSERVATION_SIZE, BounceBall, BounceState
 from bounce_mjx.errors import UserError
 from bounce_mjx.model import JOINT_NAMES
-from bounce_mjx.offscreen import make_renderer
+from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
 ACTION_SPACE = gymnasium.spaces.Box(-1.0, 1.0, (len(JOINT_NAMES),), np.float32)
@@ -176,25 +174,14 @@ class Pictures:
     """Draws states of the environment."""
 
     def __init__(self, task: BounceBall):
-        # Its own, as the marker is moved in it.
-        self._model = copy.copy(task.mj_model)
-        self._data = mujoco.MjData(self._model)
-        self._renderer = make_renderer(self._model, _HEIGHT, _WIDTH)
+        renderer = Renderer(task, _WIDTH, _HEIGHT, choose_backend())
+        self._render = renderer.render
         # Also at the end of the process, where OpenGL would be gone before the renderer.
-        self.close = weakref.finalize(self, self._renderer.close)
-        names = [self._model.camera(i).name for i in range(self._model.ncam)]
-        self._camera = "overview" if "overview" in names else -1
-        # Another robot's MJCF may lack the marker of the target height.
-        self._target = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, "target_height")
+        self.close = weakref.finalize(self, renderer.close)
 
     def draw(self, state: BounceState) -> np.ndarray:
         """The picture [480, 640, 3], uint8, of one environment."""
-        self._data.qpos[:] = state.physics.qpos
-        if self._target >= 0:
-            self._model.site_pos[self._target, 2] = state.task.target_height
-        mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        return self._renderer.render()
+        return self._render(np.asarray(state.physics.qpos), float(state.task.target_height))
 
 
 def _key(generator: np.random.Generator) -> jax.Array:

@@ -10,7 +10,6 @@ import numpy as np
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.display import Display
-from bounce_mjx.viewers.simulation import Frame
 
 CAMERA = "overview"
 _TRAIL_RADIUS = 0.004
@@ -42,18 +41,22 @@ def choose_backend() -> str:
                 f"the environment variable MUJOCO_GL is {wanted!r}, but pictures are made with "
                 "egl, osmesa or glfw; set it to one of them or unset it"
             )
-        probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
-        if subprocess.run(probe, capture_output=True).returncode == 0:
+        if _works(backend):
             return backend
-    tried = f"MUJOCO_GL={wanted} does" if wanted else "neither EGL nor OSMesa does"
+    tried = f"MUJOCO_GL={wanted} does not work" if wanted else "neither EGL nor OSMesa works"
     raise UserError(
-        f"no picture can be made, as {tried} not work here; install an OpenGL library, on Debian "
+        f"no picture can be made, as {tried} here; install an OpenGL library, on Debian "
         "or Ubuntu with: apt-get install libegl1 libgl1-mesa-dri, or: apt-get install libosmesa6"
     )
 
 
+def _works(backend: str) -> bool:
+    probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
+    return subprocess.run(probe, capture_output=True).returncode == 0
+
+
 class Renderer:
-    """Renders the first environment of frames. A context manager, which frees the GPU's memory."""
+    """Renders one environment. A context manager, which frees the GPU's memory."""
 
     def __init__(self, env: BounceBall, width: int, height: int, backend: str):
         self._display = Display(env)
@@ -75,17 +78,25 @@ class Renderer:
         return self
 
     def __exit__(self, *_) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Frees the GPU's memory."""
         self._context.free()
         self._gl.free()
 
-    def render(self, frame: Frame, trail: np.ndarray) -> np.ndarray:
+    def render(
+        self, qpos: np.ndarray, target_height: float, trail: np.ndarray | None = None
+    ) -> np.ndarray:
         """A picture [height, width, 3] (uint8).
 
         Args:
-          frame: of environments [N, ...].
+          qpos: generalised positions [nq].
+          target_height: where the marker is, m.
           trail: positions of the ball [P, 3] that a line connects, the oldest first, m.
         """
-        self._display.pose(frame.qpos[0], frame.target_height[0])
+        self._display.pose(qpos, target_height)
+        self._gl.make_current()
         mujoco.mjv_updateScene(
             self._display.model,
             self._display.data,
@@ -95,7 +106,8 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
-        draw_trail(self._scene, trail)
+        if trail is not None:
+            draw_trail(self._scene, trail)
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         picture = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, self._viewport, self._context)

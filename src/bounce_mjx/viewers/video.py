@@ -102,7 +102,9 @@ class VideoWriter:
                 start = max(0, i - length)
                 resets = np.flatnonzero(np.diff(frames.time[start : i + 1, 0]) < 0.0)
                 start += resets[-1] + 1 if resets.size else 0
-                yield caption(renderer.render(frame, frames.ball[start : i + 1, 0]), frame)
+                trail = frames.ball[start : i + 1, 0]
+                picture = renderer.render(frame.qpos[0], frame.target_height[0], trail)
+                yield caption(picture, frame)
 
 
 def caption(picture: np.ndarray, frame: Frame) -> np.ndarray:
