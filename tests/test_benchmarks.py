@@ -62,6 +62,7 @@ def test_newest_run_counts_and_a_part_of_a_run_too(benchmark):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("torch_libraries")
 @pytest.mark.parametrize("methods", [("ours", "rsl_rl"), ("brax", "skrl"), ("skrl_jax",)])
 def test_trainers_are_compared(methods, tmp_path):
     """Each in a process of its own; one table, one plot, one line an evaluation."""
@@ -85,6 +86,7 @@ def test_trainers_are_compared(methods, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("torch_libraries")
 def test_adapter_is_measured(tmp_path):
     command = "adapter.py --num-envs 4 --steps 3 --rounds 2 --out".split()
     done = subprocess.run(

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import bounce_mjx
-from bounce_mjx import cli, config_reference
+from bounce_mjx import cli, config_reference, hosts
 from bounce_mjx import eval as eval_command
 from bounce_mjx import plot as plot_command
 from bounce_mjx import train as train_command
@@ -111,6 +111,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     for module in [m for n, m in sys.modules.items() if n.startswith("bounce_mjx")]:
         if getattr(module, "parse", None) is real:
             monkeypatch.setattr(module, "parse", parse)
+    monkeypatch.setattr(hosts, "join", lambda *_: None)
     monkeypatch.setattr(sys, "argv", [name, *args])
     monkeypatch.syspath_prepend(str(path.parent))
     monkeypatch.chdir(CHECKOUT)

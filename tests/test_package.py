@@ -138,8 +138,11 @@ README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     ],
     ids=["jax", "torch", "gymnasium", "brax"],
 )
-def test_readme_example_runs(number, printed, capsys):
+def test_readme_example_runs(number, printed, request, capsys):
     """The examples for each kind of user, as they stand."""
+    needs = {1: "torch_libraries", 2: "opengl"}
+    if number in needs:
+        request.getfixturevalue(needs[number])
     example = README.split("```python\n")[1 + number].split("```")[0]
     exec(compile(example, "README.md", "exec"), {})
     assert capsys.readouterr().out.startswith(printed)

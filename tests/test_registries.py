@@ -22,14 +22,14 @@ EPISODE_STEPS = 8
 
 
 @pytest.fixture(scope="module")
-def single():
+def single(opengl):
     env = gymnasium.make(ENV_ID, render_mode="rgb_array", episode_seconds=0.01 * EPISODE_STEPS)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
-def vectorised():
+def vectorised(opengl):
     env = gymnasium.make_vec(
         ENV_ID, num_envs=3, render_mode="rgb_array", episode_seconds=0.01 * EPISODE_STEPS
     )

@@ -41,7 +41,7 @@ def choose_backend() -> str:
                 f"the environment variable MUJOCO_GL is {wanted!r}, but pictures are made with "
                 "egl, osmesa or glfw; set it to one of them or unset it"
             )
-        if _works(backend):
+        if works(backend):
             return backend
     tried = f"MUJOCO_GL={wanted} does not work" if wanted else "neither EGL nor OSMesa works"
     raise UserError(
@@ -50,7 +50,8 @@ def choose_backend() -> str:
     )
 
 
-def _works(backend: str) -> bool:
+def works(backend: str) -> bool:
+    """Whether an OpenGL library can draw here; tried in a process of its own."""
     probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
     return subprocess.run(probe, capture_output=True).returncode == 0
 
