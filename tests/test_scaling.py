@@ -17,10 +17,18 @@ import pytest
 
 from bounce_mjx import devices, hosts, ppo, training
 from bounce_mjx import eval as eval_command
+from bounce_mjx import plot as plot_command
 from bounce_mjx import train as train_command
 from bounce_mjx.config import PPOConfig
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs import best_checkpoint, find_checkpoint, latest_checkpoint, load_run_config
+from bounce_mjx.learning_curves import group_runs
+from bounce_mjx.runs import (
+    best_checkpoint,
+    find_checkpoint,
+    latest_checkpoint,
+    load_run_config,
+    runs_of_seeds,
+)
 from tiny_runs import STEPS, TINY, arrays, job
 
 # As many environments as eight devices can share.
@@ -132,6 +140,15 @@ def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyP
     best = folders[scores.index(max(scores))]
     assert find_checkpoint(seeds, seeds.parent) == best_checkpoint(best)
     assert find_checkpoint(None, seeds.parent) == best_checkpoint(best)
+
+
+def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
+    plot_command.main([str(seeds), "--out", str(tmp_path), "--formats", "svg"])
+    drawn = [str(tmp_path / name) for name in ("curves.svg", "rewards.svg")]
+    assert capsys.readouterr().out.split() == drawn
+    (group,) = group_runs(runs_of_seeds(seeds))
+    assert len(group.runs) == SEEDS
+    assert len({tuple(run.curves["loss/value"].values) for run in group.runs}) == SEEDS
 
 
 def test_a_seed_is_evaluated(seeds: Path, tmp_path: Path):

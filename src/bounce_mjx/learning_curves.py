@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs import load_results, load_run_config
 
 # What may differ in a group: the seed, where the run lies, and when it ended.
-_FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved"))
+_FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
 # Settings that a label names.
 _MAX_NAMED = 3
 

@@ -15,15 +15,16 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.learning_curves import group_runs
 from bounce_mjx.report import record_checkpoint
-from bounce_mjx.runs import find_checkpoint, load_run_config
+from bounce_mjx.runs import find_checkpoint, load_run_config, newest_run, runs_of_seeds
 
 
 class PlotCommand(StrictModel):
     """The command line."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs; those that differ only in the seed become one curve with a band. Left out:
-    the newest run. Of one run, or one checkpoint in it, the evaluation is drawn too."""
+    """Folders of runs; those that differ only in the seed become one curve with a band, as do the
+    seeds of one run. Left out: the newest run. Of one seed, or one checkpoint in it, the evaluation
+    is drawn too."""
     out: Path = Path("plots")
     """Folder for the pictures: curves, rewards and, of one run, evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
@@ -41,7 +42,9 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="python -m bounce_mjx.plot",
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
-        checkpoints = [find_checkpoint(run, command.log_dir) for run in command.runs or (None,)]
+        runs = command.runs or (newest_run(command.log_dir),)
+        seeds = [seed for run in runs for seed in runs_of_seeds(run)]
+        checkpoints = [find_checkpoint(seed, command.log_dir) for seed in seeds]
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:

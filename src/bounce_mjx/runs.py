@@ -146,9 +146,14 @@ def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
     return [run / f"{_SEED}{seed:03d}" for seed in seeds]
 
 
+def runs_of_seeds(run: Path) -> list[Path]:
+    """The folders of a run's seeds that there are; the run itself if it has one seed."""
+    return sorted(run.glob(f"{_SEED}*")) or [run]
+
+
 def _best_seed(run: Path) -> Path:
     """The folder of a run's best seed; the run itself if it has one seed."""
-    seeds = [(folder, load_results(folder)) for folder in sorted(run.glob(f"{_SEED}*"))]
+    seeds = [(folder, load_results(folder)) for folder in runs_of_seeds(run) if folder != run]
     scores = {folder: Report.from_dict(r).score for folder, r in seeds if r is not None}
     return max(scores, key=scores.get) if scores else run
 
