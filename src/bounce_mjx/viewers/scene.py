@@ -142,7 +142,7 @@ class Scene:
 
     def _look(self) -> None:
         """Turns the camera of every page to the environments."""
-        extent = 1.0 + 0.9 * np.linalg.norm(np.ptp(self._offsets, axis=0))
+        extent = 1.0 + 1.25 * np.linalg.norm(np.ptp(self._offsets, axis=0))
         position = _LOOK_AT + extent * _VIEW
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(position), tuple(_LOOK_AT)
