@@ -13,7 +13,7 @@ from bounce_mjx.devices import replicated, state_sharding
 from bounce_mjx.env import BounceBall
 from bounce_mjx.evaluation import Report, judge, make_evaluator, make_recording_evaluator
 from bounce_mjx.policy import make_networks
-from bounce_mjx.ppo import TrainingState, make_trainer, policy_of, population
+from bounce_mjx.ppo import Trainer, TrainingState, policy_of
 from bounce_mjx.recording import RECORDED_EPISODES
 
 Metrics = dict[str, np.ndarray]
@@ -42,17 +42,18 @@ def initial_key(config: TrainConfig) -> np.ndarray:
 
 
 def compile_programs(
-    config: TrainConfig, env: BounceBall, mesh: Mesh, pool: concurrent.futures.Executor
+    config: TrainConfig,
+    env: BounceBall,
+    trainer: Trainer,
+    mesh: Mesh,
+    pool: concurrent.futures.Executor,
 ) -> Programs:
     """Compiles the programs side by side, as each takes seconds; returns once the training can
     start.
 
-    Raises:
-      UserError: the trainer does not suit the environment.
+    Args:
+      trainer: of one seed, or of the population of several.
     """
-    trainer = make_trainer(config.ppo, env, config.env.episode_steps)
-    if config.num_seeds > 1:
-        trainer = population(trainer)
     key = initial_key(config)
     shapes = jax.eval_shape(trainer.init, key)
     sharding, everywhere = state_sharding(mesh, shapes, config.num_seeds), replicated(mesh)

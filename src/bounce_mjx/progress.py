@@ -50,6 +50,22 @@ class Progress:
             "evaluations": self.evaluations,
         }
 
+    def results(
+        self, trained_steps: int, seconds: dict[str, float], device: str
+    ) -> dict[str, Any] | None:
+        """A run's results, plain data; None before any evaluation."""
+        if self.best is None:
+            return None
+        return {
+            "best_steps": self.best_steps,
+            "solved_steps": self.solved_steps,
+            "trained_steps": trained_steps,
+            "seconds": seconds,
+            "device": device,
+            **self.best.to_dict(),
+            "evaluations": self.evaluations,
+        }
+
     def has(self, steps: int) -> bool:
         """Whether the state after so many steps was evaluated."""
         return any(evaluation["steps"] == steps for evaluation in self.evaluations)

@@ -23,7 +23,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import Report
 from bounce_mjx.ppo import (
     CHECKED,
-    Trainer,
     TrainingState,
     make_trainer,
     policy_of,
@@ -141,6 +140,7 @@ class _Job:
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         # What is wrong with the config must be said before a folder is made.
         trainer = make_trainer(config.ppo, self.env, config.env.episode_steps)
+        self.trainer = trainer if config.num_seeds == 1 else population(trainer)
         self.block_steps = num_iterations(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: TrainingState | None = None
@@ -148,7 +148,7 @@ class _Job:
         if resume is None:
             self._create()
         else:
-            self._resume(resume, trainer if config.num_seeds == 1 else population(trainer))
+            self._resume(resume)
         self.go_on = f"go on with: python train_jax.py --resume {shlex.quote(str(self.run))}"
         self.device = self.mesh.devices.flat[0].device_kind
         if self.mesh.size > 1:
@@ -177,9 +177,9 @@ class _Job:
         alone = [self.config.model_copy(update={"seed": s, "num_seeds": 1}) for s in seeds]
         return list(zip(seed_folders(self.run, seeds), alone, strict=True))
 
-    def _resume(self, path: Path, trainer: Trainer) -> None:
+    def _resume(self, path: Path) -> None:
         self.run = find_run(path)
-        shapes = jax.eval_shape(trainer.init, initial_key(self.config))
+        shapes = jax.eval_shape(self.trainer.init, initial_key(self.config))
         latest = latest_checkpoint(self.run)
         state, plain = load_training_state(latest, shapes)
         self.state = hosts.distribute(
@@ -202,7 +202,7 @@ class _Job:
             if report:
                 opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
             compiling = self.pool.submit(
-                compile_programs, self.config, self.env, self.mesh, self.pool
+                compile_programs, self.config, self.env, self.trainer, self.mesh, self.pool
             )
             if not self.stop.wait_for(compiling):
                 if self.resumed:
@@ -372,7 +372,10 @@ class _Job:
         state = hosts.gather(self.state)
         if not hosts.is_leader():
             return
-        results = [self._results(member) for member in self.members]
+        results = [
+            member.progress.results(self.steps, self.clock.seconds, self.device)
+            for member in self.members
+        ]
         plain = [member.progress.to_dict() for member in self.members]
         if self.config.num_seeds == 1:
             names = ("latest", "best") if best else ("latest",)
@@ -385,20 +388,6 @@ class _Job:
                 one = jax.tree.map(lambda x, i=i: x[i], state)
                 writer.save(names, self.steps, policy_of(one), one, plain[i], results[i])
         self.clock.lap("save")
-
-    def _results(self, member: _Member) -> dict[str, Any] | None:
-        progress = member.progress
-        if progress.best is None:
-            return None
-        return {
-            "best_steps": progress.best_steps,
-            "solved_steps": progress.solved_steps,
-            "trained_steps": self.steps,
-            "seconds": self.clock.seconds,
-            "device": self.device,
-            **progress.best.to_dict(),
-            "evaluations": progress.evaluations,
-        }
 
 
 def _wait_until_saved(

@@ -238,15 +238,18 @@ def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
     )
 
 
+def _model_arguments(env: SkrlEnv) -> dict[str, Any]:
+    return {
+        "observation_space": env.observation_space,
+        "state_space": env.state_space,
+        "action_space": env.action_space,
+        "device": env.device,
+    }
+
+
 class _Actor(GaussianMixin, Model):
     def __init__(self, config: PPOConfig, env: SkrlEnv):
-        Model.__init__(
-            self,
-            observation_space=env.observation_space,
-            state_space=env.state_space,
-            action_space=env.action_space,
-            device=env.device,
-        )
+        Model.__init__(self, **_model_arguments(env))
         GaussianMixin.__init__(self)
         self.mlp = make_mlp(config, self.num_observations, self.num_actions)
         init_weights(self.mlp, output_gain=0.01)
@@ -262,13 +265,7 @@ class _Actor(GaussianMixin, Model):
 
 class _Critic(DeterministicMixin, Model):
     def __init__(self, config: PPOConfig, env: SkrlEnv):
-        Model.__init__(
-            self,
-            observation_space=env.observation_space,
-            state_space=env.state_space,
-            action_space=env.action_space,
-            device=env.device,
-        )
+        Model.__init__(self, **_model_arguments(env))
         DeterministicMixin.__init__(self)
         self.mlp = make_mlp(config, self.num_states, 1)
         init_weights(self.mlp, output_gain=2**0.5)

@@ -139,13 +139,7 @@ def train(command: TorchTrainCommand, console: Console) -> Outcome:
                 names = ["latest", *(["best"] if progress.improves(report, steps) else [])]
                 results = {
                     "library": command.library,
-                    "best_steps": progress.best_steps,
-                    "solved_steps": progress.solved_steps,
-                    "trained_steps": steps,
-                    "seconds": clock.seconds,
-                    "device": device,
-                    **progress.best.to_dict(),
-                    "evaluations": progress.evaluations,
+                    **progress.results(steps, clock.seconds, device),
                 }
                 writer.save(names, steps, policy, None, progress.to_dict(), results)
                 reporter.saving_problem(writer.problem(wait=False))
