@@ -118,7 +118,7 @@ def train(command: TorchTrainCommand, console: Console) -> Outcome:
         stop = stack.enter_context(StopRequest())
         writer = CheckpointWriter(run, config)
         stack.callback(writer.close)
-        reporter = stack.enter_context(Reporter([open_log(run)], console, config, 0))
+        reporter = stack.enter_context(Reporter([open_log(run, config=config)], console, config, 0))
         clock.lap("setup")
         steps, over = 0, False
         while not over:
