@@ -25,8 +25,9 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import jax
 import tyro
@@ -38,7 +39,7 @@ from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation import judge, make_evaluator
+from bounce_mjx.evaluation import Statistics, judge, make_evaluator
 from bounce_mjx.policy import Policy, init_normalizer, make_networks
 from bounce_mjx.train import path_flag, read_preset
 
@@ -146,59 +147,71 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
 
 def train_here(command: Command) -> None:
     """Trains in this process, and writes each evaluation as it ends."""
-    started = float(os.environ.get(_STARTED) or time.time())
     (method,) = command.methods
     config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
-    env = BounceBall(config.env)
-    networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    key = jax.random.PRNGKey(config.eval_seed)
-    evaluator = _Background(
-        lambda: (
-            make_evaluator(env, networks, config.eval_episodes)
-            .lower(jax.eval_shape(lambda: _empty_policy(env, networks)), key)
-            .compile()
-        )
-    )
-    device = device_name()
-    run = f"{method}-{config.seed}-{started:.3f}"
     with (command.out / _RECORDS).open("a", encoding="utf-8") as file:
+        TRAINERS[method](config, _Judge(command, config, method, file))
 
-        def on_block(steps: int, seconds: float, policy: Policy) -> bool:
-            policy = jax.tree.map(
-                lambda x, like: jax.numpy.asarray(x, like.dtype),
-                policy,
-                jax.eval_shape(lambda: _empty_policy(env, networks)),
-            )
-            report = judge(env, evaluator.result()(policy, key))
-            record = {
-                "run": run,
-                "method": method,
-                "seed": config.seed,
-                "device": device,
-                "num_envs": config.ppo.num_envs,
-                "total_steps": config.total_steps,
-                "steps": steps,
-                "block_seconds": seconds,
-                "process_seconds": time.time() - started,
-                "passed": report.passed,
-                "return": report.details["mean_return"],
-                "results": {result.name: result.value for result in report.results},
-            }
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            print(
-                f"{method}, seed {config.seed}: {steps:,} steps, "
-                f"{record['process_seconds']:.1f} s from the start, return "
-                f"{record['return']:.0f}, {'passed' if report.passed else 'not passed'}",
-                flush=True,
-            )
-            return (
-                steps >= config.total_steps
-                or record["process_seconds"] > command.max_seconds
-                or (report.passed and command.stop_at_solved)
-            )
 
-        TRAINERS[method](config, on_block)
+class _Judge:
+    """Evaluates the policy after every block, and writes what it came to; an `OnBlock`."""
+
+    def __init__(self, command: Command, config: TrainConfig, method: Method, file: TextIO):
+        self._command, self._config, self._method, self._file = command, config, method, file
+        self._started = float(os.environ.get(_STARTED) or time.time())
+        self._env = BounceBall(config.env)
+        self._networks = make_networks(
+            config.ppo, self._env.observation_size, self._env.action_size
+        )
+        self._key = jax.random.PRNGKey(config.eval_seed)
+        self._device = device_name()
+
+    def prepare(self) -> None:
+        """Starts to compile the evaluation."""
+        self._policy = jax.eval_shape(self._empty_policy)
+        self._evaluator = _Background(self._compile)
+
+    def _empty_policy(self) -> Policy:
+        params = self._networks.policy_network.init(jax.random.PRNGKey(0))
+        return Policy(init_normalizer(self._env.observation_size), params)
+
+    def _compile(self) -> Callable[[Policy, jax.Array], Statistics]:
+        evaluate = make_evaluator(self._env, self._networks, self._config.eval_episodes)
+        return evaluate.lower(self._policy, self._key).compile()
+
+    def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
+        config, method = self._config, self._method
+        policy = jax.tree.map(
+            lambda x, like: jax.numpy.asarray(x, like.dtype), policy, self._policy
+        )
+        report = judge(self._env, self._evaluator.result()(policy, self._key))
+        process_seconds = time.time() - self._started
+        record = {
+            "run": f"{method}-{config.seed}-{self._started:.3f}",
+            "method": method,
+            "seed": config.seed,
+            "device": self._device,
+            "num_envs": config.ppo.num_envs,
+            "total_steps": config.total_steps,
+            "steps": steps,
+            "block_seconds": seconds,
+            "process_seconds": process_seconds,
+            "passed": report.passed,
+            "return": report.details["mean_return"],
+            "results": {result.name: result.value for result in report.results},
+        }
+        self._file.write(json.dumps(record) + "\n")
+        self._file.flush()
+        print(
+            f"{method}, seed {config.seed}: {steps:,} steps, {process_seconds:.1f} s from the "
+            f"start, return {record['return']:.0f}, {'passed' if report.passed else 'not passed'}",
+            flush=True,
+        )
+        return (
+            steps >= config.total_steps
+            or process_seconds > self._command.max_seconds
+            or (report.passed and self._command.stop_at_solved)
+        )
 
 
 def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]:
@@ -328,11 +341,6 @@ class _Background:
     def result(self):
         self._thread.join()
         return self._value
-
-
-def _empty_policy(env: BounceBall, networks) -> Policy:
-    params = networks.policy_network.init(jax.random.PRNGKey(0))
-    return Policy(init_normalizer(env.observation_size), params)
 
 
 def _mean(values: list[float | None]) -> float:

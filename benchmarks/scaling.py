@@ -4,7 +4,7 @@
 
 Seeds: the time of one block of training with S seeds in one program, against that with one.
 Devices: environment steps per second on D devices with `--num-envs` environments on each, against
-one device. The compiled block alone is timed, and the fastest of the repeats counts, as other work
+one device. The hyperparameters are the preset's. The compiled block alone is timed, and the fastest of the repeats counts, as other work
 on the machine only ever slows one down.
 """
 
@@ -20,9 +20,10 @@ from tables import device_name, markdown_table, write
 from bounce_mjx import BounceBall
 from bounce_mjx.cli import parse
 from bounce_mjx.config import PPOConfig, StrictModel
-from bounce_mjx.devices import make_mesh, replicated, state_sharding
+from bounce_mjx.devices import compiler_options, make_mesh, replicated, state_sharding
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.ppo import make_trainer, population
+from bounce_mjx.train import read_preset
 
 Counts = tuple[Annotated[int, Field(ge=1)], ...]
 
@@ -46,7 +47,8 @@ class Command(StrictModel):
 
 def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
     """The time of one block of training."""
-    config = PPOConfig(num_envs=command.num_envs * num_devices)
+    preset = dict(read_preset(None).ppo)
+    config = PPOConfig(**preset | {"num_envs": command.num_envs * num_devices})
     mesh = make_mesh(num_devices, config, num_seeds)
     env = BounceBall()
     trainer = make_trainer(config, env, env.config.episode_steps)
@@ -61,6 +63,7 @@ def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
         in_shardings=(sharding,),
         out_shardings=(sharding, replicated(mesh) if num_seeds == 1 else None),
         donate_argnums=0,
+        compiler_options=compiler_options(),
     )
     state, metrics = jax.block_until_ready(run(state))
     compile_seconds = time.perf_counter() - started

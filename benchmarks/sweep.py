@@ -26,7 +26,7 @@ from bounce_mjx.evaluation import Report, judge, make_evaluator
 from bounce_mjx.policy import make_networks
 from bounce_mjx.ppo import make_trainer, policy_of, population
 from bounce_mjx.resources import resource_path
-from bounce_mjx.train import enable_compilation_cache
+from bounce_mjx.train import set_up_jax
 
 try:
     import optuna
@@ -173,7 +173,7 @@ def main() -> None:
                 "benchmarks/sweep.py needs optuna, which is not installed; run "
                 "pip install 'bounce_mjx[sweep]'"
             )
-        enable_compilation_cache()
+        set_up_jax()
         preset = "cpu" if jax.default_backend() == "cpu" else "default"
         base = load_config(command.config or resource_path(f"configs/{preset}.yaml"))
         study = search(command, base)

@@ -20,21 +20,30 @@ import concurrent.futures
 import functools
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, Protocol
 
-import brax.training.agents.ppo.train as brax_ppo
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 
 from bounce_mjx.brax_interop import device_put_replicated
 from bounce_mjx.config import TrainConfig
+from bounce_mjx.devices import compiler_options
 from bounce_mjx.env import BounceBall
 from bounce_mjx.policy import MIN_VARIANCE, Policy, init_normalizer, make_networks, normalize
 from bounce_mjx.ppo import make_trainer, policy_of
 
 Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]
-OnBlock = Callable[[int, float, Policy], bool]
+
+
+class OnBlock(Protocol):
+    """What a trainer calls."""
+
+    def prepare(self) -> None:
+        """Called once, when no work of Python's delays the trainer's own compilation."""
+
+    def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
+        """Called after every block; whether it is enough."""
 
 
 def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
@@ -43,11 +52,15 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     trainer = make_trainer(config.ppo, env, config.env.episode_steps)
     iterations = block_iterations(config)
     key = jax.random.PRNGKey(config.seed)
-    init, run = jax.jit(trainer.init), jax.jit(trainer.run, static_argnums=1, donate_argnums=0)
+    init = jax.jit(trainer.init)
+    run = jax.jit(
+        trainer.run, static_argnums=1, donate_argnums=0, compiler_options=compiler_options()
+    )
     with concurrent.futures.ThreadPoolExecutor() as pool:
         shapes = jax.eval_shape(init, key)
-        compiled_run = pool.submit(lambda: run.lower(shapes, iterations).compile())
-        compiled_init = pool.submit(lambda: init.lower(key).compile())
+        compiled_run = pool.submit(run.lower(shapes, iterations).compile)
+        compiled_init = pool.submit(init.lower(key).compile)
+        on_block.prepare()
         state = jax.block_until_ready(compiled_init.result()(key))
         run_block = compiled_run.result()
     steps, enough = 0, False
@@ -77,6 +90,7 @@ def train_skrl_jax(config: TrainConfig, on_block: OnBlock) -> None:
 
 
 def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
+    on_block.prepare()
     iterations = block_iterations(config)
     steps, enough = 0, False
     while not enough:
@@ -115,11 +129,14 @@ class CriticObservation(Wrapper):
 
 def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBlock) -> None:
     """brax's PPO with its own wrappers."""
+    import brax.training.agents.ppo.train as brax_ppo
+
     ppo = config.ppo
     env = BounceBall(config.env.model_copy(update={"physics": physics}))
     steps_per_epoch = block_iterations(config) * ppo.batch_steps
     epochs = -(-config.total_steps // steps_per_epoch)
     started = time.perf_counter()
+    on_block.prepare()
 
     def on_params(steps: int, _, params) -> None:
         nonlocal started

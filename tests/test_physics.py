@@ -13,7 +13,7 @@ import pytest
 from bounce_mjx.config import EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.model import Addresses, find_addresses, load_model
-from bounce_mjx.physics import PhysicsState, chain, fused, make_engine, mjx_engine
+from bounce_mjx.physics import PhysicsState, chain, fused, make_engine, mjx_engine, scalars
 from bounce_mjx.resources import resource_path
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
@@ -582,7 +582,8 @@ def test_the_home_pose_holds_the_paddle_level(mj_model):
     model = fused.read_model(mj_model)
     position = fused.paddle_position(model, jnp.concatenate([HOME, jnp.zeros(7)]))
     np.testing.assert_allclose(position, [0.59356, 0.0, 0.04980], atol=1e-4)
-    last = np.array(chain.forward_kinematics(model.links, HOME).world_rotation[-1])
+    pose = chain.forward_kinematics(model.links, jnp.asarray(HOME))
+    last = np.array(pose.world_rotation[-1])
     normal = (last @ np.array(model.paddle_rotation))[:, 2]
     np.testing.assert_allclose(np.abs(normal), [0.0, 0.0, 1.0], atol=1e-4)
 
@@ -647,6 +648,15 @@ def test_point_jacobian_is_mujocos(mj_model, arm):
         mujoco.mj_jac(mj_model, d, jacobian, None, point[i], body)
         expected = direction[i] @ jacobian[:, :6]
         np.testing.assert_allclose([entry[i] for entry in row], expected, rtol=1e-10, atol=1e-12)
+
+
+def test_sine_and_cosine_are_numpys():
+    """In float32, of every angle that an arm comes to and far beyond."""
+    angle = np.linspace(-1000.0, 1000.0, 1_000_001, dtype=np.float32)
+    sine, cosine = jax.jit(scalars.sine_cosine)(angle)
+    # Two units in the last place of a number just below 1.
+    np.testing.assert_allclose(sine, np.sin(angle.astype(float)), rtol=0, atol=1.2e-7)
+    np.testing.assert_allclose(cosine, np.cos(angle.astype(float)), rtol=0, atol=1.2e-7)
 
 
 @pytest.mark.usefixtures("float64")

@@ -360,6 +360,45 @@ def test_run_returns_the_types_that_it_takes(trainer, init):
     assert types[0] == types[1]
 
 
+def test_bfloat16_computes_the_hidden_layers_alone(tiny, env, init):
+    """The state stays float32, and the update goes the way that it goes in float32."""
+    config = tiny.model_copy(update={"compute_dtype": "bfloat16"})
+    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    before = init(jax.random.PRNGKey(0))
+    run = jax.jit(trainer.run, static_argnums=1)
+    program = str(jax.make_jaxpr(trainer.run, static_argnums=1)(before, 1))
+    assert "bf16" in program
+    after, metrics = run(before, 1)
+    assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, before)
+
+    reference, reference_metrics = jax.jit(
+        ppo.make_trainer(tiny, env, env.config.episode_steps).run, static_argnums=1
+    )(before, 1)
+    step, reference_step = (
+        np.concatenate([(x - y).ravel() for x, y in zip(*map(jax.tree.leaves, pair), strict=True)])
+        for pair in ((after.params, before.params), (reference.params, before.params))
+    )
+    cosine = step @ reference_step / np.linalg.norm(step) / np.linalg.norm(reference_step)
+    assert 0.9 < cosine < 1.0 - 1e-6
+    # Adam's first steps have the size of the learning rate, whichever the type.
+    np.testing.assert_allclose(metrics["loss/value"], reference_metrics["loss/value"], rtol=0.05)
+
+
+def test_hidden_layers_are_cast_and_outputs_not(tiny, env):
+    networks = policy.make_networks(tiny, env.observation_size, env.action_size)
+    for network, output in (
+        (networks.policy_network, "Dense_0"),
+        (networks.value_network, "hidden_1"),
+    ):
+        params = network.init(jax.random.PRNGKey(0))
+        cast = policy.cast_hidden_layers(tiny, params, jnp.bfloat16)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(cast):
+            name = jax.tree_util.keystr(path)
+            hidden = "hidden_0" in name
+            assert leaf.dtype == (jnp.bfloat16 if hidden else jnp.float32), name
+        assert output in str(jax.tree_util.tree_structure(cast))
+
+
 def test_vmap_over_seeds_equals_single_runs(trainer, init, run_two, after_two):
     keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
     many_states = jax.jit(jax.vmap(trainer.init))(keys)

@@ -50,9 +50,11 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     compile_programs, kept = training_job.compile_programs, {}
 
     def compile_once(config, *args):
+        *args, beside = args
         key = config.model_copy(update={"total_steps": 0, "eval_every": 0, "log_dir": None})
         if repr(key) not in kept:
             kept[repr(key)] = compile_programs(config, *args)
+        beside()
         return kept[repr(key)]
 
     with pytest.MonkeyPatch.context() as patch:

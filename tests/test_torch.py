@@ -1,7 +1,9 @@
 """The environment for PyTorch: shared memory, the same steps, and its libraries' own interfaces."""
 
+import itertools
 import subprocess
 import sys
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ from bounce_mjx.policy import act, make_networks
 from bounce_mjx.torch import TorchVectorEnv
 from bounce_mjx.torch.gymnasium import TorchGymnasiumVectorEnv
 from bounce_mjx.torch.networks import Normalizer, init_weights, linears_of, make_mlp, to_policy
+from bounce_mjx.torch.packing import Layout
 from bounce_mjx.torch.rsl_rl import RslRlVecEnv, algorithm_config
 from bounce_mjx.torch.skrl import SkrlEnv
 from bounce_mjx.torch.train import make_learner, summarize
@@ -57,6 +60,19 @@ def learners(task):
     return {library: (learner, learner.learn(2)) for library, learner in made.items()}
 
 
+STEP_FIELDS = (
+    "observation",
+    "critic_metrics",
+    "final_observation",
+    "final_critic_metrics",
+    "reward",
+    "terminated",
+    "truncated",
+    "done",
+    "metrics",
+)
+
+
 def random_actions(steps: int) -> torch.Tensor:
     """Some beyond the limits [steps, B, 6]."""
     return 1.5 * torch.randn(steps, NUM_ENVS, 6, generator=torch.Generator().manual_seed(0))
@@ -68,10 +84,47 @@ def random_actions(steps: int) -> torch.Tensor:
 def test_observation_is_the_memory_of_jax(env):
     env.reset()
     result = env.step(torch.zeros(NUM_ENVS, 6))
-    names = [name for name in result._arrays._fields if name != "critic_metrics"]
-    for name in names:
-        array = getattr(result._arrays, name)
-        assert getattr(result, name).data_ptr() == array.unsafe_buffer_pointer(), name
+    block, taken = result._array.unsafe_buffer_pointer(), []
+    for name in STEP_FIELDS:
+        tensor = getattr(result, name)
+        at = tensor.data_ptr() - block
+        assert at == result._layout.offset(name), name
+        taken.append((at, at + tensor.numel() * tensor.element_size()))
+    # One after the other, and none outside the block.
+    assert taken == sorted(taken) and taken[0][0] == 0
+    assert all(before[1] <= after[0] for before, after in itertools.pairwise(taken))
+    assert taken[-1][1] <= result._array.nbytes
+
+
+def test_a_block_gives_back_what_was_packed():
+    """Of every type, and of bools whose number is no multiple of a word's bytes."""
+
+    class Arrays(NamedTuple):
+        floats: jax.Array
+        flags: jax.Array
+        counts: jax.Array
+        none: jax.Array
+        last: jax.Array
+
+    rng = np.random.default_rng(0)
+    arrays = Arrays(
+        jnp.asarray(rng.normal(size=(3, 5)), jnp.float32).at[0, 0].set(jnp.nan),
+        jnp.asarray(rng.random((2, 3)) < 0.5),
+        jnp.asarray([-1, 2**31 - 1], jnp.int32),
+        jnp.zeros((4, 0)),
+        jnp.asarray([1e-42, -0.0, jnp.inf], jnp.float32),
+    )
+    layout = Layout(jax.eval_shape(lambda: arrays))
+    block = jax.jit(layout.pack)(arrays)
+    assert block.nbytes == 4 * (15 + 2 + 2 + 0 + 3)
+    for array, back in zip(arrays, layout.unpack(block), strict=True):
+        assert back.dtype == array.dtype
+        np.testing.assert_array_equal(back, array)
+    shared = torch.from_dlpack(block)
+    for name in Arrays._fields:
+        view = layout.view(shared, name)
+        assert view.data_ptr() == shared.data_ptr() + layout.offset(name) or view.numel() == 0
+        np.testing.assert_array_equal(view.numpy(), getattr(arrays, name))
 
 
 def test_action_reaches_jax_without_a_copy(env, monkeypatch):
@@ -79,9 +132,9 @@ def test_action_reaches_jax_without_a_copy(env, monkeypatch):
     env.reset()
     step = env._jit_step
 
-    def spy(carried, action):
+    def spy(block, action):
         seen.append(action.unsafe_buffer_pointer())
-        return step(carried, action)
+        return step(block, action)
 
     monkeypatch.setattr(env, "_jit_step", spy)
     # PyTorch aligns a tensor as JAX needs it where it is not a part of another.

@@ -22,7 +22,7 @@ from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
 from bounce_mjx.policy import Policy, make_networks
 from bounce_mjx.reporting import details_line, results_table
 from bounce_mjx.runs import load_policy, load_run_config
-from bounce_mjx.train import enable_compilation_cache
+from bounce_mjx.train import set_up_jax
 
 
 class EvalCommand(StrictModel):
@@ -57,7 +57,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
-        enable_compilation_cache()
+        set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)

@@ -17,7 +17,7 @@ from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.policy import make_networks
 from bounce_mjx.runs import load_policy, load_run_config
-from bounce_mjx.train import enable_compilation_cache
+from bounce_mjx.train import set_up_jax
 from bounce_mjx.viewers.command import ViewerOptions, show
 from bounce_mjx.viewers.controllers import make_policy_controller
 
@@ -47,7 +47,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows a trained policy.",
         )
         console = Console()
-        enable_compilation_cache()
+        set_up_jax()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         console.print(f"checkpoint: {checkpoint.folder}", highlight=False, soft_wrap=True)

@@ -58,6 +58,20 @@ def make_networks(
     )
 
 
+def cast_hidden_layers(config: PPOConfig, params: Any, dtype: jax.numpy.dtype) -> Any:
+    """Parameters of one network of `make_networks` with its hidden layers in another type.
+
+    The output layer and the noise keep theirs, so the outputs stay as precise: flax computes a
+    layer in the wider of the types of its parameters and its input.
+    """
+    hidden = {f"hidden_{i}" for i in range(len(config.hidden_layers))}
+
+    def cast(path: tuple, x: jax.Array) -> jax.Array:
+        return x.astype(dtype) if any(getattr(k, "key", None) in hidden for k in path) else x
+
+    return jax.tree_util.tree_map_with_path(cast, params)
+
+
 def init_normalizer(observation_size: int) -> running_statistics.RunningStatisticsState:
     """Running statistics of observations [observation_size], before any were seen."""
     template = jax.ShapeDtypeStruct((observation_size,), jax.numpy.float32)

@@ -6,6 +6,8 @@ Sources: Schulman et al., Proximal Policy Optimization Algorithms (2017); Schulm
 High-Dimensional Continuous Control Using Generalized Advantage Estimation (2016).
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,15 +16,25 @@ import jax.numpy as jnp
 import optax
 from brax.envs.base import Env
 from brax.training.acme import running_statistics
+from jax.flatten_util import ravel_pytree
 
 from bounce_mjx import vector
 from bounce_mjx.config import PPOConfig
 from bounce_mjx.env import OBSERVATION_SIZE
 from bounce_mjx.errors import UserError
-from bounce_mjx.policy import Policy, init_normalizer, make_networks, normalize
+from bounce_mjx.policy import (
+    Policy,
+    cast_hidden_layers,
+    init_normalizer,
+    make_networks,
+    normalize,
+)
 
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
+
+# Steps of the advantages' recursion that become one kernel on a GPU.
+_ADVANTAGE_UNROLL = 32
 
 # Environments are shuffled in so many groups, or in more of so many environments.
 _FEW_GROUPS, _GROUP_ENVS = 64, 64
@@ -91,7 +103,7 @@ class Samples(NamedTuple):
     """What the update learns from: G groups of N samples (`num_groups`)."""
 
     seen: jax.Array
-    """Normalised observation and critic metrics [G, N, 29 + K]."""
+    """Normalised observation and critic metrics [G, N, 29 + K], as the networks take them."""
     action: jax.Array
     """[G, N, 6]."""
     log_prob: jax.Array
@@ -100,6 +112,25 @@ class Samples(NamedTuple):
     """[G, N]."""
     value_target: jax.Array
     """[G, N]."""
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["columns"], meta_fields=["names"])
+@dataclasses.dataclass(frozen=True)
+class Packed:
+    """Metrics in one array, as on a GPU each small array of a loop costs a kernel."""
+
+    names: tuple[str, ...]
+    columns: jax.Array
+    """The metrics in the order of their names [..., M]."""
+
+    @classmethod
+    def of(cls, metrics: Metrics) -> "Packed":
+        """Packs metrics of one shape [...]."""
+        return cls(tuple(metrics), jnp.stack(list(metrics.values()), axis=-1))
+
+    def metrics(self) -> Metrics:
+        """The metrics, each [...]."""
+        return dict(zip(self.names, jnp.moveaxis(self.columns, -1, 0), strict=True))
 
 
 class Trainer(NamedTuple):
@@ -137,6 +168,19 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
     )
 
+    lowers = config.compute_dtype != "float32"
+
+    def lower(seen: jax.Array) -> jax.Array:
+        """Inputs of the networks in the type that the hidden layers are computed in."""
+        return seen.astype(config.compute_dtype) if lowers else seen
+
+    def lower_layers(params: Params) -> Params:
+        """Parameters with the hidden layers in that type."""
+        if not lowers:
+            return params
+        dtype = jnp.dtype(config.compute_dtype)
+        return Params(*(cast_hidden_layers(config, network, dtype) for network in params))
+
     def policy_apply(params: Params, seen: jax.Array):
         observation = seen[..., : env.observation_size]
         return networks.policy_network.apply(None, params.policy, observation)
@@ -161,7 +205,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         clock = jax.random.randint(clock_key, (config.num_envs,), 0, episode_steps)
         return TrainingState(
             params=params,
-            optimizer=optimizer.init(params),
+            optimizer=optimizer.init(ravel_pytree(params)[0]),
             normalizer=init_normalizer(env.observation_size + len(config.critic_metrics)),
             learning_rate=jnp.float32(config.learning_rate),
             env=env_state._replace(clock=clock),
@@ -172,14 +216,16 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
         """Runs the policy for T steps."""
 
-        def one_step(carry, step_key):
+        params = lower_layers(state.params)
+
+        def one_step(carry, inputs):
             env_state, at_timeout = carry
-            action_key, reset_key = jax.random.split(step_key)
+            action_key, fresh = inputs
             raw = see(vector.observe(env_state), env_state.env.metrics)
             seen = normalize(raw, state.normalizer)
-            logits = policy_apply(state.params, seen)
+            logits = policy_apply(params, lower(seen))
             action = distribution.sample_no_postprocessing(logits, action_key)
-            env_state, result = vector.step(env, env_state, action, reset_key, episode_steps)
+            env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
             at_timeout = jnp.where(
                 result.truncated[:, None],
                 see(result.final_observation, result.metrics),
@@ -193,13 +239,15 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
-            metrics = step_metrics(result, groups)
+            metrics = Packed.of(step_metrics(result, groups))
             return (env_state, at_timeout), (step_of_rollout, raw, metrics)
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
         first = see(vector.observe(state.env), state.env.env.metrics)
+        keys = jax.vmap(jax.random.split)(jax.random.split(key, config.rollout_length))
+        fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs))(keys[:, 1])
         (env_state, at_timeout), (rollout, raw, metrics) = jax.lax.scan(
-            one_step, (state.env, first), jax.random.split(key, config.rollout_length)
+            one_step, (state.env, first), (keys[:, 0], fresh)
         )
         last = see(vector.observe(env_state), env_state.env.metrics)
         collection = Collection(
@@ -209,13 +257,14 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             last=normalize(last, state.normalizer),
             at_timeout=normalize(at_timeout, state.normalizer),
         )
-        return collection, rollout_metrics(metrics)
+        return collection, rollout_metrics(metrics.metrics())
 
     def prepare(params: Params, collection: Collection) -> Samples:
         """Values the rollout and turns it into samples."""
-        rollout = collection.rollout
-        values = value_apply(params, jnp.concatenate([rollout.seen, collection.last[None]]))
-        timeout_values = value_apply(params, collection.at_timeout)
+        rollout, params = collection.rollout, lower_layers(params)
+        seen = lower(jnp.concatenate([rollout.seen, collection.last[None]]))
+        values = value_apply(params, seen)
+        timeout_values = value_apply(params, lower(collection.at_timeout))
         advantage = generalized_advantages(
             rollout.reward,
             values[:-1],
@@ -226,7 +275,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             config.gae_lambda,
         )
         samples = Samples(
-            seen=rollout.seen,
+            seen=seen[:-1],
             action=rollout.action,
             log_prob=rollout.log_prob,
             advantage=advantage,
@@ -235,6 +284,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return jax.tree.map(lambda x: group(x, groups), samples)
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
+        params = lower_layers(params)
         logits = policy_apply(params, samples.seen)
         log_ratio = distribution.log_prob(logits, samples.action) - samples.log_prob
         ratio = jnp.exp(log_ratio)
@@ -261,19 +311,22 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
 
+        # Gradients and parameters as one array: one kernel clips and one makes a step of Adam.
+        flat_params, unravel = ravel_pytree(state.params)
+
         def minibatch(carry, chosen):
             params, optimizer_state, learning_rate = carry
             order, mean, deviation = chosen
             batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
             batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
-            gradient, metrics = jax.grad(loss, has_aux=True)(params, batch)
-            direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
-            params = optax.apply_updates(
-                params, jax.tree.map(lambda d: -learning_rate * d, direction)
+            gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
+                params
             )
+            direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+            params = params - learning_rate * direction
             learning_rate = adapt_learning_rate(config, learning_rate, metrics["policy/kl"], limit)
-            metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
-            return (params, optimizer_state, learning_rate), metrics
+            metrics["loss/gradient_norm"] = jnp.linalg.norm(gradient)
+            return (params, optimizer_state, learning_rate), Packed.of(metrics)
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
@@ -290,11 +343,14 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             )
             return jax.lax.scan(minibatch, carry, chosen)
 
-        carry = (state.params, state.optimizer, state.learning_rate)
-        carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.num_epochs))
+        carry = (flat_params, state.optimizer, state.learning_rate)
+        (flat_params, optimizer_state, learning_rate), packed = jax.lax.scan(
+            epoch, carry, jax.random.split(key, config.num_epochs)
+        )
+        metrics = packed.metrics()
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
-        return carry, means, metrics
+        return (unravel(flat_params), optimizer_state, learning_rate), means, metrics
 
     def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
@@ -390,7 +446,9 @@ def generalized_advantages(
         advantage = delta + carried * advantage
         return advantage, advantage
 
-    _, advantages = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True)
+    _, advantages = jax.lax.scan(
+        backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True, unroll=_ADVANTAGE_UNROLL
+    )
     return advantages
 
 
@@ -456,23 +514,23 @@ def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
     """Means over each group of environments [G] of one step, and sums over the episodes in it that
     ended on the step."""
     ended = result.terminated | result.truncated
-
-    def mean(x):
-        return jnp.mean(x.reshape(groups, -1), axis=1)
-
-    def total(x):
-        return jnp.sum(x.reshape(groups, -1), axis=1)
-
-    means = {name: mean(value) for name, value in result.metrics.items()}
-    return means | {
-        "reward": mean(result.reward),
-        "ended": total(ended),
-        "return": total(jnp.where(ended, result.episode_return, 0.0)),
-        "length": total(jnp.where(ended, result.episode_length, 0)),
-        "bounces": total(jnp.where(ended, result.metrics["n_bounces"], 0.0)),
-        "apex_error": total(result.metrics["apex_error"]),
-        "bounced": total(result.metrics["bounced"]),
-        "non_finite": total(result.metrics["non_finite"]),
+    means = result.metrics | {"reward": result.reward}
+    totals = {
+        "ended": ended,
+        "return": jnp.where(ended, result.episode_return, 0.0),
+        "length": jnp.where(ended, result.episode_length, 0),
+        "bounces": jnp.where(ended, result.metrics["n_bounces"], 0.0),
+        "apex_error": result.metrics["apex_error"],
+        "bounced": result.metrics["bounced"],
+        "non_finite": result.metrics["non_finite"],
+    }
+    # One array, as on a GPU each small one costs a kernel.
+    rows = jnp.stack([x.astype(result.reward.dtype) for x in (means | totals).values()])
+    sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
+    count = result.reward.size // groups
+    return {
+        name: total if name in totals else total / count
+        for name, total in zip(means | totals, sums, strict=True)
     }
 
 

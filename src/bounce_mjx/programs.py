@@ -9,7 +9,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from bounce_mjx.config import TrainConfig
-from bounce_mjx.devices import replicated, state_sharding
+from bounce_mjx.devices import compiler_options, replicated, state_sharding
 from bounce_mjx.env import BounceBall
 from bounce_mjx.evaluation import Report, judge, make_evaluator, make_recording_evaluator
 from bounce_mjx.policy import make_networks
@@ -47,12 +47,14 @@ def compile_programs(
     trainer: Trainer,
     mesh: Mesh,
     pool: concurrent.futures.Executor,
+    beside: Callable[[], None] = lambda: None,
 ) -> Programs:
     """Compiles the programs side by side, as each takes seconds; returns once the training can
-    start.
+    start. The longest goes first: Python traces one program at a time, while XLA compiles others.
 
     Args:
       trainer: of one seed, or of the population of several.
+      beside: called when the training is traced, to start what may go on beside its compilation.
     """
     key = initial_key(config)
     shapes = jax.eval_shape(trainer.init, key)
@@ -64,9 +66,11 @@ def compile_programs(
         in_shardings=(sharding,),
         out_shardings=(sharding, everywhere),
         donate_argnums=0,
+        compiler_options=compiler_options(),
     )
-    compiled_run = pool.submit(lambda: run.lower(shapes).compile())
-    compiled_init = pool.submit(lambda: init.lower(key).compile())
+    compiled_run = pool.submit(run.lower(shapes).compile)
+    compiled_init = pool.submit(init.lower(key).compile)
+    beside()
 
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
 
@@ -81,6 +85,7 @@ def compile_programs(
             lambda state, key: evaluate(policy_of(state), key),
             in_shardings=(sharding, everywhere),
             out_shardings=everywhere,
+            compiler_options=compiler_options(),
         )
         return program.lower(shapes, key_shape).compile()
 

@@ -27,7 +27,7 @@ from bounce_mjx.runs import (
     load_run_config,
     save_config,
 )
-from bounce_mjx.train import enable_compilation_cache
+from bounce_mjx.train import set_up_jax
 
 
 class ShipCommand(StrictModel):
@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="python -m bounce_mjx.ship",
             description="Makes the policy that comes with the package out of a run.",
         )
-        enable_compilation_cache()
+        set_up_jax()
         ship(command.run, command.out, Console())
 
 

@@ -52,7 +52,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        enable_compilation_cache()
+        set_up_jax()
         _join_hosts(args)
         command = read_command(args)
         console = Console(quiet=not hosts.is_leader())
@@ -105,9 +105,15 @@ def leave_report(outcome: Outcome, console: Console) -> None:
     console.print(text, highlight=False, soft_wrap=True)
 
 
-def enable_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, so that a second start is quick.
-    `JAX_COMPILATION_CACHE_DIR` chooses another folder."""
+def set_up_jax() -> None:
+    """Sets JAX up for a command, unless the user has.
+
+    Compiled programs are kept in the user's cache folder, so that a second start is quick
+    (`JAX_COMPILATION_CACHE_DIR` chooses another). Of a GPU's memory only what is needed is taken,
+    as taking three quarters at once, JAX's way, costs a second
+    (`XLA_PYTHON_CLIENT_PREALLOCATE=true`).
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))

@@ -198,11 +198,22 @@ class _Job:
         """Compiles the programs, and starts what is written while they run."""
         with self.console.status("compiling"):
             first_step = self.steps if self.resumed else None
-            opening = self.pool.submit(self._open_logs, first_step)
-            if report:
-                opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
+            opening: concurrent.futures.Future | None = None
+
+            def open_logs() -> None:
+                nonlocal opening
+                opening = self.pool.submit(self._open_logs, first_step)
+                if report:
+                    opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
+
             compiling = self.pool.submit(
-                compile_programs, self.config, self.env, self.trainer, self.mesh, self.pool
+                compile_programs,
+                self.config,
+                self.env,
+                self.trainer,
+                self.mesh,
+                self.pool,
+                open_logs,
             )
             if not self.stop.wait_for(compiling):
                 if self.resumed:

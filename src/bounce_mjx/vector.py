@@ -47,13 +47,18 @@ class StepResult(NamedTuple):
 
 def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
     """Starts `num_envs` episodes; consumes `key`."""
-    states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+    states = first_states(env, key, num_envs)
     return VectorState(
         env=states,
         clock=jnp.zeros(num_envs, jnp.int32),
         length=jnp.zeros(num_envs, jnp.int32),
         episode_return=jnp.zeros_like(states.reward),
     )
+
+
+def first_states(env: Env, key: jax.Array, num_envs: int) -> State:
+    """brax states at the start of `num_envs` episodes, the batch last; consumes `key`."""
+    return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
 
 
 def observe(state: VectorState) -> jax.Array:
@@ -71,7 +76,18 @@ def step(
       key: consumed by the resets.
       episode_steps: length at which an episode is truncated.
     """
-    num_envs = state.clock.shape[0]
+    fresh = first_states(env, key, state.clock.shape[0])
+    return step_with(env, state, action, fresh, episode_steps)
+
+
+def step_with(
+    env: Env, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
+) -> tuple[VectorState, StepResult]:
+    """`step` with resets that are drawn already: those of many steps at once cost less on a GPU.
+
+    Args:
+      fresh: `first_states` for those environments that end.
+    """
     stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
     clock, length = state.clock + 1, state.length + 1
     episode_return = state.episode_return + stepped.reward
@@ -79,7 +95,6 @@ def step(
     truncated = (clock >= episode_steps) & ~terminated
     ended = terminated | truncated
 
-    fresh = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
     env_state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, stepped)
     result = StepResult(
         observation=env_state.obs.T,

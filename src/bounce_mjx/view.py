@@ -12,7 +12,7 @@ from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, StrictModel
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.train import enable_compilation_cache
+from bounce_mjx.train import set_up_jax
 from bounce_mjx.viewers.command import ViewerOptions, show
 from bounce_mjx.viewers.controllers import (
     make_random_controller,
@@ -45,7 +45,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="python -m bounce_mjx.view",
             description="Shows the environment under random, zero or scripted actions.",
         )
-        enable_compilation_cache()
+        set_up_jax()
         env = BounceBall(command.env)
         show(
             env,

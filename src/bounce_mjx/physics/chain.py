@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
@@ -28,6 +27,7 @@ from bounce_mjx.physics.scalars import (
     matvec,
     mul,
     scale,
+    sine_cosine,
     sub,
     transpose,
     vadd,
@@ -78,7 +78,8 @@ def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
     parent_rotation, parent_origin = IDENTITY3, ZERO3
     for link, angle in zip(links, q, strict=True):
         turned = sub(angle, link.zero_angle)
-        joint = axis_rotation(link.axis, jnp.cos(turned), jnp.sin(turned))
+        sine, cosine = sine_cosine(turned)
+        joint = axis_rotation(link.axis, cosine, sine)
         rotation.append(matmul(link.rotation, joint))
         parent_origin = vadd(parent_origin, matvec(parent_rotation, link.offset))
         parent_rotation = matmul(parent_rotation, rotation[-1])

@@ -3,8 +3,8 @@
 The kind: a serial chain of hinges with position servos, a free ball, one frictionless pair of the
 ball (sphere) and the paddle (box), the implicitfast integrator. `read_model` takes the constants
 from a compiled `mujoco.MjModel` and refuses any other kind. `step` unrolls the equations while
-tracing; under `jax.vmap` each scalar becomes one array over the batch, and XLA fuses a substep
-into a few kernels.
+tracing; under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a substep into a
+few loops; on a GPU all substeps are one kernel (`kernel.py`).
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ import numpy as np
 from bounce_mjx.model import Addresses, find_addresses
 from bounce_mjx.physics import chain
 from bounce_mjx.physics.contact import ContactModel, normal_force, sphere_box
+from bounce_mjx.physics.kernel import elementwise
 from bounce_mjx.physics.scalars import Mat3, Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
 from bounce_mjx.physics.state import PhysicsState
 
@@ -82,10 +83,16 @@ def step(
         ball_position=tuple(state.qpos[i] for i in at.ball_qpos[:3]),
         ball_velocity=tuple(state.qvel[i] for i in at.ball_qvel[:3]),
     )
-    targets = tuple(ctrl[i] for i in at.actuators)
-    motion = jax.lax.fori_loop(
-        0, num_substeps, lambda _, carry: substep(model, carry, targets), motion
-    )
+    leaves, tree = jax.tree.flatten(motion)
+
+    def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
+        motion, targets = tree.unflatten(scalars[: len(leaves)]), scalars[len(leaves) :]
+        motion = jax.lax.fori_loop(
+            0, num_substeps, lambda _, carry: substep(model, carry, targets), motion
+        )
+        return tuple(jax.tree.leaves(motion))
+
+    motion = tree.unflatten(elementwise(substeps)(*leaves, *(ctrl[i] for i in at.actuators)))
     quaternion = turn(
         tuple(state.qpos[i] for i in at.ball_qpos[3:]),
         tuple(state.qvel[i] for i in at.ball_qvel[3:]),
@@ -106,8 +113,12 @@ def step(
 
 def paddle_position(model: FusedModel, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    pose = chain.forward_kinematics(model.links, tuple(qpos[i] for i in model.addresses.arm_qpos))
-    return jnp.stack(_paddle_origin(model, pose))
+
+    def position(*q: Scalar) -> Vec3:
+        return _paddle_origin(model, chain.forward_kinematics(model.links, q))
+
+    # XLA would spend as long on fusing this chain with what surrounds it as on all the rest.
+    return jnp.stack(elementwise(position)(*(qpos[i] for i in model.addresses.arm_qpos)))
 
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:

@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -25,7 +24,7 @@ from bounce_mjx.progress import Progress
 from bounce_mjx.reporting import Reporter, open_log
 from bounce_mjx.runs import CheckpointWriter, create_run
 from bounce_mjx.signals import StopRequest
-from bounce_mjx.train import config_of, enable_compilation_cache, path_flag, read_preset, show
+from bounce_mjx.train import config_of, path_flag, read_preset, set_up_jax, show
 from bounce_mjx.training import Clock, Outcome
 
 Library = Literal["rsl_rl", "skrl"]
@@ -59,9 +58,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        # JAX would take most of the accelerator's memory at once; PyTorch needs some of it.
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-        enable_compilation_cache()
+        set_up_jax()
         base = read_preset(path_flag(args, "--config"))
         command = parse(
             TorchTrainCommand,

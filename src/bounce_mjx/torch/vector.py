@@ -16,61 +16,63 @@ from bounce_mjx import vector
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError
 from bounce_mjx.ppo import step_metrics
+from bounce_mjx.torch.packing import Layout
 
 
 class StepResult:
-    """What one step of B environments gave, as tensors that share memory with JAX's arrays.
+    """What one step of B environments gave, as tensors that share memory with JAX's array.
 
-    Each is made when it is first asked for, as a tensor costs some microseconds.
+    All are views of one block of memory, made when they are first asked for.
     """
 
-    def __init__(self, arrays: "_StepArrays"):
-        self._arrays = arrays
+    def __init__(self, block: jax.Array, layout: Layout):
+        self._array, self._layout = block, layout
+        self._block = torch.from_dlpack(block)
 
     @functools.cached_property
     def observation(self) -> torch.Tensor:
         """What to act on next [B, 29]: after an end, the first of the new episode."""
-        return torch.from_dlpack(self._arrays.observation)
+        return self._layout.view(self._block, "observation")
 
     @functools.cached_property
     def critic_metrics(self) -> torch.Tensor:
         """The metrics that only the value network sees, of the same instant [B, K]."""
-        return torch.from_dlpack(self._arrays.critic_metrics)
+        return self._layout.view(self._block, "critic_metrics")
 
     @functools.cached_property
     def final_observation(self) -> torch.Tensor:
         """What the step itself led to [B, 29]: at an end, the last of the old episode."""
-        return torch.from_dlpack(self._arrays.final_observation)
+        return self._layout.view(self._block, "final_observation")
 
     @functools.cached_property
     def final_critic_metrics(self) -> torch.Tensor:
         """The critic's metrics of `final_observation` [B, K]."""
-        return torch.from_dlpack(self._arrays.final_critic_metrics)
+        return self._layout.view(self._block, "final_critic_metrics")
 
     @functools.cached_property
     def reward(self) -> torch.Tensor:
         """Scaled [B]."""
-        return torch.from_dlpack(self._arrays.reward)
+        return self._layout.view(self._block, "reward")
 
     @functools.cached_property
     def terminated(self) -> torch.Tensor:
         """Whether the task ended the episode [B], bool."""
-        return torch.from_dlpack(self._arrays.terminated)
+        return self._layout.view(self._block, "terminated")
 
     @functools.cached_property
     def truncated(self) -> torch.Tensor:
         """Whether only the time limit ended the episode [B], bool."""
-        return torch.from_dlpack(self._arrays.truncated)
+        return self._layout.view(self._block, "truncated")
 
     @functools.cached_property
     def done(self) -> torch.Tensor:
         """Whether the episode ended [B], bool."""
-        return torch.from_dlpack(self._arrays.done)
+        return self._layout.view(self._block, "done")
 
     @functools.cached_property
     def metrics(self) -> torch.Tensor:
         """Means and sums over the batch [M], named by `TorchVectorEnv.metric_names`."""
-        return torch.from_dlpack(self._arrays.metrics)
+        return self._layout.view(self._block, "metrics")
 
 
 class TorchVectorEnv:
@@ -120,10 +122,14 @@ class TorchVectorEnv:
             )
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
-        self.metric_names = tuple(jax.eval_shape(self._advance, carried, action)[2])
-        self._jit_start = jax.jit(self._start)
-        self._jit_step = jax.jit(self._step, donate_argnums=0)
-        self._carried: _Carried | None = None
+        _, arrays, metrics = jax.eval_shape(self._advance, carried, action)
+        self.metric_names = tuple(metrics)
+        metrics = jax.ShapeDtypeStruct((len(metrics),), jnp.float32)
+        self._carried_layout = Layout(carried)
+        self._result_layout = Layout(arrays._replace(metrics=metrics))
+        self._jit_start = jax.jit(self._packed_start)
+        self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
+        self._block: jax.Array | None = None
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Starts every episode afresh, with resets drawn from `seed` if one is given.
@@ -134,7 +140,7 @@ class TorchVectorEnv:
         if seed is not None:
             self._key = jax.random.PRNGKey(seed)
         self._key, key = jax.random.split(self._key)
-        self._carried, observation, critic_metrics = self._jit_start(key)
+        self._block, observation, critic_metrics = self._jit_start(key)
         return torch.from_dlpack(observation), torch.from_dlpack(critic_metrics)
 
     def step(self, action: torch.Tensor) -> StepResult:
@@ -156,27 +162,31 @@ class TorchVectorEnv:
                 f"the action is {action.dtype} {tuple(action.shape)} on {action.device}, but must "
                 f"be torch.float32 {(self.num_envs, self.num_actions)} on {self.device}; convert it"
             )
-        if self._carried is None:
+        if self._block is None:
             raise UserError("step was called before reset; call reset first")
         shared = jax.dlpack.from_dlpack(action.detach().contiguous())
-        self._carried, arrays = self._jit_step(self._carried, shared)
-        return StepResult(arrays)
+        self._block, result = self._jit_step(self._block, shared)
+        return StepResult(result, self._result_layout)
 
     @property
     def clock(self) -> torch.Tensor:
         """Steps of each episode that count towards its time limit [B], int32; a copy. Setting it
         spreads the time-outs of episodes that all began together."""
-        if self._carried is None:
+        if self._block is None:
             self.reset()
-        return torch.from_dlpack(jnp.copy(self._carried.vector.clock))
+        # A copy, as the next step takes the memory of the state.
+        carried = self._carried_layout.unpack(self._block)
+        return torch.from_dlpack(jnp.copy(carried.vector.clock))
 
     @clock.setter
     def clock(self, value: torch.Tensor) -> None:
-        if self._carried is None:
+        if self._block is None:
             self.reset()
-        # A copy, as the next step takes the memory of the state.
-        clock = jnp.copy(jax.dlpack.from_dlpack(value.to(self.device, torch.int32).contiguous()))
-        self._carried = self._carried._replace(vector=self._carried.vector._replace(clock=clock))
+        clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32).contiguous())
+        carried = self._carried_layout.unpack(self._block)
+        self._block = self._carried_layout.pack(
+            carried._replace(vector=carried.vector._replace(clock=clock))
+        )
 
     def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
@@ -187,11 +197,16 @@ class TorchVectorEnv:
             self._critic_metrics(state.env.metrics),
         )
 
-    def _step(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", "_StepArrays"]:
-        carried, arrays, metrics = self._advance(carried, action)
-        return carried, arrays._replace(
+    def _packed_start(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        carried, observation, critic_metrics = self._start(key)
+        return self._carried_layout.pack(carried), observation, critic_metrics
+
+    def _packed_step(self, block: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        carried, arrays, metrics = self._advance(self._carried_layout.unpack(block), action)
+        arrays = arrays._replace(
             metrics=jnp.concatenate([metrics[name] for name in self.metric_names])
         )
+        return self._carried_layout.pack(carried), self._result_layout.pack(arrays)
 
     def _advance(
         self, carried: "_Carried", action: jax.Array
@@ -239,8 +254,7 @@ class _StepArrays(NamedTuple):
 
 
 def _slim(state: vector.VectorState) -> vector.VectorState:
-    """The state without what no step reads. Each array that crosses from one call to the next
-    costs about a microsecond of Python, and the metrics are many."""
+    """The state without what no step reads."""
     return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
 
 

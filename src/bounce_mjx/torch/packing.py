@@ -1,0 +1,81 @@
+"""Many arrays in one block of memory.
+
+Each array that goes from one call of a program to the next costs a microsecond or more of Python,
+and each that goes from JAX to PyTorch tens of them on CUDA. So a step takes and gives one block
+for its state, and gives one for its results, of which PyTorch's tensors are views.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import torch
+
+_TORCH_TYPES = {"float32": torch.float32, "int32": torch.int32, "bool": torch.bool}
+
+
+class _Part(NamedTuple):
+    """Where one array lies in the block."""
+
+    shape: tuple[int, ...]
+    dtype: jnp.dtype
+    start: int
+    """First word."""
+    stop: int
+    """Word after the last."""
+
+
+class Layout:
+    """The places of a pytree's arrays in a block of words, int32 [W].
+
+    Numbers of four bytes take a word each, bools a byte; every array begins with a new word.
+    """
+
+    def __init__(self, shapes: Any):
+        """Lays out a pytree of shapes and types, as `jax.eval_shape` gives it."""
+        leaves, self._tree = jax.tree.flatten(shapes)
+        self._parts: list[_Part] = []
+        stop = 0
+        for leaf in leaves:
+            dtype = jnp.dtype(leaf.dtype)
+            start, stop = stop, stop + -(-math.prod(leaf.shape) * dtype.itemsize // 4)
+            self._parts.append(_Part(tuple(leaf.shape), dtype, start, stop))
+        names = getattr(shapes, "_fields", ())
+        is_flat = len(names) == len(self._parts)
+        self._named = dict(zip(names, self._parts, strict=True)) if is_flat else {}
+
+    def pack(self, arrays: Any) -> jax.Array:
+        """The block [W] of a pytree of such arrays."""
+        return jnp.concatenate([_to_words(x) for x in self._tree.flatten_up_to(arrays)])
+
+    def unpack(self, block: jax.Array) -> Any:
+        """The pytree of arrays of a block [W]."""
+        arrays = [_from_words(block[part.start : part.stop], part) for part in self._parts]
+        return self._tree.unflatten(arrays)
+
+    def view(self, block: torch.Tensor, name: str) -> torch.Tensor:
+        """The array of a field, where the pytree is a flat named tuple, as a view of the block."""
+        part = self._named[name]
+        values = block[part.start : part.stop].view(_TORCH_TYPES[part.dtype.name])
+        count = math.prod(part.shape)
+        return (values if len(values) == count else values[:count]).view(part.shape)
+
+    def offset(self, name: str) -> int:
+        """Bytes from the start of the block to a field."""
+        return 4 * self._named[name].start
+
+
+def _to_words(x: jax.Array) -> jax.Array:
+    flat = x.reshape(-1)
+    if flat.dtype == jnp.bool_:
+        quads = jnp.pad(flat.astype(jnp.uint8), (0, -flat.size % 4)).reshape(-1, 4)
+        return jax.lax.bitcast_convert_type(quads, jnp.int32)
+    return jax.lax.bitcast_convert_type(flat, jnp.int32)
+
+
+def _from_words(words: jax.Array, part: _Part) -> jax.Array:
+    if part.dtype == jnp.bool_:
+        flat = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(-1)
+        return flat[: math.prod(part.shape)].reshape(part.shape) != 0
+    return jax.lax.bitcast_convert_type(words, part.dtype).reshape(part.shape)

@@ -1,0 +1,167 @@
+"""The GPU kernel of the fused physics, in Pallas' interpreter, against XLA's own program."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall
+from bounce_mjx.physics import PhysicsState, fused, kernel
+
+# No multiple of a block.
+BATCH = 70
+NUM_SUBSTEPS = 10
+# In the interpreter both are compiled from the same operations.
+ROUNDING = 1e-6
+
+Step = Callable[[PhysicsState, jax.Array], PhysicsState]
+
+
+@pytest.fixture
+def in_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fused physics of the test runs in the kernel."""
+    monkeypatch.setattr(fused, "elementwise", partial(kernel.elementwise, interpret=True))
+
+
+@pytest.fixture(scope="module")
+def env() -> BounceBall:
+    return BounceBall()
+
+
+def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
+    """States that move, the batch last, and servo targets; in some the ball is in the paddle."""
+    keys = jax.random.split(jax.random.PRNGKey(0), batch)
+    physics = jax.vmap(env.reset, out_axes=-1)(keys).pipeline_state.physics
+    at = env._addresses
+    paddle = jax.vmap(env.engine.paddle_position, in_axes=-1, out_axes=-1)(physics.qpos)
+    height = jnp.where(jnp.arange(batch) % 2 == 0, paddle[2] + 0.02, physics.qpos[at.ball_qpos[2]])
+    qpos = physics.qpos.at[jnp.array(at.ball_qpos[:2])].set(paddle[:2])
+    qpos = qpos.at[at.ball_qpos[2]].set(height)
+    qvel = physics.qvel + jax.random.normal(jax.random.PRNGKey(1), physics.qvel.shape)
+    return PhysicsState(qpos, qvel), qpos[jnp.array(at.arm_qpos)] + 0.05
+
+
+def step(env: BounceBall, physics: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+    return fused.step(fused.read_model(env.mj_model), physics, ctrl, NUM_SUBSTEPS)
+
+
+def batched(env: BounceBall) -> Step:
+    return jax.vmap(partial(step, env), in_axes=-1, out_axes=-1)
+
+
+def assert_equal(ours: PhysicsState, theirs: PhysicsState) -> None:
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(ours.qvel, theirs.qvel, rtol=ROUNDING, atol=100 * ROUNDING)
+
+
+@pytest.fixture(scope="module")
+def by_xla(env: BounceBall) -> PhysicsState:
+    return jax.jit(batched(env))(*moving(env, BATCH))
+
+
+def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
+    program = jax.jit(batched(env)).trace(*moving(env, BATCH))
+    assert "pallas_call" in str(program.jaxpr)
+    after = program.lower().compile()(*moving(env, BATCH))
+    assert_equal(after, by_xla)
+    assert np.abs(after.qvel - moving(env, BATCH)[0].qvel).max() > 1.0
+
+
+def test_several_batches_and_shared_targets(env, in_kernel):
+    """Batches of batches, as of several seeds, and an argument that is the same for all."""
+    physics, ctrl = moving(env, BATCH)
+    twice = jax.tree.map(lambda x: jnp.stack([x, 0.5 * x]), physics)
+    shared = ctrl[:, 0]
+    after = jax.jit(
+        jax.vmap(jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1), in_axes=(0, None))
+    )(twice, shared)
+    one_by_one = jax.jit(jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1))
+    for i in range(2):
+        alone = one_by_one(jax.tree.map(lambda x, i=i: x[i], twice), shared)
+        assert_equal(jax.tree.map(lambda x, i=i: x[i], after), alone)
+
+
+# In a process of its own, as the number of devices is set before JAX starts.
+ON_DEVICES = """
+import functools, re
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from bounce_mjx import BounceBall
+from bounce_mjx.physics import fused, kernel
+from test_kernel import assert_equal, batched, moving
+
+fused.elementwise = functools.partial(kernel.elementwise, interpret=True)
+env = BounceBall()
+args = moving(env, 16 * 8)
+alone = jax.jit(batched(env))(*args)
+stacked = jax.tree.map(lambda x: jnp.stack([x, x]), args)
+mesh = Mesh(np.array(jax.devices()), ("environments",))
+for program, args, axes in (
+    (batched(env), args, (None, "environments")),
+    (jax.vmap(batched(env)), stacked, (None, None, "environments")),
+):
+    sharding = NamedSharding(mesh, PartitionSpec(*axes))
+    compiled = jax.jit(program, in_shardings=sharding).lower(*args).compile()
+    after = compiled(*args)
+    assert after.qpos.sharding.is_equivalent_to(sharding, after.qpos.ndim)
+    assert_equal(jax.tree.map(lambda x: x.reshape(-1, *x.shape[-2:])[-1], after), alone)
+    print(len(re.findall(r"all-(?:gather|reduce|to-all)|collective-", compiled.as_text())))
+"""
+
+
+def test_devices_keep_their_part(monkeypatch):
+    """Nothing is exchanged between eight devices that share a batch, of one seed or of two."""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
+    done = subprocess.run(
+        [sys.executable, "-c", ON_DEVICES],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["0", "0"]
+
+
+def test_one_environment_and_float64_are_left_to_xla(env, in_kernel):
+    physics, ctrl = moving(env, 2)
+    one = jax.tree.map(lambda x: x[:, 0], physics)
+    single = jax.jit(partial(step, env)).trace(one, ctrl[:, 0]).lower().as_text()
+    assert "tt.func" not in single and "pallas" not in single
+    with jax.enable_x64(True):
+        doubled = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (physics, ctrl))
+        assert "pallas_call" not in str(jax.jit(batched(env)).trace(*doubled).jaxpr)
+
+
+def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
+    """Without a GPU here: the program for one holds a Triton kernel, the one for a processor
+    none."""
+    monkeypatch.setattr(kernel, "has_kernels", lambda: True)
+    traced = jax.jit(batched(env)).trace(*moving(env, BATCH))
+    on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert len(re.findall(r"custom_call @__gpu\$xla.gpu.triton|triton_kernel_call", on_gpu)) == 1
+    assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
+
+
+def test_there_is_no_kernel_here(monkeypatch):
+    assert not kernel.has_kernels()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setenv("BOUNCE_MJX_GPU_KERNEL", "off")
+    assert not kernel.has_kernels()
+
+
+@pytest.mark.parametrize(
+    ("capability", "expected"), [("9.0", True), ("8.6", True), ("7.5", False), ("gfx90a", False)]
+)
+def test_which_gpus_have_kernels(monkeypatch, capability, expected):
+    device = type("Device", (), {"compute_capability": capability})
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda backend=None: [device])
+    assert kernel.has_kernels() is expected
