@@ -215,7 +215,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
         """Runs the policy for T steps."""
-
         params = lower_layers(state.params)
 
         def one_step(carry, inputs):
