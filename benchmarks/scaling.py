@@ -4,8 +4,8 @@
 
 Seeds: the time of one block of training with S seeds in one program, against that with one.
 Devices: environment steps per second on D devices with `--num-envs` environments on each, against
-one device. The hyperparameters are the preset's. The compiled block alone is timed, and the fastest of the repeats counts, as other work
-on the machine only ever slows one down.
+one device. The hyperparameters are the preset's. The compiled block alone is timed, and the fastest
+of the repeats counts, as other work on the machine only ever slows one down.
 """
 
 import sys
