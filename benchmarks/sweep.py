@@ -20,13 +20,12 @@ from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall
 from bounce_mjx.cli import parse
-from bounce_mjx.config import PPOConfig, StrictModel, TrainConfig, load_config, validate
+from bounce_mjx.config import PPOConfig, StrictModel, TrainConfig, validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import Report, judge, make_evaluator
 from bounce_mjx.policy import make_networks
 from bounce_mjx.ppo import make_trainer, policy_of, population
-from bounce_mjx.resources import resource_path
-from bounce_mjx.train import set_up_jax
+from bounce_mjx.train import read_preset, set_up_jax
 
 try:
     import optuna
@@ -174,9 +173,7 @@ def main() -> None:
                 "pip install 'bounce_mjx[sweep]'"
             )
         set_up_jax()
-        preset = "cpu" if jax.default_backend() == "cpu" else "default"
-        base = load_config(command.config or resource_path(f"configs/{preset}.yaml"))
-        study = search(command, base)
+        study = search(command, read_preset(command.config))
         device = device_name()
         record = {
             "device": device,

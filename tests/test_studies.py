@@ -42,7 +42,7 @@ def states(storage: Path) -> list[str]:
 
 def test_a_search_goes_on_where_it_was_cut_off(sweep, monkeypatch):
     module, command = sweep
-    base = module.load_config(command.config)
+    base = module.read_preset(command.config)
     tried = []
 
     def killed(trial, *_):
@@ -71,7 +71,7 @@ def test_a_search_goes_on_where_it_was_cut_off(sweep, monkeypatch):
 @pytest.mark.slow
 def test_a_trial_trains_a_population(sweep):
     module, command = sweep
-    base = module.load_config(command.config)
+    base = module.read_preset(command.config)
     study = module.search(command.model_copy(update={"trials": 1}), base)
     (trial,) = study.trials
     assert trial.state.name == "COMPLETE"

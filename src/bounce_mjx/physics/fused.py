@@ -92,7 +92,8 @@ def step(
         )
         return tuple(jax.tree.leaves(motion))
 
-    motion = tree.unflatten(elementwise(substeps)(*leaves, *(ctrl[i] for i in at.actuators)))
+    advance = elementwise(substeps, num_results=len(leaves))
+    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in at.actuators)))
     quaternion = turn(
         tuple(state.qpos[i] for i in at.ball_qpos[3:]),
         tuple(state.qvel[i] for i in at.ball_qvel[3:]),
@@ -117,8 +118,9 @@ def paddle_position(model: FusedModel, qpos: jax.Array) -> jax.Array:
     def position(*q: Scalar) -> Vec3:
         return _paddle_origin(model, chain.forward_kinematics(model.links, q))
 
-    # XLA would spend as long on fusing this chain with what surrounds it as on all the rest.
-    return jnp.stack(elementwise(position)(*(qpos[i] for i in model.addresses.arm_qpos)))
+    # A kernel of its own, so that XLA need not fuse so long a chain with what surrounds it.
+    in_one = elementwise(position, num_results=3)
+    return jnp.stack(in_one(*(qpos[i] for i in model.addresses.arm_qpos)))
 
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:

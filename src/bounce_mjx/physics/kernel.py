@@ -26,12 +26,15 @@ _MIN_COMPUTE_CAPABILITY = 8.0
 _BLOCK, _NUM_WARPS = 64, 2
 
 
-def elementwise(function: ElementwiseFunction, interpret: bool = False) -> ElementwiseFunction:
+def elementwise(
+    function: ElementwiseFunction, num_results: int, interpret: bool = False
+) -> ElementwiseFunction:
     """The same function of K arrays of one shape, with a GPU kernel for its batches.
 
     Args:
       function: K arrays of one shape and type -> a tuple of arrays of that shape and type, by
         elementwise operations alone.
+      num_results: how many; to find out would mean to trace the function once more.
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
     """
 
@@ -40,9 +43,9 @@ def elementwise(function: ElementwiseFunction, interpret: bool = False) -> Eleme
         if args[0].ndim == 0:
             return function(*args)
         if interpret:
-            return in_kernel(function, args, interpret)
+            return in_kernel(function, num_results, args, interpret)
         return jax.lax.platform_dependent(
-            *args, cuda=lambda *args: in_kernel(function, args), default=function
+            *args, cuda=lambda *args: in_kernel(function, num_results, args), default=function
         )
 
     @call.def_vmap
@@ -76,10 +79,11 @@ def has_kernels() -> bool:
     )
 
 
-def in_kernel(function: ElementwiseFunction, args: Arrays, interpret: bool = False) -> Arrays:
+def in_kernel(
+    function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
+) -> Arrays:
     """Runs `function` on arrays [...] in one kernel; on several devices each does its own part."""
     shape = args[0].shape
-    num_results = len(jax.eval_shape(function, *args))
 
     @custom_partitioning
     def run(packed: jax.Array) -> jax.Array:
