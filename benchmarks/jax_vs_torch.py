@@ -37,6 +37,7 @@ from trainers import TRAINERS, Method
 
 from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig
+from bounce_mjx.devices import compiler_options, set_up_gpu
 from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import Statistics, judge, make_evaluator
@@ -94,6 +95,7 @@ def main() -> None:
         args = sys.argv[1:]
         command = read_command(args)
         if command.worker:
+            set_up_gpu()
             train_here(command)
             return
         command.out.mkdir(parents=True, exist_ok=True)
@@ -177,7 +179,7 @@ class _Judge:
 
     def _compile(self) -> Callable[[Policy, jax.Array], Statistics]:
         evaluate = make_evaluator(self._env, self._networks, self._config.eval_episodes)
-        return evaluate.lower(self._policy, self._key).compile()
+        return evaluate.lower(self._policy, self._key).compile(compiler_options())
 
     def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
         config, method = self._config, self._method

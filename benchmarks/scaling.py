@@ -20,7 +20,13 @@ from tables import device_name, markdown_table, write
 from bounce_mjx import BounceBall
 from bounce_mjx.cli import parse
 from bounce_mjx.config import PPOConfig, StrictModel
-from bounce_mjx.devices import compiler_options, make_mesh, replicated, state_sharding
+from bounce_mjx.devices import (
+    compiler_options,
+    make_mesh,
+    replicated,
+    set_up_gpu,
+    state_sharding,
+)
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.ppo import make_trainer, population
 from bounce_mjx.train import read_preset
@@ -37,6 +43,8 @@ class Command(StrictModel):
     """Numbers of devices, each with one seed."""
     num_envs: Annotated[int, Field(ge=1)] = 4096
     """Environments on each device."""
+    num_minibatches: Annotated[int, Field(ge=1)] | None = None
+    """Minibatches of one epoch; left out, the preset's."""
     iterations: Annotated[int, Field(ge=1)] = 8
     """Iterations in one measured block."""
     repeats: Annotated[int, Field(ge=1)] = 8
@@ -48,7 +56,9 @@ class Command(StrictModel):
 def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
     """The time of one block of training."""
     preset = dict(read_preset(None).ppo)
-    config = PPOConfig(**preset | {"num_envs": command.num_envs * num_devices})
+    preset["num_envs"] = command.num_envs * num_devices
+    preset["num_minibatches"] = command.num_minibatches or preset["num_minibatches"]
+    config = PPOConfig(**preset)
     mesh = make_mesh(num_devices, config, num_seeds)
     env = BounceBall()
     trainer = make_trainer(config, env, env.config.episode_steps)
@@ -115,6 +125,7 @@ def table(records: list[dict]) -> str:
 def main() -> None:
     """Runs the command line."""
     with exit_on_user_error():
+        set_up_gpu()
         command = parse(
             Command, sys.argv[1:], prog="benchmarks/scaling.py", description=__doc__.split("\n")[0]
         )

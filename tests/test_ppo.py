@@ -243,6 +243,28 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
     assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
 
 
+def test_update_learns_on_what_the_next_rollout_will_see():
+    """With a policy that stays as it is, the KL divergence of an update is that between the policy
+    on observations as the rollout saw them and as the statistics that include it make them."""
+    config = two_state_config(num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12)
+    trainer = ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
+    before = trainer.init(jax.random.key(0))
+    after, metrics = jax.jit(lambda state: trainer.run(state, 1))(before)
+
+    networks = policy.make_networks(config, 2, 1)
+    (old, deviation), (new, _) = (
+        networks.policy_network.apply(
+            None, before.params.policy, policy.normalize(jnp.eye(2), state.normalizer)
+        )
+        for state in (before, after)
+    )
+    of_states = jnp.sum(jnp.square(new - old) / (2.0 * jnp.square(deviation)), axis=-1)
+    # All are in the first state at first; half of them time out then, and are there again.
+    divergence = 0.75 * of_states[0] + 0.25 * of_states[1]
+    assert divergence > 1e-5
+    np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
+
+
 def test_episodes_do_not_all_time_out_together():
     trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1000)
     steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)

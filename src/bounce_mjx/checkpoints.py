@@ -23,7 +23,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 import tensorstore
 from flax import traverse_util
 
@@ -44,6 +43,9 @@ def write_checkpoint(folder: Path, items: dict[str, Any], record: dict[str, Any]
     Raises:
       OSError: it could not be written; nothing of it is left, and what was there still is.
     """
+    # It takes a third of a second to import, and only writing needs it.
+    import orbax.checkpoint as ocp
+
     partial = folder.with_name(folder.name + _PARTIAL)
     remove_leftovers(folder.parent)
     try:

@@ -4,6 +4,8 @@ The program is the same on any number of devices: arrays of environments are sha
 batch, all else is replicated, and XLA adds the reductions of gradients and statistics.
 """
 
+import os
+
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -12,6 +14,19 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.ppo import TrainingState, num_groups
 
 _AXIS = "devices"
+
+
+def set_up_gpu() -> None:
+    """Makes JAX start sooner on a GPU, unless the user has set it up; on a CPU nothing changes.
+
+    Of the memory only what is needed is taken, as taking three quarters at once, JAX's way, costs
+    a second (`XLA_PYTHON_CLIENT_PREALLOCATE=true`). Random numbers come from a kernel of JAX's own
+    instead of XLA's: the same numbers, with a second less to compile
+    (`JAX_THREEFRY_GPU_KERNEL_LOWERING=false`).
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if "JAX_THREEFRY_GPU_KERNEL_LOWERING" not in os.environ:
+        jax.config.update("jax_threefry_gpu_kernel_lowering", True)
 
 
 def compiler_options() -> dict[str, bool | int | str]:

@@ -91,6 +91,8 @@ class Collection(NamedTuple):
     env: vector.VectorState
     """Environments after the last step."""
     rollout: Rollout
+    raw: jax.Array
+    """What the rollout's `seen` is before its normalisation [T, B, 29 + K]."""
     normalizer: running_statistics.RunningStatisticsState
     """Statistics with those of the rollout."""
     last: jax.Array
@@ -154,7 +156,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             f"rollout_length {config.rollout_length} is longer than an episode of {episode_steps} "
             "control steps; choose a shorter rollout or longer episodes"
         )
-    known_metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+    known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
     unknown = [name for name in config.critic_metrics if name not in known_metrics]
     if unknown:
         raise UserError(
@@ -219,11 +221,12 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
         def one_step(carry, inputs):
             env_state, at_timeout = carry
-            action_key, fresh = inputs
+            noise, fresh = inputs
             raw = see(vector.observe(env_state), env_state.env.metrics)
             seen = normalize(raw, state.normalizer)
             logits = policy_apply(params, lower(seen))
-            action = distribution.sample_no_postprocessing(logits, action_key)
+            mean, standard_deviation = logits
+            action = mean + standard_deviation * noise
             env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
             at_timeout = jnp.where(
                 result.truncated[:, None],
@@ -243,15 +246,21 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
         first = see(vector.observe(state.env), state.env.env.metrics)
-        keys = jax.vmap(jax.random.split)(jax.random.split(key, config.rollout_length))
-        fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs))(keys[:, 1])
+        noise_key, reset_key = jax.random.split(key)
+        # All at once, as on a GPU each draw costs a kernel or two.
+        shape = (config.rollout_length, config.num_envs, env.action_size)
+        noise = jax.random.normal(noise_key, shape)
+        fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs))(
+            jax.random.split(reset_key, config.rollout_length)
+        )
         (env_state, at_timeout), (rollout, raw, metrics) = jax.lax.scan(
-            one_step, (state.env, first), (keys[:, 0], fresh)
+            one_step, (state.env, first), (noise, fresh)
         )
         last = see(vector.observe(env_state), env_state.env.metrics)
         collection = Collection(
             env=env_state,
             rollout=rollout,
+            raw=raw,
             normalizer=running_statistics.update(state.normalizer, raw),
             last=normalize(last, state.normalizer),
             at_timeout=normalize(at_timeout, state.normalizer),
@@ -261,9 +270,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     def prepare(params: Params, collection: Collection) -> Samples:
         """Values the rollout and turns it into samples."""
         rollout, params = collection.rollout, lower_layers(params)
-        seen = lower(jnp.concatenate([rollout.seen, collection.last[None]]))
+        after = jnp.stack([collection.last, collection.at_timeout])
+        seen = lower(jnp.concatenate([rollout.seen, after]))
         values = value_apply(params, seen)
-        timeout_values = value_apply(params, lower(collection.at_timeout))
+        values, timeout_values = values[:-1], values[-1]
         advantage = generalized_advantages(
             rollout.reward,
             values[:-1],
@@ -273,8 +283,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             config.discount,
             config.gae_lambda,
         )
+        # The next rollout acts on what the new statistics make of an observation, so that is what
+        # the networks learn on: with the old ones the policy shifts whenever the statistics do.
         samples = Samples(
-            seen=seen[:-1],
+            seen=lower(normalize(collection.raw, collection.normalizer)),
             action=rollout.action,
             log_prob=rollout.log_prob,
             advantage=advantage,

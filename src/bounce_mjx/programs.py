@@ -1,6 +1,7 @@
 """The compiled programs of a training, of one seed or several, on one device or several."""
 
 import concurrent.futures
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,11 +35,21 @@ def num_iterations(config: TrainConfig) -> int:
     return max(1, round(config.block_steps / config.ppo.batch_steps))
 
 
-def initial_key(config: TrainConfig) -> np.ndarray:
-    """Key of a training [2]; of several seeds [seeds, 2], each that of a training of its own."""
-    seeds = config.seed + np.arange(config.num_seeds)
-    keys = np.stack([jax.random.PRNGKey(seed) for seed in seeds])
-    return keys[0] if config.num_seeds == 1 else keys
+def initial_shapes(config: TrainConfig, trainer: Trainer) -> TrainingState:
+    """Shapes of the training's state (`jax.eval_shape`)."""
+    return jax.eval_shape(functools.partial(_initial_state, trainer), _seeds(config))
+
+
+def _initial_state(trainer: Trainer, seeds: jax.Array) -> TrainingState:
+    """State at the start of the training of a seed [], or of those of several [S]."""
+    key = jax.random.PRNGKey
+    return trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
+
+
+def _seeds(config: TrainConfig) -> np.ndarray:
+    """The seed [], or several [S], of a training each."""
+    seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
+    return seeds[0] if config.num_seeds == 1 else seeds
 
 
 def compile_programs(
@@ -56,11 +67,10 @@ def compile_programs(
       trainer: of one seed, or of the population of several.
       beside: called when the training is traced, to start what may go on beside its compilation.
     """
-    key = initial_key(config)
-    shapes = jax.eval_shape(trainer.init, key)
+    seeds, shapes = _seeds(config), initial_shapes(config, trainer)
     sharding, everywhere = state_sharding(mesh, shapes, config.num_seeds), replicated(mesh)
 
-    init = jax.jit(trainer.init, out_shardings=sharding)
+    init = jax.jit(functools.partial(_initial_state, trainer), out_shardings=sharding)
     run = jax.jit(
         lambda state: trainer.run(state, num_iterations(config)),
         in_shardings=(sharding,),
@@ -69,12 +79,12 @@ def compile_programs(
         compiler_options=compiler_options(),
     )
     compiled_run = pool.submit(run.lower(shapes).compile)
-    compiled_init = pool.submit(init.lower(key).compile)
+    compiled_init = pool.submit(init.lower(seeds).compile)
     beside()
 
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
 
-    def compile_evaluator(episodes: int):
+    def compile_evaluator(episodes: int, stream: int):
         if config.num_seeds == 1:
             evaluate = make_recording_evaluator(env, networks, episodes, RECORDED_EPISODES)
         else:
@@ -82,26 +92,26 @@ def compile_programs(
             without = jax.vmap(make_evaluator(env, networks, episodes), in_axes=(0, None))
             evaluate = lambda policy, key: (without(policy, key), None)  # noqa: E731
         program = jax.jit(
-            lambda state, key: evaluate(policy_of(state), key),
+            lambda state, seed: evaluate(
+                policy_of(state), jax.random.split(jax.random.PRNGKey(seed))[stream]
+            ),
             in_shardings=(sharding, everywhere),
             out_shardings=everywhere,
             compiler_options=compiler_options(),
         )
-        return program.lower(shapes, key_shape).compile()
+        return program.lower(shapes, eval_seed).compile()
 
-    key_shape = jax.ShapeDtypeStruct((2,), np.uint32)
-    evaluator = pool.submit(compile_evaluator, config.eval_episodes)
+    # Keys are made inside the programs: each operation outside takes JAX a tenth of a second.
+    eval_seed = np.uint32(config.eval_seed)
+    evaluator = pool.submit(compile_evaluator, config.eval_episodes, 0)
     screening = (
-        pool.submit(compile_evaluator, config.screening_episodes)
+        pool.submit(compile_evaluator, config.screening_episodes, 1)
         if config.screening_episodes
         else None
     )
-    eval_key, screening_key = np.asarray(jax.random.split(jax.random.PRNGKey(config.eval_seed)))
 
-    def measure(
-        program: concurrent.futures.Future, state: TrainingState, key: np.ndarray
-    ) -> list[Report]:
-        statistics, recording = program.result()(state, key)
+    def measure(program: concurrent.futures.Future, state: TrainingState) -> list[Report]:
+        statistics, recording = program.result()(state, eval_seed)
         if config.num_seeds == 1:
             return [judge(env, statistics)._replace(recording=recording)]
         statistics = jax.device_get(statistics)
@@ -112,10 +122,10 @@ def compile_programs(
 
     def evaluate(state: TrainingState) -> list[Report]:
         if screening is not None:
-            screened = measure(screening, state, screening_key)
+            screened = measure(screening, state)
             if not any(report.passed for report in screened):
                 return screened
-        return measure(evaluator, state, eval_key)
+        return measure(evaluator, state)
 
     def run_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
         state, metrics = compiled_run.result()(state)
@@ -123,4 +133,4 @@ def compile_programs(
         return state, {name: np.asarray(value).reshape(many) for name, value in metrics.items()}
 
     compiled_run.result()
-    return Programs(lambda: compiled_init.result()(key), run_block, evaluate)
+    return Programs(lambda: compiled_init.result()(seeds), run_block, evaluate)

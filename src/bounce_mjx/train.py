@@ -16,6 +16,7 @@ from rich.console import Console
 from bounce_mjx import hosts
 from bounce_mjx.cli import parse
 from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig, differing_keys, load_config
+from bounce_mjx.devices import set_up_gpu
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.reporting import details_line, results_table, seeds_table
 from bounce_mjx.resources import resource_path
@@ -109,11 +110,9 @@ def set_up_jax() -> None:
     """Sets JAX up for a command, unless the user has.
 
     Compiled programs are kept in the user's cache folder, so that a second start is quick
-    (`JAX_COMPILATION_CACHE_DIR` chooses another). Of a GPU's memory only what is needed is taken,
-    as taking three quarters at once, JAX's way, costs a second
-    (`XLA_PYTHON_CLIENT_PREALLOCATE=true`).
+    (`JAX_COMPILATION_CACHE_DIR` chooses another).
     """
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    set_up_gpu()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))

@@ -28,7 +28,7 @@ from bounce_mjx.ppo import (
     policy_of,
     population,
 )
-from bounce_mjx.programs import compile_programs, initial_key, num_iterations
+from bounce_mjx.programs import compile_programs, initial_shapes, num_iterations
 from bounce_mjx.progress import Progress
 from bounce_mjx.reporting import Reporter, open_log
 from bounce_mjx.runs import (
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 # Time between two attempts to save on a full disk once the training is over.
 RETRY_SECONDS = 2.0
 
-# Imported by name, beside the compilation, as drawing takes half a second to import.
+# Imported by name, beside the compilation, as drawing takes half a second to import; so is orbax.
 REPORT_MODULE = "bounce_mjx.report"
 
 
@@ -179,7 +179,7 @@ class _Job:
 
     def _resume(self, path: Path) -> None:
         self.run = find_run(path)
-        shapes = jax.eval_shape(self.trainer.init, initial_key(self.config))
+        shapes = initial_shapes(self.config, self.trainer)
         latest = latest_checkpoint(self.run)
         state, plain = load_training_state(latest, shapes)
         self.state = hosts.distribute(
@@ -203,6 +203,7 @@ class _Job:
             def open_logs() -> None:
                 nonlocal opening
                 opening = self.pool.submit(self._open_logs, first_step)
+                self.pool.submit(importlib.import_module, "orbax.checkpoint")
                 if report:
                     opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
 

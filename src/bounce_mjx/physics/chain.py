@@ -163,7 +163,7 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
     for j in range(n):
         pivot = matrix[j][j]
         for k in range(j):
-            pivot = pivot - lower[j][k] * lower[j][k]
+            pivot = sub(pivot, mul(lower[j][k], lower[j][k]))
         inverse_diagonal.append(jax.lax.rsqrt(pivot))
         for i in range(j + 1, n):
             entry = matrix[i][j]

@@ -8,6 +8,8 @@ few loops; on a GPU all substeps are one kernel (`kernel.py`).
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -84,15 +86,7 @@ def step(
         ball_velocity=tuple(state.qvel[i] for i in at.ball_qvel[:3]),
     )
     leaves, tree = jax.tree.flatten(motion)
-
-    def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
-        motion, targets = tree.unflatten(scalars[: len(leaves)]), scalars[len(leaves) :]
-        motion = jax.lax.fori_loop(
-            0, num_substeps, lambda _, carry: substep(model, carry, targets), motion
-        )
-        return tuple(jax.tree.leaves(motion))
-
-    advance = elementwise(substeps, num_results=len(leaves))
+    advance = elementwise(_substeps(model, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in at.actuators)))
     quaternion = turn(
         tuple(state.qpos[i] for i in at.ball_qpos[3:]),
@@ -114,13 +108,41 @@ def step(
 
 def paddle_position(model: FusedModel, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
+    # A kernel of its own, so that XLA need not fuse so long a chain with what surrounds it.
+    in_one = elementwise(_paddle_position(model), num_results=3)
+    return jnp.stack(in_one(*(qpos[i] for i in model.addresses.arm_qpos)))
+
+
+@functools.lru_cache
+def _substeps(model: FusedModel, num_substeps: int) -> Callable[..., tuple[Scalar, ...]]:
+    """Physics steps as a function of scalars: those of a `Motion`, then the servo targets.
+
+    Cached, and jitted inline, so that JAX traces so long a function once for all the programs that
+    have it: each time takes some tenths of a second.
+    """
+
+    def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
+        n = len(model.links)
+        q, v, ball, targets = scalars[:n], scalars[n : 2 * n], scalars[2 * n : -n], scalars[-n:]
+        motion = jax.lax.fori_loop(
+            0,
+            num_substeps,
+            lambda _, motion: substep(model, motion, targets),
+            Motion(q, v, ball[:3], ball[3:]),
+        )
+        return tuple(jax.tree.leaves(motion))
+
+    return jax.jit(substeps, inline=True)
+
+
+@functools.lru_cache
+def _paddle_position(model: FusedModel) -> Callable[..., Vec3]:
+    """`paddle_position` as a function of the joint angles; cached as `_substeps` is."""
 
     def position(*q: Scalar) -> Vec3:
         return _paddle_origin(model, chain.forward_kinematics(model.links, q))
 
-    # A kernel of its own, so that XLA need not fuse so long a chain with what surrounds it.
-    in_one = elementwise(position, num_results=3)
-    return jnp.stack(in_one(*(qpos[i] for i in model.addresses.arm_qpos)))
+    return jax.jit(position, inline=True)
 
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:

@@ -4,7 +4,8 @@
 |-------------------------|---------------------------------------------------------------------|
 | num_envs, rollout_length, num_epochs, num_minibatches, discount, gae_lambda, clip_epsilon,      |
 | entropy_cost, value_cost, reward_scale, init_noise_std, hidden_layers, critic_metrics | the same |
-| normalisation, initial weights | the same (`networks.py`)                                     |
+| initial weights         | the same (`networks.py`)                                            |
+| normalisation           | the same formula; the statistics grow step by step (here by rollouts) |
 | advantages              | normalised in each minibatch: the same                              |
 | learning_rate           | the same start; steered by the KL of each minibatch: the same       |
 | target_kl               | `desired_kl`; 0 turns the steering off: the same                    |
