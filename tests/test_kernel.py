@@ -74,6 +74,21 @@ def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
     assert np.abs(after.qvel - moving(env, BATCH)[0].qvel).max() > 1.0
 
 
+def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
+    """Tracing it takes some tenths of a second, and a training has several programs."""
+    traced = []
+    substep = fused.substep
+    monkeypatch.setattr(fused, "substep", lambda *args: traced.append(1) or substep(*args))
+    fused._substeps.cache_clear()
+    jax.make_jaxpr(batched(env))(*moving(env, 3))
+    assert traced
+    traced.clear()
+    jax.make_jaxpr(batched(env))(*moving(env, 4))
+    assert not traced
+    # What was traced here calls the list above.
+    fused._substeps.cache_clear()
+
+
 def test_several_batches_and_shared_targets(env, in_kernel):
     """Batches of batches, as of several seeds, and an argument that is the same for all."""
     physics, ctrl = moving(env, BATCH)

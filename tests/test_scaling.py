@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import socket
@@ -81,6 +82,28 @@ def assert_trained(run: Path, before: dict[str, np.ndarray]) -> None:
 
 
 # Shuffling in groups
+
+
+@pytest.mark.parametrize(
+    ("kernel", "preallocate", "expected"),
+    [(None, None, (True, "false")), ("false", "true", (False, "true"))],
+)
+def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expected, monkeypatch):
+    before = jax.config.jax_threefry_gpu_kernel_lowering
+    for name, value in (
+        ("JAX_THREEFRY_GPU_KERNEL_LOWERING", kernel),
+        ("XLA_PYTHON_CLIENT_PREALLOCATE", preallocate),
+    ):
+        # Set first, so that what the command sets itself is undone as well.
+        monkeypatch.setenv(name, value or "")
+        if value is None:
+            monkeypatch.delenv(name)
+    try:
+        devices.set_up_gpu()
+        numbers = jax.config.jax_threefry_gpu_kernel_lowering
+        assert (numbers, os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"]) == expected
+    finally:
+        jax.config.update("jax_threefry_gpu_kernel_lowering", before)
 
 
 @pytest.mark.parametrize(
