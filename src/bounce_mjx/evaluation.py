@@ -26,7 +26,7 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 
 _BALL_X, _BALL_VZ = 6, 21
 
-_MAX_STEPS_BETWEEN_LOOKS = 100
+_MAX_STEPS_BETWEEN_LOOKS = 20
 
 
 class Statistics(NamedTuple):
@@ -106,7 +106,7 @@ def make_evaluator(
     env: BounceBall, networks: PPONetworks, episodes: int
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
-    from its own reset; it stops when all have ended or the time is over."""
+    from its own reset; it stops soon after all have ended, or when the time is over."""
     evaluate = make_recording_evaluator(env, networks, episodes, recorded=0)
     return jax.jit(lambda policy, key: evaluate(policy, key)[0])
 
