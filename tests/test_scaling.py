@@ -81,9 +81,6 @@ def assert_trained(run: Path, before: dict[str, np.ndarray]) -> None:
     assert any((after[n] != before[n]).any() for n in after if n.startswith("params"))
 
 
-# Shuffling in groups
-
-
 @pytest.mark.parametrize(
     ("kernel", "preallocate", "expected"),
     [(None, None, (True, "false")), ("false", "true", (False, "true"))],
@@ -99,11 +96,15 @@ def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expecte
         if value is None:
             monkeypatch.delenv(name)
     try:
+        jax.config.update("jax_threefry_gpu_kernel_lowering", False)
         devices.set_up_gpu()
         numbers = jax.config.jax_threefry_gpu_kernel_lowering
         assert (numbers, os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"]) == expected
     finally:
         jax.config.update("jax_threefry_gpu_kernel_lowering", before)
+
+
+# Shuffling in groups
 
 
 @pytest.mark.parametrize(
