@@ -472,7 +472,7 @@ def test_ppo_learns_to_bounce():
     )  # fmt: skip
     trainer = ppo.make_trainer(config, env, env.config.episode_steps)
     untrained = jax.jit(trainer.init)(jax.random.key(0))
-    trained, metrics = jax.jit(trainer.run, static_argnums=1)(untrained, 120)
+    trained, metrics = jax.jit(trainer.run, static_argnums=1)(untrained, 180)
 
     networks = policy.make_networks(config, env.observation_size, env.action_size)
     unseen = jax.random.key(1234)
