@@ -26,8 +26,6 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 
 _BALL_X, _BALL_VZ = 6, 21
 
-_MAX_STEPS_BETWEEN_LOOKS = 20
-
 
 class Statistics(NamedTuple):
     """Sums over the steps of E episodes, each up to its end."""
@@ -106,7 +104,7 @@ def make_evaluator(
     env: BounceBall, networks: PPONetworks, episodes: int
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
-    from its own reset; it stops soon after all have ended, or when the time is over."""
+    from its own reset; it stops when all have ended or the time is over."""
     evaluate = make_recording_evaluator(env, networks, episodes, recorded=0)
     return jax.jit(lambda policy, key: evaluate(policy, key)[0])
 
@@ -116,29 +114,23 @@ def make_recording_evaluator(
 ) -> Callable[[Policy, jax.Array], tuple[Statistics, Recording]]:
     """Like `make_evaluator`, with a recording of the first `recorded` episodes too."""
 
-    steps = env.config.episode_steps
-    between_looks = max(d for d in range(1, _MAX_STEPS_BETWEEN_LOOKS + 1) if steps % d == 0)
-
     def evaluate(policy: Policy, key: jax.Array) -> tuple[Statistics, Recording]:
         states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
 
         def unfinished(carry):
             _, statistics, _, step = carry
-            return jnp.any(statistics.running) & (step < steps)
+            return jnp.any(statistics.running) & (step < env.config.episode_steps)
 
-        def advance(_, carry):
+        def advance(carry):
             states, statistics, recording, step = carry
             actions = act(networks, policy, states.obs.T)
             states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
             recording = record(recording, states, statistics.running, step)
             return states, accumulate(env, statistics, states, step), recording, step + 1
 
-        recording = empty_recording(steps, min(recorded, episodes))
+        recording = empty_recording(env.config.episode_steps, min(recorded, episodes))
         carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
-        # A GPU waits for the processor to look at each condition, so that comes once in a while.
-        _, statistics, recording, _ = jax.lax.while_loop(
-            unfinished, lambda carry: jax.lax.fori_loop(0, between_looks, advance, carry), carry
-        )
+        _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
         return statistics, recording
 
     return jax.jit(evaluate)
