@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
-from bounce_mjx import vector
-from bounce_mjx.cli import parse
-from bounce_mjx.config import StrictModel
-from bounce_mjx.env import BounceBall
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.task import vector
+from bounce_mjx.task.env import BounceBall
 
 
 class Command(StrictModel):
@@ -42,8 +42,8 @@ def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
     """Functions that take a number of steps and wait for the last one."""
     import torch
 
-    from bounce_mjx.torch import TorchVectorEnv
-    from bounce_mjx.torch.rsl_rl import RslRlVecEnv
+    from bounce_mjx.adapters.torch import TorchVectorEnv
+    from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv
 
     env = BounceBall()
     episode_steps = env.config.episode_steps

@@ -19,12 +19,12 @@ from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall
-from bounce_mjx.cli import parse
-from bounce_mjx.config import StrictModel
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.evaluation import DEFAULT_SEED, accumulate, empty_statistics, judge
-from bounce_mjx.policy import act, make_networks
-from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.evaluation.results import DEFAULT_SEED, accumulate, empty_statistics, judge
+from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config
 
 # Share of the environments that must keep the ball up throughout.
 MIN_SHARE = 0.99

@@ -35,14 +35,18 @@ from pydantic import Field
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
-from bounce_mjx.cli import parse
-from bounce_mjx.config import EnvConfig, PPOConfig, TrainConfig
-from bounce_mjx.devices import compiler_options, set_up_gpu
-from bounce_mjx.env import BounceBall
+from bounce_mjx.commands.train import path_flag
+from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation import Statistics, judge, make_evaluator
-from bounce_mjx.policy import Policy, init_normalizer, make_networks
-from bounce_mjx.train import path_flag, read_preset
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import Statistics, judge
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training.setup import compiler_options, set_up_gpu
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
 _NAMES = {

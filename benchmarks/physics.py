@@ -22,8 +22,8 @@ from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.cli import parse
-from bounce_mjx.config import StrictModel
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 
 EngineName = Literal["fused", "mjx", "c"]

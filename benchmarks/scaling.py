@@ -18,18 +18,14 @@ from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall
-from bounce_mjx.cli import parse
-from bounce_mjx.config import PPOConfig, StrictModel
-from bounce_mjx.devices import (
-    compiler_options,
-    make_mesh,
-    replicated,
-    set_up_gpu,
-    state_sharding,
-)
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.ppo import make_trainer, population
-from bounce_mjx.train import read_preset
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import make_trainer, population
+from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
+from bounce_mjx.training.setup import compiler_options, set_up_gpu
 
 Counts = tuple[Annotated[int, Field(ge=1)], ...]
 

@@ -18,11 +18,11 @@ from skrl.memories.jax import RandomMemory
 from skrl.models.jax import DeterministicMixin, GaussianMixin, Model
 from skrl.resources.schedulers.jax import KLAdaptiveLR
 
-from bounce_mjx import vector
-from bounce_mjx.config import PPOConfig
-from bounce_mjx.env import BounceBall
-from bounce_mjx.policy import Policy, init_normalizer, normalize
-from bounce_mjx.ppo import max_learning_rate
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, init_normalizer, normalize
+from bounce_mjx.learning.ppo import max_learning_rate
+from bounce_mjx.task import vector
+from bounce_mjx.task.env import BounceBall
 
 
 class SkrlJaxLearner:

@@ -19,13 +19,18 @@ from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall
-from bounce_mjx.cli import parse
-from bounce_mjx.config import PPOConfig, StrictModel, TrainConfig, validate
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation import Report, judge, make_evaluator
-from bounce_mjx.policy import make_networks
-from bounce_mjx.ppo import make_trainer, policy_of, population
-from bounce_mjx.train import read_preset, set_up_jax
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import Report, judge
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.learning.ppo import make_trainer, policy_of, population
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.training.setup import set_up_jax
 
 try:
     import optuna

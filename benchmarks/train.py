@@ -18,8 +18,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
-from bounce_mjx.cli import parse
-from bounce_mjx.config import StrictModel
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 
 PHASES = ("import", "setup", "compile", "train", "evaluate", "save")

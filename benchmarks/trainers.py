@@ -26,12 +26,18 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 
-from bounce_mjx.brax_interop import device_put_replicated
-from bounce_mjx.config import TrainConfig
-from bounce_mjx.devices import compiler_options
-from bounce_mjx.env import BounceBall
-from bounce_mjx.policy import MIN_VARIANCE, Policy, init_normalizer, make_networks, normalize
-from bounce_mjx.ppo import make_trainer, policy_of
+from bounce_mjx.adapters.brax.compatibility import device_put_replicated
+from bounce_mjx.learning.policy import (
+    MIN_VARIANCE,
+    Policy,
+    init_normalizer,
+    make_networks,
+    normalize,
+)
+from bounce_mjx.learning.ppo import make_trainer, policy_of
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training.setup import compiler_options
 
 Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]
 
@@ -75,7 +81,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the adapter."""
-    from bounce_mjx.torch.train import make_learner
+    from bounce_mjx.commands.train_torch import make_learner
 
     learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import tensorstore
 
-from bounce_mjx import checkpoints
-from bounce_mjx.config import PPOConfig, TrainConfig, load_config
-from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError
-from bounce_mjx.policy import Policy
-from bounce_mjx.ppo import TrainingState, make_trainer, policy_of
-from bounce_mjx.runs import (
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
+from bounce_mjx.runs import checkpoint as checkpoints
+from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.folder import (
     CheckpointWriter,
     create_run,
     find_checkpoint,
@@ -28,6 +28,7 @@ from bounce_mjx.runs import (
     load_run_config,
     load_training_state,
 )
+from bounce_mjx.task.env import BounceBall
 
 SOURCES = Path(checkpoints.__file__).parent
 CONFIG = TrainConfig(

@@ -14,14 +14,14 @@ import orbax.checkpoint as ocp
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from bounce_mjx import eval as eval_command
-from bounce_mjx import train as train_command
-from bounce_mjx.config import TrainConfig, load_config
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.policy import Policy
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.resources import resource_path
-from bounce_mjx.rewards import TERM_NAMES
-from bounce_mjx.runs import find_checkpoint, load_policy, load_run_config, newest_run
+from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config, newest_run
+from bounce_mjx.task.rewards import TERM_NAMES
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents
 
 RESULT_NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")

@@ -15,13 +15,18 @@ import pytest
 import yaml
 
 import bounce_mjx
-from bounce_mjx import cli, config_reference, hosts
-from bounce_mjx import eval as eval_command
-from bounce_mjx import plot as plot_command
-from bounce_mjx import train as train_command
-from bounce_mjx.config import RewardConfig, StrictModel, TrainConfig, dump_config
+from bounce_mjx.commands import config_reference
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import train as train_command
+from bounce_mjx.config import command_line as cli
+from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.resources import resource_path
-from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.reward_config import RewardConfig
+from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.training import hosts
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]

@@ -13,9 +13,10 @@ from brax.envs.wrappers import training
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 
-from bounce_mjx import BounceBall, EnvConfig, brax_interop
-from bounce_mjx.env import TaskState, update_task
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.adapters.brax import compatibility as brax_interop
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task.env import TaskState, update_task
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
@@ -718,7 +719,7 @@ def test_replicate_puts_one_copy_on_each_device():
 import jax, numpy as np
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
-from bounce_mjx import brax_interop
+from bounce_mjx.adapters.brax import compatibility as brax_interop
 copies = brax_interop.replicate(np.arange(3.0), jax.devices())
 assert copies.shape == (2, 3), copies.shape
 for i, shard in enumerate(sorted(copies.addressable_shards, key=lambda s: s.index[0].start)):

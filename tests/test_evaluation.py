@@ -9,18 +9,19 @@ import pytest
 from brax.envs.base import State
 from brax.training.networks import FeedForwardNetwork
 
-from bounce_mjx import BounceBall, EnvConfig, policy
-from bounce_mjx.config import PPOConfig
-from bounce_mjx.evaluation import (
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import (
     Report,
     Result,
     Statistics,
     accumulate,
     empty_statistics,
     judge,
-    make_evaluator,
 )
-from bounce_mjx.mujoco_evaluation import make_mujoco_evaluator
+from bounce_mjx.learning import policy
+from bounce_mjx.learning.config import PPOConfig
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856

@@ -13,11 +13,13 @@ import yaml
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
-from bounce_mjx import eval as eval_command
-from bounce_mjx import train as train_command
-from bounce_mjx.cli import _flags, parse
-from bounce_mjx.config import StrictModel, TrainConfig, dump_config, load_config
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.command_line import _flags, parse
+from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.runs.config import TrainConfig, load_config
 from tiny_runs import contents
 
 FLAGS = sorted(_flags(train_command.TrainCommand))

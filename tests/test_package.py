@@ -89,9 +89,9 @@ print(*bounce_mjx.__all__)
 
 def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
     script = """
-from bounce_mjx.config import load_config
+from bounce_mjx.runs.config import load_config
 from bounce_mjx.resources import resource_path
-from bounce_mjx.train import read_command
+from bounce_mjx.commands.train import read_command
 import jax
 preset = "cpu" if jax.default_backend() == "cpu" else "default"
 print(read_command([]).ppo == load_config(resource_path(f"configs/{preset}.yaml")).ppo)
@@ -107,10 +107,10 @@ def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
 import jax
 from rich.console import Console
 from bounce_mjx import BounceBall
-from bounce_mjx.config import TrainConfig
-from bounce_mjx.policy import act, make_networks
-from bounce_mjx.checkpoint_choice import choose_checkpoint
-from bounce_mjx.runs import load_policy, load_run_config
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.runs.choice import choose_checkpoint
+from bounce_mjx.runs.folder import load_policy, load_run_config
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from bounce_mjx.config import EnvConfig
 from bounce_mjx.errors import UserError
-from bounce_mjx.model import Addresses, find_addresses, load_model
 from bounce_mjx.physics import PhysicsState, chain, fused, make_engine, mjx_engine, scalars
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.model import Addresses, find_addresses, load_model
+from bounce_mjx.task.config import EnvConfig
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
 HALF_SIZE = np.array([0.05, 0.065, 0.0035])
@@ -49,7 +49,7 @@ def float64():
 @pytest.fixture(scope="module")
 def mj_model() -> mujoco.MjModel:
     """The shipped model at the default time step."""
-    return load_model(EnvConfig())
+    return load_model(None, EnvConfig().physics_dt)
 
 
 @pytest.fixture(scope="module")

@@ -16,18 +16,25 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboardX import SummaryWriter
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx import plot as plot_command
-from bounce_mjx import report as report_command
-from bounce_mjx import train as train_command
-from bounce_mjx.config import PPOConfig, TrainConfig, load_config
+from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation import Report
-from bounce_mjx.figures import CURVES, curves_figure, evaluation_figure, image, rewards_figure
-from bounce_mjx.learning_curves import group_runs, mean_and_band, read_curves
-from bounce_mjx.recording import Recording
-from bounce_mjx.reporting import results_markdown
-from bounce_mjx.rewards import TERM_NAMES
-from bounce_mjx.runs import load_results, save_config
+from bounce_mjx.evaluation.recording import Recording
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.figures import (
+    CURVES,
+    curves_figure,
+    evaluation_figure,
+    image,
+    rewards_figure,
+)
+from bounce_mjx.reports.tables import results_markdown
+from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.folder import load_results, save_config
+from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.training import report as report_command
 
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics
 
-from bounce_mjx.config import PPOConfig
-from bounce_mjx.policy import Policy, act, init_normalizer, make_networks, normalize
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, act, init_normalizer, make_networks, normalize
 
 CONSTANT = slice(9, 13)
 

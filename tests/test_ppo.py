@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
-from bounce_mjx import BounceBall, EnvConfig, evaluation, policy, ppo, vector
-from bounce_mjx.config import PPOConfig
+from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import results as evaluation
+from bounce_mjx.learning import policy, ppo
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.task import vector
 
 
 def all_finite(tree) -> bool:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bounce_mjx import ship as ship_command
-from bounce_mjx.checkpoint_choice import choose_checkpoint, pretrained_checkpoint
-from bounce_mjx.config import TrainConfig, load_config
+from bounce_mjx.commands import ship as ship_command
+from bounce_mjx.commands.train import read_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.eval import evaluate_policy
-from bounce_mjx.evaluation import Report
+from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs import best_checkpoint, load_policy, load_run_config
-from bounce_mjx.train import read_command
+from bounce_mjx.runs.choice import choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.folder import best_checkpoint, load_policy, load_run_config
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128
@@ -34,7 +34,9 @@ def measured() -> Report:
     """The shipped policy's results over 128 episodes."""
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    return evaluate_policy(load_policy(checkpoint, config), config, episodes=EPISODES)[0]
+    return evaluate_policy(
+        load_policy(checkpoint, config), config.env, config.ppo, episodes=EPISODES
+    )[0]
 
 
 @pytest.fixture

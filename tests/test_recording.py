@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.config import PPOConfig
-from bounce_mjx.evaluation import make_recording_evaluator
-from bounce_mjx.policy import Policy, act, init_normalizer, make_networks
-from bounce_mjx.recording import Recording, apex_errors, hit_points, settled_bounces
+from bounce_mjx.evaluation.episodes import make_recording_evaluator
+from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, act, init_normalizer, make_networks
 
 EPISODES, RECORDED = 6, 4
 

@@ -26,21 +26,22 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
 
-from bounce_mjx import checkpoints
-from bounce_mjx import train as train_command
-from bounce_mjx import training as training_job
-from bounce_mjx.config import TrainConfig, differing_keys
+from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
-from bounce_mjx.ppo import CHECKED, first_fault
-from bounce_mjx.reporting import Reporter
-from bounce_mjx.runs import (
+from bounce_mjx.learning.ppo import CHECKED, first_fault
+from bounce_mjx.runs import checkpoint as checkpoints
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.folder import (
     RESUMABLE_KEYS,
     CheckpointWriter,
     best_checkpoint,
     latest_checkpoint,
     load_run_config,
 )
-from bounce_mjx.signals import StopRequest
+from bounce_mjx.training import job as training_job
+from bounce_mjx.training.console import Reporter
+from bounce_mjx.training.signals import StopRequest
 from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, job
 
 

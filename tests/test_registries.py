@@ -167,7 +167,7 @@ def test_playground_loads_the_environment(monkeypatch):
     from mujoco_playground import manipulation, registry, wrapper
     from mujoco_playground._src import mjx_env
 
-    import bounce_mjx.playground
+    import bounce_mjx.adapters.playground.environment
 
     # Playground fetches its own robots before it loads any environment.
     monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: None)

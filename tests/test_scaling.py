@@ -16,20 +16,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx import devices, hosts, ppo, training
-from bounce_mjx import eval as eval_command
-from bounce_mjx import plot as plot_command
-from bounce_mjx import train as train_command
-from bounce_mjx.config import PPOConfig
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning_curves import group_runs
-from bounce_mjx.runs import (
+from bounce_mjx.learning import ppo
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.reports.curves import group_runs
+from bounce_mjx.runs.folder import (
     best_checkpoint,
     find_checkpoint,
     latest_checkpoint,
     load_run_config,
     runs_of_seeds,
 )
+from bounce_mjx.training import devices, hosts
+from bounce_mjx.training import job as training
 from tiny_runs import STEPS, TINY, arrays, job
 
 # As many environments as eight devices can share.
@@ -241,8 +243,10 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 
 MESSAGES = """
 import jax, re
-from bounce_mjx import BounceBall, devices, ppo
-from bounce_mjx.config import PPOConfig
+from bounce_mjx import BounceBall
+from bounce_mjx.training import devices
+from bounce_mjx.learning import ppo
+from bounce_mjx.learning.config import PPOConfig
 config = PPOConfig(num_envs=64, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
 env = BounceBall()
 trainer = ppo.make_trainer(config, env, 100)

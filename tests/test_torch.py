@@ -13,17 +13,24 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from skrl.trainers.torch import SequentialTrainer
 
-from bounce_mjx import BounceBall, EnvConfig, vector
-from bounce_mjx.config import PPOConfig
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.adapters.torch import TorchVectorEnv
+from bounce_mjx.adapters.torch.gymnasium_env import TorchGymnasiumVectorEnv
+from bounce_mjx.adapters.torch.networks import (
+    Normalizer,
+    init_weights,
+    linears_of,
+    make_mlp,
+    to_policy,
+)
+from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
+from bounce_mjx.adapters.torch.skrl_ppo import SkrlEnv
+from bounce_mjx.commands.train_torch import make_learner, summarize
 from bounce_mjx.errors import UserError
-from bounce_mjx.policy import act, make_networks
-from bounce_mjx.torch import TorchVectorEnv
-from bounce_mjx.torch.gymnasium import TorchGymnasiumVectorEnv
-from bounce_mjx.torch.networks import Normalizer, init_weights, linears_of, make_mlp, to_policy
-from bounce_mjx.torch.packing import Layout
-from bounce_mjx.torch.rsl_rl import RslRlVecEnv, algorithm_config
-from bounce_mjx.torch.skrl import SkrlEnv
-from bounce_mjx.torch.train import make_learner, summarize
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.task import vector
 
 NUM_ENVS = 4
 # Both a fall (the ball reaches the floor after 0.3 s) and time-outs come within a test.
@@ -251,7 +258,7 @@ sys.modules["torch"] = None
 import jax, bounce_mjx, bounce_mjx.train, bounce_mjx.eval
 print(bounce_mjx.BounceBall().reset(jax.random.PRNGKey(0)).obs.shape)
 try:
-    import bounce_mjx.torch
+    import bounce_mjx.adapters.torch
 except ImportError as error:
     print(error)
 """
@@ -376,7 +383,7 @@ def test_normalizer_is_that_of_jax():
     """Over batches: the statistics and what they make of an observation, a constant one too."""
     from brax.training.acme import running_statistics
 
-    from bounce_mjx.policy import init_normalizer, normalize
+    from bounce_mjx.learning.policy import init_normalizer, normalize
 
     rng = np.random.default_rng(0)
     normalizer, statistics = Normalizer(3), init_normalizer(3)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bounce_mjx import eval as eval_command
-from bounce_mjx.config import load_config
-from bounce_mjx.runs import find_checkpoint, load_policy
-from bounce_mjx.torch import train as torch_train
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import train_torch as torch_train
+from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.folder import find_checkpoint, load_policy
 
 SCRIPT = Path(__file__).parent.parent / "train_torch.py"
 TINY = (
@@ -62,7 +62,7 @@ def test_run_is_evaluated_without_torch(run, tmp_path):
     out = tmp_path / "results.json"
     seed = load_config(run / "config.yaml").eval_seed
     script = f"""{NO_TORCH}
-from bounce_mjx.eval import main
+from bounce_mjx.commands.eval import main
 main([{str(run)!r}, "--episodes", "4", "--seed", "{seed}", "--json", {str(out)!r}])
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -107,7 +107,7 @@ def test_missing_library_is_told_in_a_sentence(missing, library, tmp_path):
 import sys
 sys.modules[{missing!r}] = None
 sys.argv = ["train_torch.py"] + {["--library", library, *TINY]!r}
-from bounce_mjx.torch.train import main
+from bounce_mjx.commands.train_torch import main
 main()
 """
     done = subprocess.run(

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx import BounceBall, vector
+from bounce_mjx import BounceBall
+from bounce_mjx.task import vector
 
 NUM_ENVS = 4
 STEPS = 70

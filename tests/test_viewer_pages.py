@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from bounce_mjx import view
+from bounce_mjx.commands import view
 from bounce_mjx.viewers.browser import reward_bars
 
 pytestmark = [

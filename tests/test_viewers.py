@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from bounce_mjx import BounceBall, EnvConfig, play, view
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.commands import play, view
 from bounce_mjx.resources import resource_path
 from bounce_mjx.viewers import offscreen, pace
 from bounce_mjx.viewers.controllers import (

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bounce_mjx import checkpoints
-from bounce_mjx.runs import Checkpoint
+from bounce_mjx.runs import checkpoint as checkpoints
+from bounce_mjx.runs.folder import Checkpoint
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
 STEPS = 256

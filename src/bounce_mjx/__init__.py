@@ -7,9 +7,9 @@ import io
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
 
-from bounce_mjx.config import EnvConfig
-from bounce_mjx.env import BounceBall
-from bounce_mjx.registration import register as _register
+from bounce_mjx.adapters.registration import register as _register
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
 
 __all__ = ["BounceBall", "EnvConfig"]
 

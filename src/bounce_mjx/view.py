@@ -1,61 +1,6 @@
-"""Shows the environment without a policy: `python -m bounce_mjx.view` (see --help)."""
+"""Shows the environment without a policy: `python -m bounce_mjx.view`."""
 
-import contextlib
-import sys
-from collections.abc import Sequence
-from typing import Annotated, Literal
-
-import tyro
-from rich.console import Console
-
-from bounce_mjx.cli import parse
-from bounce_mjx.config import EnvConfig, StrictModel
-from bounce_mjx.env import BounceBall
-from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.train import set_up_jax
-from bounce_mjx.viewers.command import ViewerOptions, show
-from bounce_mjx.viewers.controllers import (
-    make_random_controller,
-    make_scripted_controller,
-    make_zero_controller,
-)
-
-_CONTROLLERS = {
-    "random": make_random_controller,
-    "zero": make_zero_controller,
-    "scripted": make_scripted_controller,
-}
-
-
-class ViewCommand(StrictModel):
-    """The command line."""
-
-    actions: Literal["random", "zero", "scripted"] = "random"
-    """random: uniform; zero: the servos hold; scripted: a hand-written juggler."""
-    viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error(), contextlib.suppress(KeyboardInterrupt):
-        command = parse(
-            ViewCommand,
-            sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.view",
-            description="Shows the environment under random, zero or scripted actions.",
-        )
-        set_up_jax()
-        env = BounceBall(command.env)
-        show(
-            env,
-            _CONTROLLERS[command.actions](env),
-            command.viewing,
-            title=f"{command.actions} actions",
-            target_height=None,
-            console=Console(),
-        )
-
+from bounce_mjx.commands.view import main
 
 if __name__ == "__main__":
     main()

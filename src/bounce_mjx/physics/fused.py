@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.model import Addresses, find_addresses
 from bounce_mjx.physics import chain
 from bounce_mjx.physics.contact import ContactModel, normal_force, sphere_box
 from bounce_mjx.physics.kernel import elementwise
 from bounce_mjx.physics.scalars import Mat3, Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
 from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 
 class UnsupportedModelError(ValueError):

@@ -8,8 +8,8 @@ import mujoco
 from mujoco import mjx
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.model import find_addresses
 from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.robot.model import find_addresses
 
 
 class MjxModel(NamedTuple):

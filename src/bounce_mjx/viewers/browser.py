@@ -12,7 +12,7 @@ import viser.uplot
 from rich.console import Console
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene

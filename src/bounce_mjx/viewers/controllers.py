@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from brax.training.agents.ppo.networks import PPONetworks
 
-from bounce_mjx.env import BounceBall
-from bounce_mjx.policy import Policy, act
+from bounce_mjx.learning.policy import Policy, act
+from bounce_mjx.task.env import BounceBall
 
 Controller = Callable[[State, jax.Array], jax.Array]
 """(states of N environments, batch last; key, which is consumed) -> actions [6, N]."""

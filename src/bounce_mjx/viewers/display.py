@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import trimesh
 
-from bounce_mjx.config import EnvConfig
-from bounce_mjx.env import BounceBall
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
 
 TARGET_SITE = "target_height"
 HOME_SITE = "paddle_home"

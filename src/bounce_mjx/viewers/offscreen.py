@@ -7,8 +7,8 @@ import sys
 import mujoco
 import numpy as np
 
-from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.display import Display
 
 CAMERA = "overview"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from bounce_mjx.env import BounceBall
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, body_scenes, site_mesh
 from bounce_mjx.viewers.simulation import Frame
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 
-from bounce_mjx.env import BounceBall
-from bounce_mjx.model import find_addresses
-from bounce_mjx.rewards import TERM_NAMES
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers.controllers import Controller
 
 # Entries of the observation.

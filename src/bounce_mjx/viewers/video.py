@@ -9,8 +9,8 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from bounce_mjx.env import BounceBall
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.files import replace_file
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 from bounce_mjx.viewers.simulation import Frame, Simulation, resample

@@ -1,0 +1,1 @@
+"""The environment in the form that other libraries expect."""

@@ -1,0 +1,1 @@
+"""brax: its registry and what its trainers need."""

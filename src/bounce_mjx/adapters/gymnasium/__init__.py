@@ -1,0 +1,1 @@
+"""Gymnasium: one environment, and many at once."""

@@ -1,0 +1,41 @@
+"""Gymnasium's `VectorEnv` with tensors that stay on JAX's device."""
+
+from typing import Any
+
+import gymnasium
+import torch
+from gymnasium.vector import AutoresetMode
+
+from bounce_mjx.adapters.gymnasium.environments import ACTION_SPACE, OBSERVATION_SPACE
+from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+
+
+class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
+    """B environments. One that ends is reset within the step that ends it; `info["final_obs"]`
+    [B, 29] is what that step itself led to, for every environment, and `info["_final_obs"]` [B]
+    tells which have ended."""
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "torch": True}
+
+    def __init__(self, env: TorchVectorEnv):
+        self.env = env
+        self.num_envs = env.num_envs
+        self.single_action_space, self.single_observation_space = ACTION_SPACE, OBSERVATION_SPACE
+        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, env.num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(OBSERVATION_SPACE, env.num_envs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Starts every episode afresh: observations [B, 29], and no information."""
+        super().reset(seed=seed)
+        observation, _ = self.env.reset(seed)
+        return observation, {}
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advances every environment under the actions [B, 6], float32."""
+        result = self.env.step(actions)
+        info = {"final_obs": result.final_observation, "_final_obs": result.done}
+        return result.observation, result.reward, result.terminated, result.truncated, info

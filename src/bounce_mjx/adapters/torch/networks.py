@@ -1,0 +1,137 @@
+"""The networks of `policy.py` in PyTorch, and their way back to a `Policy`.
+
+Same layers, activation, initial weights and normalisation, so that what is learned in PyTorch can
+be saved, evaluated and shown by everything that takes a `Policy`.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from brax.training.types import UInt64
+from torch import nn
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import (
+    MAX_NORMALIZED,
+    MIN_STD,
+    MIN_VARIANCE,
+    Policy,
+    init_normalizer,
+    make_networks,
+)
+from bounce_mjx.robot.model import JOINT_NAMES
+from bounce_mjx.task.env import OBSERVATION_SIZE
+
+
+class Normalizer(nn.Module):
+    """`policy.normalize` with its running statistics.
+
+    It serves as rsl_rl's observation normaliser (`update`) and as skrl's preprocessor (`train`).
+    """
+
+    def __init__(self, size: int, device: torch.device | str | None = None):
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64, device=device))
+        self.register_buffer("mean", torch.zeros(size, device=device))
+        self.register_buffer("summed_variance", torch.zeros(size, device=device))
+        self.register_buffer("std", torch.ones(size, device=device))
+
+    @torch.no_grad()
+    def update(self, observation: torch.Tensor) -> None:
+        """Takes observations [..., N] into the statistics (Chan, Golub and LeVeque 1979)."""
+        batch = observation.reshape(-1, observation.shape[-1])
+        old_count = self.count.clone()
+        self.count += batch.shape[0]
+        batch_mean = batch.mean(0)
+        delta = batch_mean - self.mean
+        self.mean += delta * (batch.shape[0] / self.count)
+        self.summed_variance += (batch - batch_mean).square().sum(0)
+        self.summed_variance += delta.square() * (old_count * batch.shape[0] / self.count)
+        self.std = torch.sqrt(self.summed_variance / self.count + MIN_VARIANCE)
+
+    def forward(self, observation: torch.Tensor | None, train: bool = False) -> torch.Tensor | None:
+        """Normalises observations [..., N], after taking them in if `train` is set."""
+        if observation is None:
+            return None
+        if train:
+            self.update(observation)
+        standardized = (observation - self.mean) / self.std
+        clipped = standardized.clamp(-MAX_NORMALIZED, MAX_NORMALIZED)
+        return torch.where(self.std > MIN_STD, clipped, 0.0)
+
+
+def make_mlp(config: PPOConfig, num_inputs: int, num_outputs: int) -> nn.Sequential:
+    """The hidden layers of the config with SiLU between them, and a linear output."""
+    sizes = [num_inputs, *config.hidden_layers, num_outputs]
+    layers: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.SiLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def init_weights(mlp: nn.Sequential, output_gain: float) -> None:
+    """Orthogonal weights as in `policy.make_networks`: 0.01 is the gain of the mean's output,
+    sqrt(2) that of everything else."""
+    linears = linears_of(mlp)
+    for linear in linears:
+        gain = output_gain if linear is linears[-1] else 2**0.5
+        nn.init.orthogonal_(linear.weight, gain)
+        nn.init.zeros_(linear.bias)
+
+
+def linears_of(mlp: nn.Module) -> list[nn.Linear]:
+    """The linear layers of a network, in order."""
+    return [module for module in mlp.modules() if isinstance(module, nn.Linear)]
+
+
+def to_policy(
+    config: PPOConfig, normalizer: Normalizer, linears: Sequence[nn.Linear], log_std: torch.Tensor
+) -> Policy:
+    """The policy that acts as the networks do: same normalised observation, same mean.
+
+    Args:
+      normalizer: of the observation [29].
+      linears: hidden layers and output of the mean.
+      log_std: logarithm of the standard deviation [6].
+
+    Raises:
+      UserError: the layers are not those of the config.
+    """
+    layers = [
+        {"kernel": _array(linear.weight).T, "bias": _array(linear.bias)} for linear in linears
+    ]
+    params = {
+        "params": {
+            "MLP_0": {f"hidden_{i}": layer for i, layer in enumerate(layers[:-1])},
+            "Dense_0": layers[-1],
+            "std_logparam": {"log_value": _array(log_std)},
+        }
+    }
+    networks = make_networks(config, OBSERVATION_SIZE, len(JOINT_NAMES))
+    wanted = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
+    shapes, wanted_shapes = (jax.tree.map(lambda x: x.shape, tree) for tree in (params, wanted))
+    if shapes != wanted_shapes:
+        raise UserError(
+            f"the policy's network has layers {shapes}, but the config's has {wanted_shapes}; "
+            "build it with the hidden_layers of the config"
+        )
+    count = int(normalizer.count)
+    statistics = init_normalizer(OBSERVATION_SIZE).replace(
+        count=UInt64(hi=jnp.uint32(count >> 32), lo=jnp.uint32(count & 0xFFFFFFFF)),
+        mean=jnp.asarray(_array(normalizer.mean)),
+        std=jnp.asarray(_array(normalizer.std)),
+        summed_variance=jnp.asarray(_array(normalizer.summed_variance)),
+    )
+    # As float32, in which checkpoints hold it; brax starts it as a Python number.
+    statistics = statistics.replace(std_eps=jnp.float32(statistics.std_eps))
+    return Policy(statistics, jax.tree.map(jnp.asarray, params))
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    """A copy, as the training goes on in the tensor's memory."""
+    return tensor.detach().cpu().numpy().copy()

@@ -1,0 +1,231 @@
+"""rsl_rl (5.x): the environment as its `VecEnv`, and its PPO with this project's hyperparameters.
+
+| here                    | rsl_rl                                                              |
+|-------------------------|---------------------------------------------------------------------|
+| num_envs, rollout_length, num_epochs, num_minibatches, discount, gae_lambda, clip_epsilon,      |
+| entropy_cost, value_cost, reward_scale, init_noise_std, hidden_layers, critic_metrics | the same |
+| initial weights         | the same (`networks.py`)                                            |
+| normalisation           | the same formula; the statistics grow step by step (here by rollouts) |
+| advantages              | normalised in each minibatch: the same                              |
+| learning_rate           | the same start; steered by the KL of each minibatch: the same       |
+| target_kl               | `desired_kl`; 0 turns the steering off: the same                    |
+| factor of the steering  | 1.5 (here 1.1): fixed in rsl_rl                                     |
+| min, max and final_max_learning_rate, decay_steps | 1e-5 to 1e-2, no decay: fixed in rsl_rl   |
+| max_grad_norm           | of the actor and of the critic each (here of both together)         |
+| KL                      | exact for two Gaussians (here Schulman's estimate)                  |
+| minibatches             | shuffled once an iteration (here once an epoch)                     |
+| value at a time-out     | of the state before it (here of the last state)                     |
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import numpy as np
+import torch
+
+from bounce_mjx.adapters.torch.networks import Normalizer, init_weights, linears_of, to_policy
+from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.task.env import BounceBall
+
+try:
+    from rsl_rl.algorithms import PPO
+    from rsl_rl.env import VecEnv
+    from rsl_rl.models import MLPModel
+    from tensordict import TensorDict
+except ImportError as error:
+    raise UserError(
+        f"rsl_rl cannot be imported ({error}); install it with pip install 'bounce_mjx[torch]'"
+    ) from error
+
+
+class RslRlVecEnv(VecEnv):
+    """B environments as rsl_rl's runners want them.
+
+    The observation groups are `policy` [B, 29] and `critic` [B, K], the metrics that only the
+    value network should see. `extras` holds `time_outs` [B] and `log`, means over the batch.
+    """
+
+    def __init__(self, env: TorchVectorEnv):
+        self.env = env
+        self.num_envs = env.num_envs
+        self.num_actions = env.num_actions
+        self.max_episode_length = env.episode_steps
+        self.device = env.device
+        self.cfg = env.env.config
+        self._observations = self._groups(*env.reset())
+        self._result: StepResult | None = None
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Steps that count towards the time limit [B], int64; a copy, which may be set."""
+        return self.env.clock.long()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self.env.clock = value
+
+    def get_observations(self) -> TensorDict:
+        """The current observations."""
+        return self._observations
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advances every environment under the actions [B, 6].
+
+        Returns:
+          Observations, rewards [B], dones [B] (bool) and extras.
+        """
+        result = self._result = self.env.step(actions)
+        self._observations = self._groups(result.observation, result.critic_metrics)
+        means = zip(self.env.metric_names, result.metrics.unbind(), strict=True)
+        log = {f"task/{name}": mean for name, mean in means if name not in _SUMS}
+        extras = {"time_outs": result.truncated, "log": log}
+        return self._observations, result.reward, result.done, extras
+
+    def terminal_observations(self) -> TensorDict:
+        """What the last step itself led to: where an episode ended, its last observations and not
+        the first of the next one."""
+        return self._groups(self._result.final_observation, self._result.final_critic_metrics)
+
+    def step_metrics(self) -> torch.Tensor:
+        """Metrics of the last step [M], named by `TorchVectorEnv.metric_names`."""
+        return self._result.metrics
+
+    def _groups(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> TensorDict:
+        # Built on its device, as a conversion would wait for it.
+        return TensorDict(
+            {"policy": observation, "critic": critic_metrics},
+            batch_size=[self.num_envs],
+            device=self.device,
+        )
+
+
+# Sums over the episodes that ended on a step, whose mean over steps says nothing.
+_SUMS = frozenset({"ended", "return", "length", "bounces", "apex_error", "bounced", "non_finite"})
+
+
+class Network(MLPModel):
+    """rsl_rl's model with this project's normalisation and initial weights."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, obs_normalization=False, **kwargs)
+        self.obs_normalization = True
+        self.obs_normalizer = Normalizer(self.obs_dim)
+        init_weights(self.mlp, output_gain=2**0.5 if self.distribution is None else 0.01)
+
+
+class RslRlLearner:
+    """rsl_rl's PPO on its own storage, stepped by its runner's loop without the runner's log,
+    which would wait for the device at every step."""
+
+    library = "rsl_rl"
+
+    def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
+        """Builds environments, networks and algorithm."""
+        torch.manual_seed(seed)
+        self.config = config
+        self.vector = TorchVectorEnv(
+            env,
+            config.num_envs,
+            seed=seed,
+            critic_metrics=config.critic_metrics,
+            reward_scale=config.reward_scale,
+        )
+        self.env = RslRlVecEnv(self.vector)
+        self.env.episode_length_buf = torch.randint_like(
+            self.env.episode_length_buf, self.env.max_episode_length
+        )
+        self._observations = self.env.get_observations()
+        # rsl_rl prints its networks.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.algorithm = PPO.construct_algorithm(
+                self._observations, self.env, algorithm_config(config), str(self.env.device)
+            )
+
+    def learn(self, iterations: int) -> dict[str, np.ndarray]:
+        """Trains for `iterations`.
+
+        Returns:
+          The environment's metrics of each step [iterations, T], and the losses [iterations].
+        """
+        self.algorithm.train_mode()
+        rollouts, losses = [], []
+        for _ in range(iterations):
+            steps = []
+            with torch.inference_mode():
+                for _ in range(self.config.rollout_length):
+                    actions = self.algorithm.act(self._observations)
+                    self._observations, rewards, dones, extras = self.env.step(actions)
+                    self.algorithm.process_env_step(self._observations, rewards, dones, extras)
+                    steps.append(self.env.step_metrics())
+                self.algorithm.compute_returns(self._observations)
+            loss = self.algorithm.update()
+            rollouts.append(torch.stack(steps).cpu())
+            losses.append(
+                {
+                    "loss/policy": loss["surrogate"],
+                    "loss/value": loss["value"],
+                    "policy/entropy": loss["entropy"],
+                    "policy/learning_rate": self.algorithm.learning_rate,
+                }
+            )
+        per_step = torch.stack(rollouts).numpy()
+        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
+        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
+
+    def policy(self) -> Policy:
+        """The policy as it acts now, without its noise."""
+        actor = self.algorithm.get_policy()
+        return to_policy(
+            self.config,
+            actor.obs_normalizer,
+            linears_of(actor.mlp),
+            actor.distribution.log_std_param,
+        )
+
+
+def algorithm_config(config: PPOConfig) -> dict[str, Any]:
+    """The config as rsl_rl's runners and algorithms take it."""
+    network = {
+        "class_name": Network,
+        "hidden_dims": list(config.hidden_layers),
+        "activation": "swish",
+    }
+    return {
+        "num_steps_per_env": config.rollout_length,
+        "save_interval": 1_000_000_000,
+        # The environment lets nothing non-finite out, and the check waits for the device.
+        "check_for_nan": False,
+        "multi_gpu": None,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]},
+        "actor": network
+        | {
+            "distribution_cfg": {
+                "class_name": "GaussianDistribution",
+                "init_std": config.init_noise_std,
+                "std_type": "log",
+            }
+        },
+        "critic": network,
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": config.num_epochs,
+            "num_mini_batches": config.num_minibatches,
+            "clip_param": config.clip_epsilon,
+            "gamma": config.discount,
+            "lam": config.gae_lambda,
+            "value_loss_coef": config.value_cost,
+            "entropy_coef": config.entropy_cost,
+            "learning_rate": config.learning_rate,
+            "max_grad_norm": config.max_grad_norm,
+            "use_clipped_value_loss": False,
+            "schedule": "adaptive" if config.target_kl > 0.0 else "fixed",
+            "desired_kl": config.target_kl,
+            "normalize_advantage_per_mini_batch": True,
+        },
+    }

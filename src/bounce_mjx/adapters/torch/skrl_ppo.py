@@ -1,0 +1,286 @@
+"""skrl (2.x): the environment as its `Wrapper`, and its PPO with this project's hyperparameters.
+
+| here                    | skrl                                                                |
+|-------------------------|---------------------------------------------------------------------|
+| num_envs, rollout_length, num_epochs, num_minibatches, discount, gae_lambda, clip_epsilon,      |
+| entropy_cost, value_cost, reward_scale, max_grad_norm, init_noise_std, hidden_layers,           |
+| critic_metrics, initial weights | the same                                                    |
+| normalisation           | the same formula; statistics taken in during the first epoch        |
+| value at a time-out     | of the last state: the same, as the learner hands it on             |
+| learning_rate, its limits, decay_steps | the same                                             |
+| target_kl               | steers once an epoch by 1.5 (here once a minibatch by 1.1)          |
+| advantages              | normalised over the whole rollout (here in each minibatch)          |
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from bounce_mjx.adapters.torch.networks import (
+    Normalizer,
+    init_weights,
+    linears_of,
+    make_mlp,
+    to_policy,
+)
+from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import max_learning_rate
+from bounce_mjx.task.env import BounceBall
+
+try:
+    from skrl.agents.torch.ppo import PPO, PPO_CFG
+    from skrl.envs.wrappers.torch import Wrapper
+    from skrl.memories.torch import RandomMemory
+    from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
+    from skrl.resources.schedulers.torch import KLAdaptiveLR
+except ImportError as error:
+    raise UserError(
+        f"skrl cannot be imported ({error}); install it with pip install 'bounce_mjx[torch]'"
+    ) from error
+
+
+class SkrlEnv(Wrapper):
+    """B environments as skrl's trainers want them.
+
+    Rewards, terminated and truncated are [B, 1]; `state()` is what the value network sees, the
+    observation and the critic's metrics [B, 29 + K].
+    """
+
+    def __init__(self, env: TorchVectorEnv):
+        super().__init__(env)
+        num_states = env.num_observations + len(env.critic_metrics)
+        self._observation_space = _unbounded(env.num_observations)
+        self._state_space = _unbounded(num_states)
+        self._action_space = gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,))
+        self._states: torch.Tensor | None = None
+        self._result: StepResult | None = None
+
+    @property
+    def observation_space(self) -> gymnasium.Space:
+        return self._observation_space
+
+    @property
+    def state_space(self) -> gymnasium.Space:
+        return self._state_space
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        return self._action_space
+
+    def reset(self) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Starts every episode afresh."""
+        observation, critic_metrics = self._env.reset()
+        self._states = torch.cat([observation, critic_metrics], dim=-1)
+        return observation, {}
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advances every environment under the actions [B, 6]."""
+        result = self._result = self._env.step(actions)
+        self._states = torch.cat([result.observation, result.critic_metrics], dim=-1)
+        return (
+            result.observation,
+            result.reward[:, None],
+            result.terminated[:, None],
+            result.truncated[:, None],
+            {},
+        )
+
+    def state(self) -> torch.Tensor:
+        """What the value network sees [B, 29 + K]."""
+        return self._states
+
+    def terminal_observations(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Observations and states that the last step itself led to: where an episode ended, its
+        last ones and not the first of the next one."""
+        result = self._result
+        states = torch.cat([result.final_observation, result.final_critic_metrics], dim=-1)
+        return result.final_observation, states
+
+    def render(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing, as skrl asks for it at each step; see `bounce_mjx.gymnasium` for pictures."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class SkrlLearner:
+    """skrl's PPO, stepped as its trainers step it but with the terminal observations at an end,
+    from which it then bootstraps time-outs."""
+
+    library = "skrl"
+
+    def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
+        """Builds environments, networks and agent."""
+        torch.manual_seed(seed)
+        self.config = config
+        self.vector = TorchVectorEnv(
+            env,
+            config.num_envs,
+            seed=seed,
+            critic_metrics=config.critic_metrics,
+            reward_scale=config.reward_scale,
+        )
+        self.env = SkrlEnv(self.vector)
+        self._observations, _ = self.env.reset()
+        self._states = self.env.state()
+        self.vector.clock = torch.randint_like(self.vector.clock, self.vector.episode_steps)
+        self.agent = PPO(
+            models={"policy": _Actor(config, self.env), "value": _Critic(config, self.env)},
+            memory=RandomMemory(
+                memory_size=config.rollout_length,
+                num_envs=config.num_envs,
+                device=self.env.device,
+            ),
+            observation_space=self.env.observation_space,
+            state_space=self.env.state_space,
+            action_space=self.env.action_space,
+            device=self.env.device,
+            cfg=agent_config(config, self.env),
+        )
+        self.agent.init()
+        self.agent.enable_training_mode(True)
+        self._iteration = 0
+
+    def learn(self, iterations: int) -> dict[str, np.ndarray]:
+        """Trains for `iterations`.
+
+        Returns:
+          The environment's metrics of each step [iterations, T], and the losses [iterations].
+        """
+        rollouts, losses = [], []
+        for _ in range(iterations):
+            if self.agent.scheduler is not None:
+                self.agent.scheduler.max_lr = float(max_learning_rate(self.config, self._iteration))
+            self._iteration += 1
+            self.agent.tracking_data.clear()
+            rollouts.append(torch.stack([self._step() for _ in range(self.config.rollout_length)]))
+            tracked = self.agent.tracking_data
+            losses.append(
+                {
+                    "loss/policy": tracked["Loss / Policy loss"][-1],
+                    "loss/value": tracked["Loss / Value loss"][-1],
+                    "policy/action_std": tracked["Policy / Standard deviation"][-1],
+                    "policy/learning_rate": self.agent.optimizer.param_groups[0]["lr"],
+                }
+            )
+        per_step = torch.stack(rollouts).cpu().numpy()
+        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
+        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
+
+    def policy(self) -> Policy:
+        """The policy as it acts now, without its noise."""
+        actor = self.agent.policy
+        return to_policy(
+            self.config, self.agent._observation_preprocessor, linears_of(actor.mlp), actor.log_std
+        )
+
+    def _step(self) -> torch.Tensor:
+        """One step of every environment, and an update where it ends a rollout; its metrics."""
+        clock = {"timestep": 0, "timesteps": 0}
+        self.agent.pre_interaction(**clock)
+        with torch.no_grad():
+            actions, _ = self.agent.act(self._observations, self._states, **clock)
+            following, rewards, terminated, truncated, infos = self.env.step(actions)
+            final_observations, final_states = self.env.terminal_observations()
+            self.agent.record_transition(
+                observations=self._observations,
+                states=self._states,
+                actions=actions,
+                # skrl adds the bootstrapped value in place.
+                rewards=rewards.clone(),
+                next_observations=final_observations,
+                next_states=final_states,
+                terminated=terminated,
+                truncated=truncated,
+                infos=infos,
+                **clock,
+            )
+        self.agent.post_interaction(**clock)
+        self._observations, self._states = following, self.env.state()
+        return self.env._result.metrics
+
+
+def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
+    """The config as skrl's agent takes it."""
+    adaptive = config.target_kl > 0.0
+    return PPO_CFG(
+        rollouts=config.rollout_length,
+        learning_epochs=config.num_epochs,
+        mini_batches=config.num_minibatches,
+        discount_factor=config.discount,
+        gae_lambda=config.gae_lambda,
+        learning_rate=config.learning_rate,
+        learning_rate_scheduler=KLAdaptiveLR if adaptive else None,
+        learning_rate_scheduler_kwargs=(
+            {
+                "kl_threshold": config.target_kl,
+                "min_lr": config.min_learning_rate,
+                "max_lr": config.max_learning_rate,
+            }
+            if adaptive
+            else {}
+        ),
+        observation_preprocessor=Normalizer,
+        observation_preprocessor_kwargs={
+            "size": env.observation_space.shape[0],
+            "device": env.device,
+        },
+        state_preprocessor=Normalizer,
+        state_preprocessor_kwargs={"size": env.state_space.shape[0], "device": env.device},
+        grad_norm_clip=config.max_grad_norm,
+        ratio_clip=config.clip_epsilon,
+        value_clip=0.0,
+        entropy_loss_scale=config.entropy_cost,
+        value_loss_scale=config.value_cost,
+        time_limit_bootstrap=True,
+        experiment={"write_interval": 0, "checkpoint_interval": 0},
+    )
+
+
+def _model_arguments(env: SkrlEnv) -> dict[str, Any]:
+    return {
+        "observation_space": env.observation_space,
+        "state_space": env.state_space,
+        "action_space": env.action_space,
+        "device": env.device,
+    }
+
+
+class _Actor(GaussianMixin, Model):
+    def __init__(self, config: PPOConfig, env: SkrlEnv):
+        Model.__init__(self, **_model_arguments(env))
+        GaussianMixin.__init__(self)
+        self.mlp = make_mlp(config, self.num_observations, self.num_actions)
+        init_weights(self.mlp, output_gain=0.01)
+        self.log_std = torch.nn.Parameter(
+            torch.full((self.num_actions,), float(np.log(config.init_noise_std)))
+        )
+
+    def compute(
+        self, inputs: dict[str, Any], role: str = ""
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        return self.mlp(inputs["observations"]), {"log_std": self.log_std}
+
+
+class _Critic(DeterministicMixin, Model):
+    def __init__(self, config: PPOConfig, env: SkrlEnv):
+        Model.__init__(self, **_model_arguments(env))
+        DeterministicMixin.__init__(self)
+        self.mlp = make_mlp(config, self.num_states, 1)
+        init_weights(self.mlp, output_gain=2**0.5)
+
+    def compute(
+        self, inputs: dict[str, Any], role: str = ""
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        return self.mlp(inputs["states"]), {}
+
+
+def _unbounded(size: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-np.inf, np.inf, (size,))

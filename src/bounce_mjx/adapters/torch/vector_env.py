@@ -1,0 +1,291 @@
+"""Many environments at once for PyTorch: `vector.py` behind tensors.
+
+Tensors and arrays share their memory (DLPack), on the CPU as on CUDA, and nothing waits for the
+device: DLPack lets each library's stream wait for the other's. The state is donated to the next
+step, so nothing that a step hands out is a part of it.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import torch
+
+from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.ppo import step_metrics
+from bounce_mjx.task import vector
+from bounce_mjx.task.env import BounceBall
+
+
+class StepResult:
+    """What one step of B environments gave, as tensors that share memory with JAX's array.
+
+    All are views of one block of memory, made when they are first asked for.
+    """
+
+    def __init__(self, block: jax.Array, layout: Layout):
+        self._array, self._layout = block, layout
+        self._block = torch.from_dlpack(block)
+
+    @functools.cached_property
+    def observation(self) -> torch.Tensor:
+        """What to act on next [B, 29]: after an end, the first of the new episode."""
+        return self._layout.view(self._block, "observation")
+
+    @functools.cached_property
+    def critic_metrics(self) -> torch.Tensor:
+        """The metrics that only the value network sees, of the same instant [B, K]."""
+        return self._layout.view(self._block, "critic_metrics")
+
+    @functools.cached_property
+    def final_observation(self) -> torch.Tensor:
+        """What the step itself led to [B, 29]: at an end, the last of the old episode."""
+        return self._layout.view(self._block, "final_observation")
+
+    @functools.cached_property
+    def final_critic_metrics(self) -> torch.Tensor:
+        """The critic's metrics of `final_observation` [B, K]."""
+        return self._layout.view(self._block, "final_critic_metrics")
+
+    @functools.cached_property
+    def reward(self) -> torch.Tensor:
+        """Scaled [B]."""
+        return self._layout.view(self._block, "reward")
+
+    @functools.cached_property
+    def terminated(self) -> torch.Tensor:
+        """Whether the task ended the episode [B], bool."""
+        return self._layout.view(self._block, "terminated")
+
+    @functools.cached_property
+    def truncated(self) -> torch.Tensor:
+        """Whether only the time limit ended the episode [B], bool."""
+        return self._layout.view(self._block, "truncated")
+
+    @functools.cached_property
+    def done(self) -> torch.Tensor:
+        """Whether the episode ended [B], bool."""
+        return self._layout.view(self._block, "done")
+
+    @functools.cached_property
+    def metrics(self) -> torch.Tensor:
+        """Means and sums over the batch [M], named by `TorchVectorEnv.metric_names`."""
+        return self._layout.view(self._block, "metrics")
+
+
+class TorchVectorEnv:
+    """B environments whose ended episodes start afresh within the step that ended them."""
+
+    def __init__(
+        self,
+        env: BounceBall | None = None,
+        num_envs: int = 4096,
+        *,
+        seed: int = 0,
+        critic_metrics: tuple[str, ...] = ("n_bounces",),
+        reward_scale: float = 1.0,
+        device: torch.device | str | None = None,
+    ):
+        """Compiles nothing yet; `reset` and `step` do when they are first called.
+
+        Args:
+          env: the task; the default one if left out.
+          seed: of all resets.
+          critic_metrics: names of the metrics that a value network may see beside the
+            observation.
+          reward_scale: factor of the rewards.
+          device: where the tensors must lie; JAX's default device if left out.
+
+        Raises:
+          UserError: torch cannot use JAX's device, `device` is another one, or a metric is unknown.
+        """
+        self.env = env or BounceBall()
+        self.num_envs = num_envs
+        self.num_observations = self.env.observation_size
+        self.num_actions = self.env.action_size
+        self.episode_steps = self.env.config.episode_steps
+        self.critic_metrics = critic_metrics
+        self.device = _shared_device(None if device is None else torch.device(device))
+        self._reward_scale = reward_scale
+        self._key = jax.random.PRNGKey(seed)
+        self._template = jax.eval_shape(
+            lambda key: vector.reset(self.env, key, num_envs), self._key
+        )
+        known = self._template.env.metrics
+        unknown = [name for name in critic_metrics if name not in known]
+        if unknown:
+            raise UserError(
+                f"critic_metrics names {unknown[0]!r}, which is no metric of the environment; "
+                f"choose from {', '.join(sorted(known))}"
+            )
+        action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
+        carried = jax.eval_shape(self._start, self._key)[0]
+        _, arrays, metrics = jax.eval_shape(self._advance, carried, action)
+        self.metric_names = tuple(metrics)
+        metrics = jax.ShapeDtypeStruct((len(metrics),), jnp.float32)
+        self._carried_layout = Layout(carried)
+        self._result_layout = Layout(arrays._replace(metrics=metrics))
+        self._jit_start = jax.jit(self._packed_start)
+        self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
+        self._block: jax.Array | None = None
+
+    def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Starts every episode afresh, with resets drawn from `seed` if one is given.
+
+        Returns:
+          The observations [B, 29] and the critic's metrics [B, K].
+        """
+        if seed is not None:
+            self._key = jax.random.PRNGKey(seed)
+        self._key, key = jax.random.split(self._key)
+        self._block, observation, critic_metrics = self._jit_start(key)
+        return torch.from_dlpack(observation), torch.from_dlpack(critic_metrics)
+
+    def step(self, action: torch.Tensor) -> StepResult:
+        """Advances every environment.
+
+        Args:
+          action: [B, 6], float32, on the environments' device; clipped to [-1, 1]. It must not be
+            changed in place before the observation of this step has been used.
+
+        Raises:
+          UserError: the action has another shape, type or device, or `reset` was never called.
+        """
+        if (
+            action.dtype is not torch.float32
+            or action.device != self.device
+            or action.shape != (self.num_envs, self.num_actions)
+        ):
+            raise UserError(
+                f"the action is {action.dtype} {tuple(action.shape)} on {action.device}, but must "
+                f"be torch.float32 {(self.num_envs, self.num_actions)} on {self.device}; convert it"
+            )
+        if self._block is None:
+            raise UserError("step was called before reset; call reset first")
+        shared = jax.dlpack.from_dlpack(action.detach().contiguous())
+        self._block, result = self._jit_step(self._block, shared)
+        return StepResult(result, self._result_layout)
+
+    @property
+    def clock(self) -> torch.Tensor:
+        """Steps of each episode that count towards its time limit [B], int32; a copy. Setting it
+        spreads the time-outs of episodes that all began together."""
+        if self._block is None:
+            self.reset()
+        # A copy, as the next step takes the memory of the state.
+        carried = self._carried_layout.unpack(self._block)
+        return torch.from_dlpack(jnp.copy(carried.vector.clock))
+
+    @clock.setter
+    def clock(self, value: torch.Tensor) -> None:
+        if self._block is None:
+            self.reset()
+        clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32).contiguous())
+        carried = self._carried_layout.unpack(self._block)
+        self._block = self._carried_layout.pack(
+            carried._replace(vector=carried.vector._replace(clock=clock))
+        )
+
+    def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
+        key, reset_key = jax.random.split(key)
+        state = vector.reset(self.env, reset_key, self.num_envs)
+        return (
+            _Carried(_slim(state), key),
+            vector.observe(state),
+            self._critic_metrics(state.env.metrics),
+        )
+
+    def _packed_start(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        carried, observation, critic_metrics = self._start(key)
+        return self._carried_layout.pack(carried), observation, critic_metrics
+
+    def _packed_step(self, block: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        carried, arrays, metrics = self._advance(self._carried_layout.unpack(block), action)
+        arrays = arrays._replace(
+            metrics=jnp.concatenate([metrics[name] for name in self.metric_names])
+        )
+        return self._carried_layout.pack(carried), self._result_layout.pack(arrays)
+
+    def _advance(
+        self, carried: "_Carried", action: jax.Array
+    ) -> tuple["_Carried", "_StepArrays", dict[str, jax.Array]]:
+        key, reset_key = jax.random.split(carried.key)
+        state = _whole(carried.vector, self._template)
+        state, result = vector.step(self.env, state, action, reset_key, self.episode_steps)
+        arrays = _StepArrays(
+            observation=result.observation,
+            critic_metrics=self._critic_metrics(state.env.metrics),
+            final_observation=result.final_observation,
+            final_critic_metrics=self._critic_metrics(result.metrics),
+            reward=self._reward_scale * result.reward,
+            terminated=result.terminated,
+            truncated=result.truncated,
+            done=result.terminated | result.truncated,
+        )
+        return _Carried(_slim(state), key), arrays, step_metrics(result, groups=1)
+
+    def _critic_metrics(self, metrics: dict[str, jax.Array]) -> jax.Array:
+        """[B, K]."""
+        columns = [metrics[name] for name in self.critic_metrics]
+        return jnp.stack(columns, axis=-1) if columns else jnp.zeros((self.num_envs, 0))
+
+
+class _Carried(NamedTuple):
+    """What the next step needs."""
+
+    vector: vector.VectorState
+    key: jax.Array
+
+
+class _StepArrays(NamedTuple):
+    """The arrays behind a `StepResult`."""
+
+    observation: jax.Array
+    critic_metrics: jax.Array
+    final_observation: jax.Array
+    final_critic_metrics: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    done: jax.Array
+    metrics: jax.Array | None = None
+
+
+def _slim(state: vector.VectorState) -> vector.VectorState:
+    """The state without what no step reads."""
+    return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
+
+
+def _whole(slim: vector.VectorState, template: Any) -> vector.VectorState:
+    """A slim state with zeros for what it lacks, which the compiler drops."""
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template.env)
+    filled = slim.env.replace(
+        obs=zeros.obs, reward=zeros.reward, done=zeros.done, metrics=zeros.metrics
+    )
+    return slim._replace(env=filled)
+
+
+def _shared_device(wanted: torch.device | None) -> torch.device:
+    """The torch device of JAX's default device."""
+    device = jax.devices()[0]
+    if device.platform == "gpu" and not torch.cuda.is_available():
+        raise UserError(
+            f"JAX computes on {device.device_kind}, but this PyTorch has no CUDA; install a "
+            "PyTorch with CUDA, or start with JAX_PLATFORMS=cpu"
+        )
+    try:
+        shared = torch.from_dlpack(jnp.zeros(1)).device
+    except Exception as error:
+        raise UserError(
+            f"PyTorch cannot use the memory of JAX's {device.platform} device "
+            f"({str(error).splitlines()[0]}); start with JAX_PLATFORMS=cpu"
+        ) from error
+    same = wanted is None or (wanted.type == shared.type and wanted.index in (None, shared.index))
+    if not same:
+        raise UserError(
+            f"device is {wanted}, but JAX's arrays lie on {shared}; leave it out, or choose JAX's "
+            "device with JAX_PLATFORMS"
+        )
+    return shared

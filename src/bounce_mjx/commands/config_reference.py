@@ -1,0 +1,144 @@
+"""Prints the reference of every config key, taken from the types in `config.py`:
+
+python -m bounce_mjx.config_reference > docs/config.md
+"""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.runs.config import TrainConfig
+
+_HEAD = """# Config reference
+
+Every setting of a training. A key is written in a YAML file as nested groups (`--config FILE`, see
+[training](training.md)); the flag beside it is the same setting on the command line of
+`train_jax.py`, and wins over the file. An unknown key and a value out of range are refused.
+
+This page is generated from the types in `src/bounce_mjx/config.py`:
+
+    python -m bounce_mjx.config_reference > docs/config.md
+
+Some rules concern several keys, and their errors say what to change:
+
+- `env.control_dt` is a whole number of `env.physics_dt`, and `env.episode_seconds` no shorter;
+- `env.target_height_range` is 0 < low ≤ high;
+- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is no longer
+  than an episode;
+- `ppo.min_learning_rate` is no higher than the two upper limits;
+- `ppo.critic_metrics` names metrics of the environment.
+"""
+
+# A unit stands behind a comma in a key's description, at its end or before an addition.
+_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces)(?=[.;]| \()")
+
+
+def main() -> None:
+    """Prints the page."""
+    print(reference(), end="")
+
+
+def reference() -> str:
+    """The whole page, Markdown."""
+    return _HEAD + "".join(_section(model, prefix) for model, prefix in _groups(TrainConfig, ""))
+
+
+def flag(key: str) -> str:
+    """The flag of a key, such as --num-envs of ppo.num_envs."""
+    return "--" + key.removeprefix("env.").removeprefix("ppo.").replace("_", "-")
+
+
+def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[StrictModel], str]]:
+    """A group of settings and the groups in it, each with the prefix of its keys."""
+    yield model, prefix
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
+            yield from _groups(field.annotation, f"{prefix}{name}.")
+
+
+def _section(model: type[StrictModel], prefix: str) -> str:
+    rows = []
+    schema = model.model_json_schema()
+    for name, field in model.model_fields.items():
+        plain = schema["properties"][name]
+        if "$ref" in plain:
+            continue
+        text = " ".join((field.description or "").split())
+        units = _UNIT.findall(text)
+        cells = (
+            f"`{prefix}{name}`",
+            f"`{flag(prefix + name)}`",
+            _type(plain),
+            _default(plain.get("default")),
+            units[-1] if units else "",
+            _range(plain),
+            text,
+        )
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
+    title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
+    text = " ".join((model.__doc__ or "").split())
+    return (
+        f"\n## {title}\n\n{text}\n\n"
+        "| key | flag | type | default | unit | range | meaning |\n"
+        "|---|---|---|---|---|---|---|\n" + "".join(rows)
+    )
+
+
+def _type(plain: dict[str, Any]) -> str:
+    """A JSON schema's type in a word or two."""
+    if "anyOf" in plain:
+        return " or ".join(_type(option) for option in plain["anyOf"])
+    if "enum" in plain:
+        return "word"
+    if plain.get("format") == "path":
+        return "path"
+    if plain["type"] == "array":
+        items = plain.get("prefixItems")
+        one = _type(items[0] if items else plain["items"])
+        return f"{len(items)} of {one}" if items else f"list of {one}"
+    names = {"integer": "whole number", "string": "word", "boolean": "switch", "null": "nothing"}
+    return names.get(plain["type"], plain["type"])
+
+
+def _default(value: Any) -> str:
+    """A default as YAML writes it, six digits of a number."""
+    if isinstance(value, list):
+        return f"[{', '.join(_default(item) for item in value)}]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, int):
+        return f"{value:_}" if value >= 10_000 else str(value)
+    if isinstance(value, float):
+        # YAML takes a number with an exponent but no point for a word.
+        digits, exponent, power = f"{value:.6g}".partition("e")
+        return (
+            f"{digits}.0e{power}" if exponent and "." not in digits else digits + exponent + power
+        )
+    return str(value)
+
+
+def _range(plain: dict[str, Any]) -> str:
+    """The bounds of a JSON schema's value, or of the items of its list."""
+    if "enum" in plain:
+        return ", ".join(plain["enum"])
+    if "anyOf" in plain:
+        return next((text for text in map(_range, plain["anyOf"]) if text), "")
+    if plain.get("type") == "array":
+        items = plain.get("prefixItems")
+        each = _range(items[0] if items else plain["items"])
+        least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
+        return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
+    if plain.get("type") == "boolean":
+        return "true, false"
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
+    return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")
+
+
+def _bound(value: float) -> str:
+    return {2**31: "2^31", 10**12: "10^12"}.get(value, f"{value:g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Measures the five results of a trained policy: `python -m bounce_mjx.eval [CHECKPOINT]`."""
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from pydantic import Field
+from rich.console import Console
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
+from bounce_mjx.reports.tables import details_line, results_table
+from bounce_mjx.runs.choice import choose_checkpoint
+from bounce_mjx.runs.folder import load_policy, load_run_config
+from bounce_mjx.training.setup import set_up_jax
+
+
+class EvalCommand(StrictModel):
+    """The command line."""
+
+    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run, or
+    the policy that comes with the package where there is none."""
+    episodes: Annotated[int, Field(ge=1)] = DEFAULT_EPISODES
+    """Episodes, each from its own reset."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
+    """Seed of the resets."""
+    target_height: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
+    """One target height for all episodes, m; left out: the range of the run's config."""
+    physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
+    """Engine: mujoco is the C engine itself; config is the one that the run was trained on."""
+    json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
+    """File to write the results to."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Where to look for the newest run."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
+    with exit_on_user_error():
+        args = sys.argv[1:] if args is None else args
+        command = parse(
+            EvalCommand,
+            args,
+            prog="python -m bounce_mjx.eval",
+            description="Measures the five results of a trained policy.",
+        )
+        if command.json_file is not None:
+            _check_writable(command.json_file)
+        set_up_jax()
+        console = Console()
+        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
+        config = load_run_config(checkpoint.run)
+        policy = load_policy(checkpoint, config)
+        report, engine = evaluate_policy(
+            policy,
+            config.env,
+            config.ppo,
+            episodes=command.episodes,
+            seed=command.seed,
+            target_height=command.target_height,
+            physics=command.physics,
+        )
+        console.print(
+            f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        console.print(results_table(report, "the five results"))
+        console.print(details_line(report), highlight=False)
+        if command.json_file is not None:
+            plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
+            plain |= {"seed": command.seed, "target_height": command.target_height}
+            try:
+                command.json_file.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+            except OSError as error:
+                raise UserError(
+                    f"--json {command.json_file} cannot be written ({error.strerror}); give "
+                    "another file"
+                ) from error
+    sys.exit(0 if report.passed else 1)
+
+
+def _check_writable(json_file: Path) -> None:
+    """Spares the user an evaluation whose results could not be written."""
+    if not os.path.isdir(json_file.absolute().parent):
+        raise UserError(f"the folder of --json {json_file} does not exist; make it")
+    if os.path.isdir(json_file):
+        raise UserError(f"--json {json_file} is a folder; give a file")

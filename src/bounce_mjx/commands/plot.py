@@ -1,0 +1,64 @@
+"""Draws learning curves and an evaluation: `python -m bounce_mjx.plot [RUN ...]`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from pydantic import Field
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.reports.curves import group_runs
+from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
+from bounce_mjx.reports.page import record_checkpoint
+from bounce_mjx.runs.folder import find_checkpoint, load_run_config, newest_run, runs_of_seeds
+from bounce_mjx.task.env import BounceBall
+
+
+class PlotCommand(StrictModel):
+    """The command line."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Folders of runs; those that differ only in the seed become one curve with a band, as do the
+    seeds of one run. Left out: the newest run. Of one seed, or one checkpoint in it, the evaluation
+    is drawn too."""
+    out: Path = Path("plots")
+    """Folder for the pictures: curves, rewards and, of one run, evaluation."""
+    formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
+    """Formats of each picture."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Where to look for the newest run."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        command = parse(
+            PlotCommand,
+            sys.argv[1:] if args is None else args,
+            prog="python -m bounce_mjx.plot",
+            description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
+        )
+        runs = command.runs or (newest_run(command.log_dir),)
+        seeds = [seed for run in runs for seed in runs_of_seeds(run)]
+        checkpoints = [find_checkpoint(seed, command.log_dir) for seed in seeds]
+        groups = group_runs([checkpoint.run for checkpoint in checkpoints])
+        figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
+        if len(checkpoints) == 1:
+            env = BounceBall(load_run_config(checkpoints[0].run).env)
+            figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
+        for name, figure in figures.items():
+            for suffix in command.formats:
+                path = command.out / f"{name}.{suffix}"
+                try:
+                    command.out.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(image(figure, suffix))
+                except OSError as error:
+                    raise UserError(
+                        f"{path} cannot be written ({error.strerror}); choose another folder with "
+                        "--out"
+                    ) from error
+                print(path)

@@ -1,0 +1,37 @@
+"""Writes the report of a run: `bounce-mjx report [RUN]`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.reports.page import record_checkpoint, write_report
+from bounce_mjx.runs.folder import find_checkpoint
+
+
+class ReportCommand(StrictModel):
+    """The command line."""
+
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder; left out: the newest run."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Where to look for the newest run."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line."""
+    with exit_on_user_error():
+        command = parse(
+            ReportCommand,
+            sys.argv[1:] if args is None else args,
+            prog="python -m bounce_mjx.report",
+            description="Writes the report of a run, report.html in its folder.",
+        )
+        checkpoint = find_checkpoint(command.run, command.log_dir)
+        path, _ = write_report(checkpoint.run, record_checkpoint(checkpoint))
+        print(path)

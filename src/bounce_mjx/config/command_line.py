@@ -1,0 +1,133 @@
+"""Command lines made from config types, with one-sentence errors."""
+
+import difflib
+import itertools
+import sys
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+import pydantic
+import tyro
+
+# tyro's own hook for replacing its error boxes; unstable, so pyproject.toml bounds the version.
+from tyro import _errors as tyro_errors
+
+from bounce_mjx.config.validation import describe
+from bounce_mjx.errors import UserError
+
+CommandT = TypeVar("CommandT")
+
+
+def parse(
+    command_class: type[CommandT],
+    args: Sequence[str],
+    *,
+    prog: str,
+    description: str,
+    default: CommandT | None = None,
+) -> CommandT:
+    """Reads a command line into a config.
+
+    Args:
+      default: values of the flags that are not given; the type's own if left out.
+
+    Raises:
+      UserError: a flag is unknown or has a bad value.
+    """
+
+    def raise_user_error(event: tyro_errors.ParseErrorEvent) -> None:
+        raise UserError(f"{_mistake(event, command_class, args)} (see {prog} --help)")
+
+    with tyro_errors.on_parse_error(raise_user_error):
+        try:
+            return tyro.cli(
+                command_class,
+                args=list(args),
+                prog=prog,
+                description=description,
+                **({} if default is None else {"default": default}),
+            )
+        # tyro hands on the errors of groups without a prefix, and puts the others into an event.
+        except pydantic.ValidationError as error:
+            raise UserError(f"{_bad_value(error, command_class)} (see {prog} --help)") from error
+
+
+def _mistake(
+    event: tyro_errors.ParseErrorEvent, command_class: type[pydantic.BaseModel], args: Sequence[str]
+) -> str:
+    if isinstance(event, tyro_errors.UnrecognizedArgs):
+        given = event.tokens[0].split("=")[0].replace("_", "-")
+        near = difflib.get_close_matches(given, list(_flags(command_class)), n=1)
+        return f"unknown argument {event.tokens[0]}" + (
+            f"; did you mean {near[0]}?" if near else ""
+        )
+    invalid = _validation_error()
+    if invalid is not None:
+        return _bad_value(invalid, command_class)
+    argument = getattr(event, "argument", None)
+    if argument is None:
+        return "the command line is not understood"
+    flag = (argument.lowered.name_or_flags or [argument.field.extern_name])[0]
+    wanted = (argument.lowered.metavar or "no value").removeprefix("{None}|")
+    return f"{flag} takes {wanted}, but was given {_given(args, flag) or 'nothing'}"
+
+
+def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:
+    """The first mistake of a validation error, told by the flag."""
+    prefixes = {group.__name__: prefix for group, prefix in _groups(command_class)}
+    return describe(error, command_class, lambda name: _flag(prefixes[error.title] + name))
+
+
+def _validation_error() -> pydantic.ValidationError | None:
+    """The one that tyro is handling; its event has only the text."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, pydantic.ValidationError):
+        error = error.__context__
+    return error
+
+
+def _given(args: Sequence[str], flag: str) -> str:
+    """What the command line gives a flag."""
+    for i, word in enumerate(args):
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == flag:
+            values = itertools.takewhile(lambda word: not word.startswith("--"), args[i + 1 :])
+            return value if equals else " ".join(values)
+    return ""
+
+
+def _flags(command_class: type[pydantic.BaseModel]) -> Iterator[str]:
+    """The flags of a command, as tyro names them."""
+    for group, prefix in _groups(command_class):
+        for name, field in group.model_fields.items():
+            if tyro.conf.Positional in field.metadata or _is_group(field):
+                continue
+            yield _flag(prefix + _argument_name(name, field))
+            if field.annotation is bool:
+                yield _flag(f"{prefix}no-{name}")
+
+
+def _groups(
+    command_class: type[pydantic.BaseModel], prefix: str = ""
+) -> Iterator[tuple[type[pydantic.BaseModel], str]]:
+    """A command and the groups of settings in it, each with the prefix of its flags."""
+    yield command_class, prefix
+    for name, field in command_class.model_fields.items():
+        if _is_group(field):
+            inner = _argument_name(name, field)
+            yield from _groups(field.annotation, f"{prefix}{inner}." if inner else prefix)
+
+
+def _is_group(field: pydantic.fields.FieldInfo) -> bool:
+    annotation = field.annotation
+    return isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel)
+
+
+def _argument_name(name: str, field: pydantic.fields.FieldInfo) -> str:
+    """The name of a field's flag, which `tyro.conf.arg(name=...)` may replace."""
+    given = (getattr(mark, "name", None) for mark in field.metadata)
+    return next((new for new in given if isinstance(new, str)), name)
+
+
+def _flag(name: str) -> str:
+    return f"--{name}".replace("_", "-")

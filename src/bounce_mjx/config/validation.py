@@ -1,0 +1,105 @@
+"""Plain values turned into settings, with one sentence for a mistake."""
+
+import difflib
+import reprlib
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import pydantic
+
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError, shorten
+
+ConfigT = TypeVar("ConfigT", bound=StrictModel)
+
+
+def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:
+    """Builds a config from plain values.
+
+    Args:
+      source: where the values come from, for the error.
+
+    Raises:
+      UserError: a key is unknown or a value is out of range.
+    """
+    try:
+        return config_class.model_validate(values)
+    except pydantic.ValidationError as error:
+        raise UserError(f"{shorten(source)}: {describe(error, config_class)}") from error
+
+
+def describe(
+    error: pydantic.ValidationError,
+    config_class: type[pydantic.BaseModel],
+    spell: Callable[[str], str] = str,
+) -> str:
+    """The first mistake of a validation error as part of a sentence.
+
+    Args:
+      spell: how to write the dotted name of a setting.
+    """
+    first = error.errors()[0]
+    if first["type"] in ("extra_forbidden", "invalid_key"):
+        path = [shorten(str(part)) for part in first["loc"]]
+        return f"unknown key {'.'.join(path)}; {_advice(config_class, path)}"
+    path = [part for part in first["loc"] if isinstance(part, str)]
+    if first["type"] == "value_error":
+        reason = first["msg"].removeprefix("Value error, ")
+        return ": ".join([*path[-1:], shorten(reason, 500)])
+    return f"{spell('.'.join(path))} is {_quote(first['input'])}, but must {_wanted(error)}"
+
+
+class _Repr(reprlib.Repr):
+    """Python's notation, cut short: a file can describe a value without an end."""
+
+    def __init__(self):
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = 80
+        self.maxlevel = 3
+
+    def repr_int(self, x: int, level: int) -> str:
+        # Python refuses to write an integer of many digits.
+        return super().repr_int(x, level) if x.bit_length() < 1000 else "a very large number"
+
+
+def _quote(value: Any) -> str:
+    """A value of a user, as far as it fits into a sentence."""
+    return shorten(_Repr().repr(value))
+
+
+def _wanted(error: pydantic.ValidationError) -> str:
+    """What the first mistake should have been, after "must"."""
+    first = error.errors()[0]
+    if first["type"] == "missing":
+        beside = [e["loc"] for e in error.errors() if e["loc"][:-1] == first["loc"][:-1]]
+        return f"have {beside[-1][-1] + 1} items"
+    limits = first.get("ctx", {})
+    special = {
+        "model_type": "be a group of keys and values",
+        "path_type": "be a path",
+        "too_long": f"have {limits.get('max_length')} items",
+        "too_short": f"have at least {limits.get('min_length')} item",
+        "tuple_type": "be a list",
+    }
+    ordinary = first["msg"].removeprefix("Input should ").split(", unable")[0]
+    return special.get(first["type"], ordinary)
+
+
+def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
+    """What to do about an unknown key."""
+    known = list(_dotted_keys(config_class))
+    prefix = ".".join([*path[:-1], ""])
+    beside = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
+    same_name = [key for key in known if key.split(".")[-1] == path[-1]]
+    near = difflib.get_close_matches(path[-1], beside, n=1)
+    if near or same_name:
+        return f"did you mean {same_name[0] if same_name else prefix + near[0]}?"
+    return f"known keys here are {', '.join(sorted(beside))}"
+
+
+def _dotted_keys(config_class: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in config_class.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
+            yield from _dotted_keys(field.annotation, f"{prefix}{name}.")
+        else:
+            yield prefix + name

@@ -1,0 +1,86 @@
+"""The settings of the trainer."""
+
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from bounce_mjx.config.settings import (
+    Count,
+    NonNegative,
+    Positive,
+    Steps,
+    StrictModel,
+    UnitInterval,
+)
+
+
+class PPOConfig(StrictModel):
+    """Proximal policy optimisation (Schulman et al. 2017) with a KL-adaptive learning rate."""
+
+    num_envs: Count = 4096
+    """Environments that run in parallel."""
+    rollout_length: Count = 32
+    """Control steps of each environment in one iteration."""
+    num_epochs: Count = 4
+    """Passes over the data of one iteration."""
+    num_minibatches: Count = 8
+    """Minibatches in one epoch; must divide num_envs * rollout_length."""
+    learning_rate: Positive = 3e-4
+    """Learning rate at the start."""
+    min_learning_rate: Positive = 1e-5
+    """Lower limit of the learning rate."""
+    max_learning_rate: Positive = 3e-3
+    """Upper limit of the learning rate at the start of the training."""
+    final_max_learning_rate: Positive = 1e-4
+    """Upper limit of the learning rate at and after decay_steps."""
+    decay_steps: Steps = 20_000_000
+    """Environment steps over which the upper limit goes down, in equal ratios."""
+    target_kl: NonNegative = 0.01
+    """KL divergence of one update that the learning rate is steered to; 0 leaves it as it is."""
+    discount: UnitInterval = 0.98
+    """Discount factor of a control step."""
+    gae_lambda: UnitInterval = 0.95
+    """Lambda of the generalised advantage estimation."""
+    clip_epsilon: Positive = 0.2
+    """Clipping range of the probability ratio."""
+    entropy_cost: NonNegative = 0.0
+    """Weight of the entropy bonus."""
+    value_cost: NonNegative = 0.5
+    """Weight of the squared value error."""
+    max_grad_norm: Positive = 1.0
+    """Global norm to which a gradient is clipped."""
+    reward_scale: Positive = 0.1
+    """Factor of the reward that the trainer sees."""
+    init_noise_std: Positive = 0.4
+    """Standard deviation of the action noise at the start."""
+    hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
+    """Widths of the hidden layers of the policy and of the value network."""
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type in which the training computes the hidden layers. Parameters, outputs, losses and the
+    optimizer are float32, and so is every evaluation. bfloat16 is faster on a GPU."""
+    critic_metrics: tuple[str, ...] = ("n_bounces",)
+    """Metrics of the environment that the value network sees beside the observation. The reward
+    depends on the bounce count, which the observation lacks."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_batch_and_learning_rates(self):
+        limits = (self.final_max_learning_rate, self.max_learning_rate)
+        if self.min_learning_rate > min(limits):
+            raise ValueError(
+                f"min_learning_rate {self.min_learning_rate} is above the upper limits "
+                f"max_learning_rate {limits[1]} and final_max_learning_rate {limits[0]}; lower it"
+            )
+        batch = self.num_envs * self.rollout_length
+        if batch % self.num_minibatches:
+            raise ValueError(
+                f"num_minibatches {self.num_minibatches} does not divide the batch of "
+                f"{batch} samples (num_envs {self.num_envs} * rollout_length "
+                f"{self.rollout_length}); choose a divisor of {batch}"
+            )
+        return self
+
+    @property
+    def batch_steps(self) -> int:
+        """Environment steps in one iteration."""
+        return self.num_envs * self.rollout_length

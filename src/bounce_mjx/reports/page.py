@@ -1,0 +1,160 @@
+"""The report of a run, one self-contained page: `python -m bounce_mjx.report [RUN]`.
+
+The main job writes it too, once it has printed its results.
+"""
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from matplotlib.figure import Figure
+
+from bounce_mjx.config.files import dump_config
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.episodes import make_recording_evaluator
+from bounce_mjx.evaluation.recording import RECORDED_EPISODES, Recording
+from bounce_mjx.evaluation.results import DEFAULT_SEED, Report
+from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.reports.curves import group_runs
+from bounce_mjx.reports.figures import (
+    curves_figure,
+    evaluation_figure,
+    image,
+    rewards_figure,
+)
+from bounce_mjx.reports.tables import details_line, verdict
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.folder import (
+    Checkpoint,
+    load_policy,
+    load_results,
+    load_run_config,
+)
+from bounce_mjx.task.env import BounceBall
+
+REPORT_FILE = "report.html"
+
+
+def record_checkpoint(checkpoint: Checkpoint) -> Recording:
+    """Runs the policy of a checkpoint for some episodes, on the physics engine of its config."""
+    config = load_run_config(checkpoint.run)
+    policy = load_policy(checkpoint, config)
+    env = BounceBall(config.env)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
+    return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
+
+
+def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
+    """Writes `report.html` into a run's folder.
+
+    Args:
+      recording: episodes of the run's best checkpoint.
+
+    Returns:
+      The page, and its picture of the evaluation.
+
+    Raises:
+      UserError: the run has no results or no log yet, or the page cannot be written.
+    """
+    results = load_results(run)
+    if results is None:
+        raise UserError(f"{run} has no results yet; wait for the end of its training")
+    config = load_run_config(run)
+    groups = group_runs([run])
+    evaluation = evaluation_figure(BounceBall(config.env), recording)
+    figures = {
+        "Learning curves": curves_figure(groups),
+        "The best checkpoint": evaluation,
+        "Reward terms": rewards_figure(groups),
+    }
+    page = run / REPORT_FILE
+    try:
+        page.write_text(_page(run, config, results, figures), encoding="utf-8")
+    except OSError as error:
+        raise UserError(
+            f"{page} cannot be written ({error.strerror}); make the folder writable"
+        ) from error
+    return page, evaluation
+
+
+def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict[str, Figure]):
+    report = Report.from_dict(results)
+    met = sum(result.passed is not False for result in report.results)
+    pictures = "".join(
+        f'<h2>{title}</h2>\n<img alt="{title}" src="{_embed(figure)}">\n'
+        for title, figure in figures.items()
+    )
+    seconds = results["seconds"]
+    phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
+    names = [result.name for result in report.results]
+    evaluations = [
+        [f"{e['steps']:,}", *[f"{e[name]:.2f}" for name in names], "pass" if e["passed"] else "-"]
+        for e in results["evaluations"]
+    ]
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>bounce_mjx: {html.escape(run.name)}</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<h1>{met} of {len(report.results)} results met</h1>
+<p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
+{html.escape(results["device"])}. The best of {len(evaluations)} evaluations, after
+{results["best_steps"]:,} of {results["trained_steps"]:,} environment steps:
+{html.escape(details_line(report))}.</p>
+{_results(report)}
+{pictures}
+<h2>Where the time went</h2>
+{_table(["phase", "seconds"], [*phases, ["together", f"{sum(seconds.values()):.1f}"]])}
+<h2>All evaluations</h2>
+{_table(["environment steps", *names, "all five"], evaluations)}
+<details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>
+</body>
+</html>
+"""
+
+
+def _results(report: Report) -> str:
+    rows = [
+        [result.name, result.measured, f"{result.value:.2f}", result.bound, verdict(result)]
+        for result in report.results
+    ]
+    return _table(["result", "measured", "value", "bound", ""], rows)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; a cell is coloured where it is a verdict."""
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        inner = "".join(f'<{tag} class="{_class(c)}">{html.escape(c)}</{tag}>' for c in cells)
+        return f"<tr>{inner}</tr>\n"
+
+    body = "".join(row("td", cells) for cells in rows)
+    return f"<table>\n{row('th', header)}{body}</table>"
+
+
+def _class(cell: str) -> str:
+    return {"pass": "pass", "FAIL": "fail"}.get(cell, "")
+
+
+def _embed(figure: Figure) -> str:
+    return f"data:image/svg+xml;base64,{base64.b64encode(image(figure, 'svg')).decode()}"
+
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; background: #fff; }
+h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
+img { width: 100%; }
+table { border-collapse: collapse; }
+th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
+.pass { color: #00704f; font-weight: bold; } .fail { color: #b00020; font-weight: bold; }
+code, pre { font-size: 13px; } summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
+"""

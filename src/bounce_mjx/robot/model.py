@@ -1,0 +1,122 @@
+"""The simulated robot: the MJCF file, the names it must have, and where their data lie."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.resources import resource_path
+
+JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
+BALL_BODY_NAME = "ball_link"
+PADDLE_GEOM_NAME = "blocker"
+
+
+class Addresses(NamedTuple):
+    """Where the named parts lie in the model's arrays."""
+
+    arm_joints: tuple[int, ...]
+    """Ids of Joint1..Joint6."""
+    arm_qpos: tuple[int, ...]
+    """Joint angles in qpos."""
+    arm_qvel: tuple[int, ...]
+    """Joint velocities in qvel."""
+    actuators: tuple[int, ...]
+    """Servos of Joint1..Joint6 in ctrl."""
+    ball_body: int
+    ball_geom: int
+    ball_qpos: tuple[int, ...]
+    """The ball's position (3) and quaternion (4) in qpos."""
+    ball_qvel: tuple[int, ...]
+    """The ball's linear (3) and angular (3) velocity in qvel."""
+    paddle_geom: int
+
+
+def load_model(mjcf: Path | None, physics_dt: float) -> mujoco.MjModel:
+    """Compiles an MJCF file.
+
+    Args:
+      mjcf: the file; None for the project's own robot.
+      physics_dt: physics time step, s.
+
+    Raises:
+      UserError: the file is missing, is no MJCF, or lacks a name that the task needs.
+    """
+    path = mjcf or resource_path("mjcf/bounce_ball.xml")
+    if not os.path.isfile(path):
+        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+    try:
+        mj_model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"the MJCF file {path} does not compile ({reason}); mend it") from error
+    mj_model.opt.timestep = physics_dt
+    try:
+        find_addresses(mj_model)
+    except UserError as error:
+        raise UserError(f"the MJCF file {path} has {error}") from error
+    return mj_model
+
+
+def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
+    """Addresses of the task's parts.
+
+    Raises:
+      UserError: a needed name is missing; the text starts with what the model lacks.
+    """
+    joints = tuple(_find(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in JOINT_NAMES)
+    ball_body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, BALL_BODY_NAME)
+    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
+
+    ball_joint = mj_model.body_jntadr[ball_body]
+    if ball_joint < 0 or mj_model.jnt_type[ball_joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise UserError(f"no free joint on the body {BALL_BODY_NAME}; add <freejoint/> to it")
+    if mj_model.body_geomnum[ball_body] < 1:
+        raise UserError(f"no geom on the body {BALL_BODY_NAME}; add the ball's sphere to it")
+    actuators = []
+    for joint, name in zip(joints, JOINT_NAMES, strict=True):
+        driving = [
+            i
+            for i in range(len(mj_model.actuator_trntype))
+            if mj_model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+            and mj_model.actuator_trnid[i, 0] == joint
+        ]
+        if len(driving) != 1:
+            raise UserError(
+                f"{len(driving)} actuators on {name}; give it exactly one position servo"
+            )
+        actuators.append(driving[0])
+    ball_qpos, ball_qvel = mj_model.jnt_qposadr[ball_joint], mj_model.jnt_dofadr[ball_joint]
+    return Addresses(
+        arm_joints=joints,
+        arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
+        arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
+        actuators=tuple(actuators),
+        ball_body=ball_body,
+        ball_geom=_ball_geom(mj_model, ball_body),
+        ball_qpos=tuple(range(ball_qpos, ball_qpos + 7)),
+        ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
+        paddle_geom=paddle_geom,
+    )
+
+
+def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
+    """The ball's geom that the contact pair names, or else its first one."""
+    of_ball = {
+        int(geom)
+        for pair in range(mj_model.npair)
+        for geom in (mj_model.pair_geom1[pair], mj_model.pair_geom2[pair])
+        if mj_model.geom_bodyid[geom] == ball_body
+    }
+    return min(of_ball, default=int(mj_model.body_geomadr[ball_body]))
+
+
+def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    index = mujoco.mj_name2id(mj_model, kind, name)
+    if index < 0:
+        noun = kind.name.removeprefix("mjOBJ_").lower()
+        needed = ", ".join((*JOINT_NAMES, BALL_BODY_NAME, PADDLE_GEOM_NAME))
+        raise UserError(f"no {noun} named {name}; the task needs the names {needed}")
+    return index

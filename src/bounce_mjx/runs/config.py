@@ -1,0 +1,77 @@
+"""The settings of a training run, and the files that hold them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import yaml
+from pydantic import Field
+
+from bounce_mjx.config.settings import Count, PlainPath, Steps, StrictModel
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.task.config import EnvConfig
+
+
+class TrainConfig(StrictModel):
+    """A training run: the task, the trainer, and how long and how often."""
+
+    env: EnvConfig = EnvConfig()
+    """The task."""
+    ppo: PPOConfig = PPOConfig()
+    """The trainer."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Seed of the whole training."""
+    num_seeds: Count = 1
+    """Independent trainings in one program, from seeds `seed`, `seed` + 1, ...; a folder each."""
+    num_devices: Count | None = None
+    """Devices that share the environments (with several seeds: the seeds); left out, one, and on
+    several hosts all. The training does not depend on it."""
+    total_steps: Steps = 50_000_000
+    """Environment steps to train for, rounded up to whole blocks."""
+    block_steps: Steps = 1_000_000
+    """Environment steps between two progress reports, rounded to whole iterations."""
+    eval_every: Steps = 2_000_000
+    """Environment steps between two evaluations, rounded to whole blocks."""
+    eval_episodes: Count = 1024
+    """Episodes of an evaluation of the five results."""
+    screening_episodes: Annotated[int, Field(ge=0)] = 0
+    """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
+    eval_seed: Annotated[int, Field(ge=0, lt=2**31)] = 10_000
+    """Seed of the evaluations during the training."""
+    stop_when_solved: bool = False
+    """End at the first evaluation that meets all five results."""
+    log_dir: PlainPath = Path("runs/bounce_ball")
+    """Folder in which the run makes its own, named by the time."""
+
+
+_MAX_CONFIG_BYTES = 2**20
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Reads a run's config from a YAML file, missing keys at their defaults.
+
+    Raises:
+      UserError: the file is missing, is no YAML mapping, or holds an unknown key or a bad value.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MAX_CONFIG_BYTES + 1)
+        if len(data) > _MAX_CONFIG_BYTES:
+            raise ValueError(f"it is longer than {_MAX_CONFIG_BYTES} bytes")
+        values = yaml.safe_load(data.decode("utf-8"))
+    # PyYAML raises many types where a value has the form of a number or a date but is none.
+    except Exception as error:
+        reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())
+        raise UserError(
+            f"the config file {shorten(str(path))} cannot be read ({shorten(reason, 300)}); give a "
+            "YAML file such as configs/default.yaml"
+        ) from error
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise UserError(
+            f"the config file {shorten(str(path))} holds a {type(values).__name__}, not a mapping "
+            "of keys to values; write it like configs/default.yaml"
+        )
+    return validate(TrainConfig, values, str(path))

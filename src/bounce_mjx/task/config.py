@@ -1,0 +1,102 @@
+"""The settings of the task."""
+
+import math
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+
+from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.task.reward_config import RewardConfig
+
+ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+
+class EnvConfig(StrictModel):
+    """The task: the model, its time steps, the resets, the bounces, the ends and the reward."""
+
+    physics: Literal["auto", "fused", "mjx"] = "auto"
+    """Physics engine: fused (straight-line, fast), mjx (any MJCF), auto (fused where it can)."""
+    mjcf: PlainPath | None = None
+    """MJCF file to simulate; the project's own robot where it is left out."""
+    physics_dt: Positive = 0.001
+    """Physics time step, s."""
+    control_dt: Positive = 0.01
+    """Time between two actions, s; a whole number of physics steps."""
+    episode_seconds: Positive = 20.0
+    """Length of an episode before it is truncated, s."""
+    action_scale: Positive = 0.02
+    """Change of the servo target that the action 1 asks for, rad."""
+    default_joint_angles: ArmVector = tuple(math.radians(a) for a in (0, 40, 110, 0, -60, 0))
+    """Joint angles of a reset before noise, rad."""
+    joint_angle_noise: NonNegative = 0.1
+    """Half-width of the uniform noise of the joint angles at a reset, rad."""
+    joint_velocity_noise: NonNegative = 0.01
+    """Half-width of the uniform noise of the joint velocities at a reset, rad/s."""
+    ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
+    """Ball position of a reset before noise, m."""
+    ball_position_noise: NonNegative = 0.01
+    """Half-width of the uniform noise of each ball coordinate at a reset, m."""
+    target_height_range: tuple[float, float] = (0.4, 0.6)
+    """Range from which a reset draws the target height, m; equal ends fix it."""
+    bounce_min_velocity: NonNegative = 0.01
+    """Vertical velocity above which the ball counts as rising, m/s."""
+    bounce_max_distance: Positive = 0.12
+    """Vertical distance ball-paddle within which a reversal is a bounce, m."""
+    apex_tolerance: NonNegative = 0.1
+    """How far below the target an apex may stay and still continue the bounce count, m."""
+    min_ball_height: Finite = 0.05
+    """The episode ends when the ball is below this height, m."""
+    max_height_above_target: Positive = 1.0
+    """The episode ends when the ball is higher than this above the target height, m."""
+    max_horizontal_distance: Positive = 1.5
+    """The episode ends when |x| or |y| of the ball exceeds this, m."""
+    max_joint_velocity: Positive = 2.0 * math.pi
+    """The episode ends when a joint is faster than this, rad/s."""
+    reward: RewardConfig = RewardConfig()
+    """The reward terms."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_times_and_ranges(self):
+        substeps = self.control_dt / self.physics_dt
+        if not max(substeps, self.episode_seconds / self.control_dt) < 2**31:
+            raise ValueError(
+                f"control_dt {self.control_dt} is too long for physics_dt {self.physics_dt} or too "
+                f"short for episode_seconds {self.episode_seconds}; choose times less far apart"
+            )
+        if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
+            raise ValueError(
+                f"control_dt {self.control_dt} is not a whole number of physics steps of "
+                f"{self.physics_dt} s; choose a multiple of physics_dt"
+            )
+        if self.episode_seconds < self.control_dt:
+            raise ValueError(
+                f"episode_seconds {self.episode_seconds} is shorter than one control step of "
+                f"{self.control_dt} s; choose a longer episode"
+            )
+        low, high = self.target_height_range
+        if not 0.0 < low <= high < math.inf:
+            raise ValueError(
+                f"target_height_range {self.target_height_range} is not 0 < low <= high; "
+                "give two heights in metres, the lower first"
+            )
+        return self
+
+    @pydantic.field_validator("mjcf")
+    @classmethod
+    def _make_absolute(cls, path: Path | None) -> Path | None:
+        """A run's config is read from other folders too."""
+        try:
+            return None if path is None else path.expanduser().absolute()
+        except RuntimeError as error:
+            raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
+
+    @property
+    def num_substeps(self) -> int:
+        """Physics steps in one control step."""
+        return round(self.control_dt / self.physics_dt)
+
+    @property
+    def episode_steps(self) -> int:
+        """Control steps in one episode."""
+        return round(self.episode_seconds / self.control_dt)

@@ -1,0 +1,256 @@
+"""`BounceBall`: the arm, the ball, and the task of bouncing it at a chosen height."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from brax.envs.base import Env, State
+
+from bounce_mjx.physics import Engine, PhysicsState, make_engine
+from bounce_mjx.robot.model import JOINT_NAMES, find_addresses, load_model
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.rewards import TERM_NAMES, RewardInputs, weighted_terms
+
+OBSERVATION_SIZE = 29
+# MuJoCo's mjMAXVAL: a coordinate beyond it has diverged, and counts as non-finite.
+_MAX_COORDINATE = 1e10
+
+
+class TaskState(NamedTuple):
+    """What an episode carries beside the physics."""
+
+    target_height: jax.Array
+    """Height [] to which the ball is to bounce, m."""
+    last_action: jax.Array
+    """Clipped action of the last step [6]."""
+    rising: jax.Array
+    """Whether the ball moved upward after the last step [], bool."""
+    n_bounces: jax.Array
+    """Consecutive bounces [], float."""
+    apex: jax.Array
+    """Highest ball position since the last bounce [], m."""
+
+
+class BounceState(NamedTuple):
+    """The whole state of one environment: brax's `pipeline_state`."""
+
+    physics: PhysicsState
+    task: TaskState
+
+
+class BounceBall(Env):
+    """One environment, unbatched and pure: `jax.vmap` and `jax.jit` its `reset` and `step`.
+
+    `done` is 1 where the episode terminated; time-outs belong to the training wrapper.
+    """
+
+    def __init__(self, config: EnvConfig | None = None):
+        """Compiles the model and chooses the physics engine.
+
+        Raises:
+          UserError: the MJCF file or the engine does not fit the task.
+        """
+        self.config = config or EnvConfig()
+        self.mj_model: mujoco.MjModel = load_model(self.config.mjcf, self.config.physics_dt)
+        self.engine: Engine = make_engine(self.mj_model, self.config.physics)
+        self._addresses = find_addresses(self.mj_model)
+
+    @property
+    def dt(self) -> float:
+        """Time of one control step, s."""
+        return self.config.control_dt
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return OBSERVATION_SIZE
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+        return len(JOINT_NAMES)
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics engine."""
+        return self.engine.name
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts an episode; consumes the key `rng`."""
+        config, at = self.config, self._addresses
+        # One draw for everything: the keys of separate draws would cost more than the numbers.
+        noise = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
+        zero = jnp.zeros((), noise.dtype)
+        low, high = config.target_height_range
+
+        qpos = [jnp.asarray(q, noise.dtype) for q in self.mj_model.qpos0]
+        qvel = [zero] * self.mj_model.nv
+        for i, angle in enumerate(config.default_joint_angles):
+            qpos[at.arm_qpos[i]] = angle + config.joint_angle_noise * noise[i]
+            qvel[at.arm_qvel[i]] = config.joint_velocity_noise * noise[6 + i]
+        for i, coordinate in enumerate(config.ball_init_pos):
+            qpos[at.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
+        for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
+            qpos[at.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
+        physics = PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
+
+        task = TaskState(
+            target_height=low + (high - low) * 0.5 * (noise[15] + 1.0),
+            last_action=jnp.zeros(self.action_size, noise.dtype),
+            rising=jnp.zeros((), bool),
+            n_bounces=zero,
+            apex=physics.qpos[at.ball_qpos[2]],
+        )
+        metrics = {f"reward/{name}": zero for name in TERM_NAMES}
+        metrics |= dict.fromkeys(
+            ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"), zero
+        )
+        return State(
+            pipeline_state=BounceState(physics, task),
+            obs=self._observation(physics, task, self.engine.paddle_position(physics.qpos)),
+            reward=zero,
+            done=zero,
+            metrics=metrics,
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one control step under the action [6], clipped to [-1, 1]."""
+        action = jnp.clip(action, -1.0, 1.0)
+        before = state.pipeline_state
+        physics = self.engine.step(
+            before.physics, self.servo_targets(before.physics, action), self.config.num_substeps
+        )
+        return self.finish_step(state, action, physics)
+
+    def servo_targets(self, physics: PhysicsState, action: jax.Array) -> jax.Array:
+        """Servo targets ctrl [nu] (rad) of a clipped action [6]: the measured joint angles plus
+        the scaled action, clipped to the joint ranges."""
+        at = self._addresses
+        ranges = self.mj_model.jnt_range[at.arm_joints,]
+        targets = [jnp.zeros_like(action[0])] * self.mj_model.nu
+        # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
+        for i, actuator in enumerate(at.actuators):
+            target = physics.qpos[at.arm_qpos[i]] + self.config.action_scale * action[i]
+            targets[actuator] = jnp.clip(target, *(float(limit) for limit in ranges[i]))
+        return jnp.stack(targets)
+
+    def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
+        """The task's part of a step: bounces, reward, end and observation, given the clipped
+        action [6] and the physics state that it led to (by whichever engine).
+
+        A non-finite physics state ends the episode and is replaced by the one before it, so that
+        nothing non-finite leaves the environment.
+        """
+        config, at = self.config, self._addresses
+        before = state.pipeline_state
+        finite = jnp.array(True)
+        for coordinates in physics:
+            finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
+        # What came before is itself looked at, in case the memory was damaged.
+        physics = jax.tree.map(
+            lambda new, old: jnp.where(
+                finite, new, jnp.where(jnp.abs(old) < _MAX_COORDINATE, old, 0.0)
+            ),
+            physics,
+            before.physics,
+        )
+        action = jnp.where(finite, action, before.task.last_action)
+
+        ball = jnp.stack([physics.qpos[i] for i in at.ball_qpos[:3]])
+        ball_velocity = jnp.stack([physics.qvel[i] for i in at.ball_qvel[:3]])
+        joint_velocity = jnp.stack([physics.qvel[i] for i in at.arm_qvel])
+        paddle = self.engine.paddle_position(physics.qpos)
+
+        task, bounced = update_task(config, before.task, ball, ball_velocity, paddle, action)
+        terms = weighted_terms(
+            config.reward,
+            RewardInputs(
+                ball_position=ball,
+                ball_velocity=ball_velocity,
+                paddle_position=paddle,
+                target_height=task.target_height,
+                n_bounces=task.n_bounces,
+                bounced=bounced,
+                action=action,
+                last_action=before.task.last_action,
+                joint_velocity=joint_velocity,
+            ),
+        )
+        ended = ~finite | terminated(config, ball, joint_velocity, task.target_height)
+        target = jnp.array([config.reward.target_x, config.reward.target_y], ball.dtype)
+        apex_error = jnp.abs(before.task.apex - task.target_height)
+
+        dtype = ball.dtype
+        metrics = {f"reward/{name}": value for name, value in terms.items()}
+        metrics |= {
+            "bounced": bounced.astype(dtype),
+            "n_bounces": task.n_bounces,
+            "ball_xy_error": jnp.linalg.norm(ball[:2] - target),
+            "apex_error": jnp.where(bounced, apex_error, 0.0),
+            "non_finite": (~finite).astype(dtype),
+        }
+        return state.replace(
+            pipeline_state=BounceState(physics, task),
+            obs=self._observation(physics, task, paddle),
+            reward=sum(terms.values()),
+            done=ended.astype(dtype),
+            metrics=metrics,
+        )
+
+    def _observation(self, physics: PhysicsState, task: TaskState, paddle: jax.Array) -> jax.Array:
+        """[29]: joint angles 6, ball position 3 and quaternion 4, joint velocities 6, ball's
+        linear 3 and angular 3 velocity, paddle position 3, target height 1."""
+        at = self._addresses
+        entries = [physics.qpos[i] for i in at.arm_qpos + at.ball_qpos]
+        entries += [physics.qvel[i] for i in at.arm_qvel + at.ball_qvel]
+        entries += [paddle[0], paddle[1], paddle[2], task.target_height]
+        return jnp.stack(entries)
+
+
+def update_task(
+    config: EnvConfig,
+    task: TaskState,
+    ball: jax.Array,
+    ball_velocity: jax.Array,
+    paddle: jax.Array,
+    action: jax.Array,
+) -> tuple[TaskState, jax.Array]:
+    """Detects a bounce and counts it.
+
+    A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
+    the apex before it was no lower than the tolerance below the target height; otherwise the
+    count restarts at 1, which is also what the first bounce of an episode comes to.
+
+    Args:
+      ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
+      action: clipped action [6] of the step.
+
+    Returns:
+      The new task state, and whether this step is a bounce [] (bool).
+    """
+    rising = ball_velocity[2] > config.bounce_min_velocity
+    near = jnp.abs(ball[2] - paddle[2]) < config.bounce_max_distance
+    bounced = rising & ~task.rising & near
+    continues = task.apex > task.target_height - config.apex_tolerance
+    counted = jnp.where(continues, task.n_bounces + 1.0, 1.0)
+    updated = TaskState(
+        target_height=task.target_height,
+        last_action=action,
+        rising=rising,
+        n_bounces=jnp.where(bounced, counted, task.n_bounces),
+        apex=jnp.where(bounced, ball[2], jnp.maximum(task.apex, ball[2])),
+    )
+    return updated, bounced
+
+
+def terminated(
+    config: EnvConfig, ball: jax.Array, joint_velocity: jax.Array, target_height: jax.Array
+) -> jax.Array:
+    """Whether the episode ends [] (bool): the ball fell, flew too high or too far, or a joint is
+    too fast. Units m and rad/s."""
+    fell = ball[2] < config.min_ball_height
+    too_high = ball[2] > target_height + config.max_height_above_target
+    too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
+    too_fast = jnp.any(jnp.abs(joint_velocity) > config.max_joint_velocity)
+    return fell | too_high | too_far | too_fast

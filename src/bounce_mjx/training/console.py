@@ -1,0 +1,156 @@
+"""What a training shows and writes while it runs: the progress line and the TensorBoard log."""
+
+import math
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.reports.tables import results_markdown
+from bounce_mjx.runs.config import TrainConfig
+
+if typing.TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
+
+
+class Reporter:
+    """Shows a progress bar on a terminal, a line a block elsewhere, and logs to TensorBoard."""
+
+    def __init__(
+        self,
+        logs: Sequence["SummaryWriter"],
+        console: Console,
+        config: TrainConfig,
+        first_step: int,
+    ):
+        """
+        Args:
+          logs: one a seed; none in a process that writes nothing.
+        """
+        self._console = console
+        self._logs = logs
+        self._progress = Progress(
+            TextColumn("[bold]training"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}% {task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TextColumn("<"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._total_steps = config.total_steps
+        self._task = self._progress.add_task(
+            "training", total=config.total_steps, completed=first_step, figures=""
+        )
+        unknown = np.full(config.num_seeds, math.nan)
+        self._last = {"episode/return": unknown, "episode/bounces": unknown}
+        self._saving_problem: str | None = None
+
+    def __enter__(self) -> "Reporter":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._progress.stop()
+        for log in self._logs:
+            log.close()
+
+    def block(self, steps: int, seconds: float, metrics: dict[str, np.ndarray]) -> None:
+        """Reports a block of iterations.
+
+        Args:
+          steps: environment steps done so far, of each seed.
+          seconds: what the block took.
+          metrics: each [seeds, iterations]; a value that is not a number is left out.
+        """
+        means = {name: _finite_mean(values) for name, values in metrics.items()}
+        # A count, where a mean would hide one event in many iterations.
+        non_finite = np.sum(metrics["task/non_finite"], axis=1)
+        means["task/non_finite"] = non_finite.astype(float)
+        for name, of_seeds in means.items():
+            for log, value in zip(self._logs, of_seeds, strict=False):
+                if math.isfinite(value):
+                    log.add_scalar(name, float(value), steps)
+        for name, last in self._last.items():
+            self._last[name] = np.where(np.isfinite(means[name]), means[name], last)
+        rate = means["speed/steps_per_second"][0]
+        figures = (
+            f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s  "
+            f"return {_mean_and_deviation(self._last['episode/return'], 0)}  "
+            f"bounces {_mean_and_deviation(self._last['episode/bounces'], 1)}"
+        )
+        self._progress.update(self._task, completed=steps, figures=figures)
+        if not self._console.is_terminal:
+            left = (self._total_steps - steps) * len(non_finite) / rate
+            line = f"{figures}  {seconds:.1f} s, {left:.0f} s left"
+            self._console.print(line, highlight=False, soft_wrap=True)
+
+        if total := int(non_finite.sum()):
+            had = "environment had a state that was not finite, and was reset"
+            if total > 1:
+                had = "environments had a state that was not finite, and were reset"
+            self.say(f"{total:,} {had}")
+
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+    def saving_problem(
+        self,
+        problem: str | None,
+        meanwhile: str = "the training goes on, and saves at its next evaluation",
+    ) -> None:
+        """Tells once why the last save failed, and once when there is no such problem any more."""
+        sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
+        if sentence != self._saving_problem:
+            self.say(sentence or "the state is saved again")
+        self._saving_problem = sentence
+
+    def evaluation(
+        self, steps: int, reports: Sequence[Report], healthy: Sequence[bool] = (True,)
+    ) -> None:
+        """Reports an evaluation.
+
+        Args:
+          reports: one a seed.
+          healthy: whether each seed has not diverged.
+        """
+        for log, report, sound in zip(self._logs, reports, healthy, strict=False):
+            if not sound:
+                continue
+            for result in report.results:
+                log.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
+            for name, value in report.details.items():
+                log.add_scalar(f"results/{name}", value, steps)
+            log.add_text("results", results_markdown(report), steps)
+        if len(reports) == 1:
+            (report,) = reports
+            met = sum(result.passed is not False for result in report.results)
+            figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
+            line = f"{met} of {len(report.results)} results met ({figures})"
+        else:
+            solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
+            line = f"{solved} of {len(reports)} seeds meet all results"
+        self.say(f"evaluation at {steps / 1e6:.1f}M steps: {line}")
+
+
+def _finite_mean(values: np.ndarray) -> np.ndarray:
+    """Mean of the finite values of each row; not a number where there is none."""
+    finite = np.isfinite(values)
+    number = finite.sum(axis=1)
+    total = np.where(finite, values, 0.0).sum(axis=1)
+    return np.where(number > 0, total / np.maximum(number, 1), math.nan)
+
+
+def _mean_and_deviation(values: np.ndarray, digits: int) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.{digits}f}"
+    return f"{np.mean(values):.{digits}f} +- {np.std(values):.{digits}f}"
+
+
+def _short(rate: float) -> str:
+    return f"{rate / 1e6:.2f}M" if rate >= 1e6 else f"{rate / 1e3:.0f}k"

@@ -1,0 +1,74 @@
+"""Training on several devices: one mesh, on which the environments or the seeds are divided.
+
+The program is the same on any number of devices: arrays of environments are sharded along their
+batch, all else is replicated, and XLA adds the reductions of gradients and statistics.
+"""
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import TrainingState, num_groups
+
+_AXIS = "devices"
+
+
+def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) -> Mesh:
+    """A mesh of the first `num_devices` devices.
+
+    Args:
+      num_devices: None for one, and on several hosts for all.
+
+    Raises:
+      UserError: there are fewer, or the environments (one seed) or the seeds (several) cannot be
+        divided among them, or a device of another host is left out.
+    """
+    devices = jax.devices()
+    if num_devices is None:
+        num_devices = 1 if jax.process_count() == 1 else len(devices)
+    if num_devices > len(devices):
+        raise UserError(
+            f"num_devices is {num_devices}, but there are {len(devices)} "
+            f"({devices[0].device_kind}); choose at most that"
+        )
+    if jax.process_count() > 1 and num_devices < len(devices):
+        raise UserError(
+            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; leave "
+            "it out"
+        )
+    groups = num_groups(config)
+    if num_seeds > 1 and num_seeds % num_devices:
+        raise UserError(
+            f"num_seeds {num_seeds} cannot be divided among {num_devices} devices; choose a "
+            f"multiple of {num_devices} seeds"
+        )
+    if num_seeds == 1 and groups % num_devices:
+        raise UserError(
+            f"num_envs {config.num_envs} cannot be divided among {num_devices} devices; choose a "
+            f"power of two as num_devices, and a multiple of {num_devices} * num_minibatches as "
+            "num_envs"
+        )
+    return Mesh(devices[:num_devices], (_AXIS,))
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Sharding of what every device holds whole."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> TrainingState:
+    """Shardings of a training state: of several seeds, each device holds some whole; of one, each
+    device holds some environments and all the rest.
+
+    Args:
+      state: the state or its shapes; of several seeds, with the seeds as the first axis.
+    """
+    if num_seeds > 1:
+        return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)
+    shardings = jax.tree.map(lambda _: replicated(mesh), state)
+    return shardings._replace(
+        env=jax.tree.map(
+            lambda x: NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS)), state.env
+        )
+    )

@@ -1,0 +1,32 @@
+"""The report that a training leaves when it ends."""
+
+from pathlib import Path
+
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.reports.figures import pixels
+from bounce_mjx.reports.page import record_checkpoint, write_report
+from bounce_mjx.runs.folder import find_checkpoint
+from bounce_mjx.training.log import open_log
+
+
+def report_training(run: Path, report: Report, steps: int) -> Path:
+    """Writes the report of a training that has just ended, and its picture of the evaluation into
+    the TensorBoard log.
+
+    Args:
+      report: of the best checkpoint; its recording is missing if the run was resumed and none of
+        the new evaluations was the best.
+      steps: environment steps at the best checkpoint.
+
+    Returns:
+      The page.
+
+    Raises:
+      UserError: the page cannot be written.
+    """
+    recording = report.recording or record_checkpoint(find_checkpoint(run, run))
+    page, evaluation = write_report(run, recording)
+    # A file of its own, as that of the training is closed.
+    with open_log(run, suffix=".report") as log:
+        log.add_image("evaluation", pixels(evaluation), steps, dataformats="HWC")
+    return page

@@ -1,0 +1,121 @@
+"""The part of the command lines that `view` and `play` share."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+from rich.console import Console
+
+from bounce_mjx.config.settings import Positive, StrictModel
+from bounce_mjx.errors import UserError
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.viewers.controllers import Controller
+from bounce_mjx.viewers.files import check_writable
+from bounce_mjx.viewers.native import check_display, has_display, run_native
+from bounce_mjx.viewers.scene import MAX_ENVS
+from bounce_mjx.viewers.simulation import Simulation
+
+_RECORDED_SECONDS = 10.0
+
+
+class ViewerOptions(StrictModel):
+    """How to see it."""
+
+    viewer: Literal["auto", "browser", "native"] = "auto"
+    """browser serves a page, native opens MuJoCo's own window; auto: native where there is a
+    display, else browser."""
+    video: Path | None = None
+    """File to film to, .mp4 or .gif, in place of a viewer."""
+    html: Path | None = None
+    """File for a page that replays the episode offline, in place of a viewer."""
+    seconds: Positive | None = None
+    """Simulated time, s; left out: 10 of a recording, and a viewer until it is closed."""
+    num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
+    """Robots side by side, on the page and in the replay."""
+    speed: Annotated[float, Field(ge=0.1, le=2.0)] = 1.0
+    """Speed of a viewer, as a factor of real time."""
+    fps: Annotated[int, Field(ge=1, le=240)] | None = None
+    """Pictures a second of a recording; left out: 60 of a video, 25 of a GIF, 30 of a page."""
+    size: tuple[Annotated[int, Field(ge=64, le=4096)], Annotated[int, Field(ge=64, le=4096)]] = (
+        640,
+        480,
+    )
+    """Width and height of a video, pixels."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Seed of the resets."""
+    host: str = "127.0.0.1"
+    """Address that the page is served at; 0.0.0.0 lets other machines in."""
+    port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
+    """Port of the page; the next free one where it is taken."""
+
+
+def show(
+    env: BounceBall,
+    controller: Controller,
+    options: ViewerOptions,
+    *,
+    title: str,
+    target_height: float | None,
+    console: Console,
+) -> None:
+    """Shows or records an environment under a controller.
+
+    Raises:
+      UserError: a file cannot be written, or the viewer does not work here.
+    """
+    recorded = options.video is not None or options.html is not None
+    if recorded and options.viewer != "auto":
+        raise UserError(
+            f"--viewer {options.viewer} and --video or --html exclude each other; leave one out"
+        )
+    viewer = options.viewer
+    if viewer == "auto":
+        viewer = "native" if has_display() else "browser"
+    film = None
+    if options.video is not None:
+        from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
+
+        check_writable(options.video, "--video", SUFFIXES)
+        film = VideoWriter(options.video, options.size, options.fps)
+    if options.html is not None:
+        from bounce_mjx.viewers.page import SUFFIXES, write_page
+
+        check_writable(options.html, "--html", SUFFIXES)
+    if not recorded and viewer == "native":
+        check_display()
+    if not recorded and viewer == "browser":
+        from bounce_mjx.viewers.browser import free_port, run_browser
+
+        port = free_port(options.host, options.port)
+
+    num_envs = options.num_envs
+    # The page's slider goes up to the simulated number. MJX simulates 16 too slowly on a CPU.
+    if not recorded and viewer == "browser" and env.engine.name == "fused":
+        num_envs = MAX_ENVS
+    with console.status("compiling"):
+        simulation = Simulation(env, controller, num_envs, options.seed)
+        simulation.target_height = target_height
+
+    if recorded:
+        with console.status("recording"):
+            recording = simulation.record(options.seconds or _RECORDED_SECONDS)
+            if film is not None:
+                film.write(simulation, recording)
+            if options.html is not None:
+                write_page(options.html, simulation, recording, options.fps)
+        for path in (options.video, options.html):
+            if path is not None:
+                console.print(f"written: {path}", highlight=False, soft_wrap=True)
+    elif viewer == "native":
+        run_native(simulation, speed=options.speed, seconds=options.seconds)
+    else:
+        run_browser(
+            simulation,
+            shown=options.num_envs,
+            speed=options.speed,
+            seconds=options.seconds,
+            host=options.host,
+            port=port,
+            title=title,
+            console=console,
+        )
