@@ -16,6 +16,8 @@ class Progress:
     best_steps: int = 0
     solved_steps: int | None = None
     evaluations: list[dict] = dataclasses.field(default_factory=list)
+    fault: str | None = None
+    """The first quantity that was not finite, and when, once the training diverged."""
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any], checkpoint: Checkpoint) -> "Progress":
@@ -27,7 +29,11 @@ class Progress:
         try:
             best = None if plain["best"] is None else Report.from_dict(plain["best"])
             progress = cls(
-                best, int(plain["best_steps"]), plain["solved_steps"], list(plain["evaluations"])
+                best,
+                int(plain["best_steps"]),
+                plain["solved_steps"],
+                list(plain["evaluations"]),
+                plain.get("fault"),
             )
             if best is not None:
                 best.score  # noqa: B018
@@ -48,6 +54,7 @@ class Progress:
             "best_steps": self.best_steps,
             "solved_steps": self.solved_steps,
             "evaluations": self.evaluations,
+            "fault": self.fault,
         }
 
     def results(
@@ -73,7 +80,8 @@ class Progress:
     def improves(self, report: Report, steps: int) -> bool:
         """Takes a new evaluation in, and tells whether it is the best."""
         values = {result.name: result.value for result in report.results}
-        self.evaluations.append({"steps": steps, "passed": report.passed, **values})
+        kind = {"screening": report.screening, "episodes": int(report.details["episodes"])}
+        self.evaluations.append({"steps": steps, "passed": report.passed, **kind, **values})
         if report.passed and self.solved_steps is None:
             self.solved_steps = steps
         if self.best is not None and report.score < self.best.score:
