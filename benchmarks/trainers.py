@@ -24,9 +24,9 @@ from typing import Literal, Protocol
 
 import jax
 import jax.numpy as jnp
+from bounce_mjx.adapters.brax.compatibility import device_put_replicated
 from brax.envs.base import State, Wrapper
 
-from bounce_mjx.adapters.brax.compatibility import device_put_replicated
 from bounce_mjx.learning.policy import (
     MIN_VARIANCE,
     Policy,

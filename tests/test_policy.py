@@ -4,10 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.training.acme import running_statistics
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, act, init_normalizer, make_networks, normalize
+from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.statistics import (
+    init_normalizer,
+    init_statistics,
+    normalize,
+    update,
+)
 
 CONSTANT = slice(9, 13)
 
@@ -24,7 +29,7 @@ def seen() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def normalizer(seen):
-    return running_statistics.update(init_normalizer(29), jnp.asarray(seen))
+    return update(init_statistics(29), jnp.asarray(seen)).normalizer
 
 
 def test_varying_observations_are_standardized(seen, normalizer):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.reward_config import RewardConfig
-from bounce_mjx.task.rewards import TERM_NAMES, RewardInputs, weighted_terms
+from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig, RewardInputs, weighted_terms
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = (
