@@ -47,8 +47,8 @@ class LogParameter(nn.Module):
     @nn.compact
     def __call__(self) -> jax.Array:
         """The vector [size]."""
-        log_initial = math.log(self.initial)
-        log_value = self.param("log_value", lambda _: jnp.full(self.size, log_initial, jnp.float32))
+        log_initial = jnp.log(jnp.float32(self.initial))
+        log_value = self.param("log_value", lambda _: jnp.full(self.size, log_initial))
         return jnp.exp(log_value)
 
 
