@@ -448,9 +448,9 @@ class FaultyBall(BounceBall):
         super().__init__()
         healthy = self.engine.step
 
-        def step(state, ctrl, num_substeps):
+        def step(parameters, state, ctrl, num_substeps):
             fails = (state.qpos[0] > 0.0) & (state.qvel[8] < -0.05)
-            after = healthy(state, ctrl, num_substeps)
+            after = healthy(parameters, state, ctrl, num_substeps)
             return after._replace(qpos=jnp.where(fails, jnp.nan, after.qpos))
 
         self.engine = self.engine._replace(step=step)

@@ -9,10 +9,12 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
+from bounce_mjx.evaluation.results import Statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.task.env import TaskState
+from bounce_mjx.task.observation import OBSERVATION, Kinematics
 
 EPISODES, RECORDED = 6, 4
 
@@ -132,6 +134,7 @@ def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
         paddle = data.geom("blocker")
         local = [*points[step, episode], 0.0225]
         recording.joint_angles[step, :, episode] = data.qpos[:6]
+        recording.paddle[step, :, episode] = paddle.xpos
         recording.ball[step, :, episode] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
     bounces = rng.random((5, 3)) < 0.5
     assert 0 < bounces.sum() < bounces.size
@@ -148,3 +151,34 @@ def test_only_so_many_episodes_are_recorded(env: BounceBall, networks) -> None:
         _, recording = jax.eval_shape(evaluate, policy, jax.random.PRNGKey(0))
         assert recording.ball.shape == (150, 3, kept)
         assert recording.running.dtype == jnp.bool
+
+
+class NoisyBall(BounceBall):
+    """Its sensors see nothing but noise."""
+
+    def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
+        return jnp.sin(1e4 * super().observe(kinematics, task))
+
+
+def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
+    """The results and the recording are of the true state, under a policy that is blind to it."""
+    layers = policy.params["params"] | {
+        "Dense_0": {"kernel": jnp.zeros((8, 6)), "bias": jnp.array([0, 0.3, -0.4, 0, 0.1, 0.2])}
+    }
+    blind = policy._replace(params={"params": layers})
+    (statistics, recording), (noisy, of_noisy) = (
+        make_recording_evaluator(ball, networks, EPISODES, RECORDED)(blind, jax.random.PRNGKey(2))
+        for ball in (env, NoisyBall(env.config))
+    )
+    assert statistics.rising_steps.sum() > 0 and recording.bounced.any()
+    for name in Statistics._fields:
+        np.testing.assert_allclose(
+            getattr(noisy, name), getattr(statistics, name), rtol=1e-3, err_msg=name
+        )
+    running = recording.running
+    np.testing.assert_array_equal(of_noisy.running, running)
+    for name in ("ball", "paddle", "joint_angles"):
+        kept, seen = (
+            np.moveaxis(np.asarray(getattr(r, name)), 1, 2)[running] for r in (recording, of_noisy)
+        )
+        np.testing.assert_allclose(seen, kept, atol=1e-3, err_msg=name)

@@ -100,14 +100,14 @@ def hit_points(env: BounceBall, recording: Recording, bounces: np.ndarray) -> np
     """
     model, addresses = env.mj_model, find_addresses(env.mj_model)
     data = mujoco.MjData(model)
-    joint_angles, balls = (
+    joint_angles, offsets = (
         np.moveaxis(np.asarray(values), 1, 2)[bounces]
-        for values in (recording.joint_angles, recording.ball)
+        for values in (recording.joint_angles, recording.ball - recording.paddle)
     )
-    points = np.zeros((len(balls), 2))
-    for i, (angles, ball) in enumerate(zip(joint_angles, balls, strict=True)):
+    points = np.zeros((len(offsets), 2))
+    for i, (angles, offset) in enumerate(zip(joint_angles, offsets, strict=True)):
         data.qpos[list(addresses.arm_qpos)] = angles
         mujoco.mj_kinematics(model, data)
         rotation = data.geom_xmat[addresses.paddle_geom].reshape(3, 3)
-        points[i] = (rotation.T @ (ball - data.geom_xpos[addresses.paddle_geom]))[:2]
+        points[i] = (rotation.T @ offset)[:2]
     return points
