@@ -212,7 +212,8 @@ class _Page:
 
 
 def reward_bars(terms: np.ndarray) -> str:
-    """A bar chart of weighted reward terms [15] as HTML, and their sum."""
+    """A bar chart of the weighted reward terms, in the order of `TERM_NAMES`, and of their sum, as
+    HTML."""
     rows = [
         (name.replace("_", " "), value, value / max(5.0, np.abs(terms).max()))
         for name, value in zip(TERM_NAMES, np.round(terms, 2) + 0.0, strict=True)
