@@ -17,8 +17,9 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.policies import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.choice import choose_checkpoint
-from bounce_mjx.runs.folder import load_policy, load_run_config
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.training.setup import set_up_jax
 
 

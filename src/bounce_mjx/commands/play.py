@@ -15,8 +15,9 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.runs.choice import choose_checkpoint
-from bounce_mjx.runs.folder import load_policy, load_run_config
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.setup import set_up_jax

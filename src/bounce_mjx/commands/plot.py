@@ -14,7 +14,8 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.page import record_checkpoint
-from bounce_mjx.runs.folder import find_checkpoint, load_run_config, newest_run, runs_of_seeds
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import find_checkpoint, newest_run, runs_of_seeds
 from bounce_mjx.task.env import BounceBall
 
 

@@ -11,7 +11,7 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.reports.page import record_checkpoint, write_report
-from bounce_mjx.runs.folder import find_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 
 
 class ReportCommand(StrictModel):

@@ -17,17 +17,11 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.policies import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_SEED
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.choice import PRETRAINED
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    CONFIG_FILE,
-    CheckpointWriter,
-    find_checkpoint,
-    load_policy,
-    load_results,
-    load_run_config,
-    save_config,
-)
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.folders import PRETRAINED, find_checkpoint, save_config
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.setup import set_up_jax
 
 

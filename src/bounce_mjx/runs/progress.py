@@ -1,82 +1,153 @@
-"""The evaluations of a training so far, as its checkpoints keep them."""
+"""The evaluations of a run, as its checkpoints and results.json store them."""
 
-import dataclasses
-from typing import Any
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.runs.folder import Checkpoint
+from bounce_mjx.runs.files import first_mistake, read_json
+
+RESULTS_FILE = "results.json"
 
 
-@dataclasses.dataclass
-class Progress:
-    """The evaluations of a run so far."""
+def _not_infinite(value: float) -> float:
+    if math.isinf(value):
+        raise ValueError("the number is infinite")
+    return value
 
-    best: Report | None = None
-    best_steps: int = 0
-    solved_steps: int | None = None
-    evaluations: list[dict] = dataclasses.field(default_factory=list)
+
+# A null, as the apex error of an evaluation without a bounce, is NaN in memory.
+_Number = Annotated[
+    float,
+    BeforeValidator(lambda value: math.nan if value is None else value),
+    AfterValidator(_not_infinite),
+]
+_Steps = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+class _Numbers(pydantic.BaseModel):
+    """Figures by name: at least those of the class."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, _Number]
+
+
+class Evaluation(_Numbers):
+    """An evaluation in the list of all: the value of each result by its name."""
+
+    steps: _Steps
+    passed: bool
+
+
+class _Details(_Numbers):
+    episodes: _Number
+    mean_consecutive_bounces: _Number
+    mean_apex_error_m: _Number
+    mean_return: _Number
+    mean_length_s: _Number
+
+
+class _Result(pydantic.BaseModel):
+    name: str
+    measured: str
+    value: _Number
+    bound: str
+    passed: bool | None
+
+
+class _StoredReport(pydantic.BaseModel):
+    results: Annotated[list[_Result], Field(min_length=1)]
+    details: _Details
+
+
+class _Results(_StoredReport):
+    """results.json: the best evaluation, all evaluations, and where the time went."""
+
+    device: str
+    best_steps: _Steps
+    solved_steps: _Steps | None = None
+    trained_steps: _Steps = 0
+    seconds: dict[str, _Number] = {}
+    evaluations: list[Evaluation] = []
+
+    @pydantic.model_validator(mode="after")
+    def _check_names(self) -> "_Results":
+        names = {result.name for result in self.results}
+        if any(names - evaluation.model_extra.keys() for evaluation in self.evaluations):
+            raise ValueError("an evaluation lacks a result")
+        return self
+
+
+def load_results(run: Path) -> dict[str, Any] | None:
+    """The run's results, with the keys of `_Results`; None if there are none yet.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    path = run / RESULTS_FILE
+    if not path.is_file():
+        return None
+    try:
+        return read_json(path, _Results).model_dump()
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({error}); delete it to go on without it") from error
+
+
+class Progress(pydantic.BaseModel):
+    """The evaluations of a training so far."""
+
+    best: Annotated[
+        Report | None,
+        pydantic.PlainValidator(lambda plain: plain and _report(plain)),
+        pydantic.PlainSerializer(lambda report: report and report.to_dict()),
+    ] = None
+    best_steps: _Steps = 0
+    solved_steps: _Steps | None = None
+    evaluations: list[Evaluation] = []
 
     @classmethod
-    def from_dict(cls, plain: dict[str, Any], checkpoint: Checkpoint) -> "Progress":
-        """That of `to_dict`, as it was stored in a checkpoint.
+    def from_dict(cls, plain: dict[str, Any], checkpoint: Path) -> "Progress":
+        """Reads the `model_dump` that the folder of a checkpoint holds.
 
         Raises:
-          UserError: it is something else.
+          UserError: it is damaged.
         """
         try:
-            best = None if plain["best"] is None else Report.from_dict(plain["best"])
-            progress = cls(
-                best, int(plain["best_steps"]), plain["solved_steps"], list(plain["evaluations"])
-            )
-            if best is not None:
-                best.score  # noqa: B018
-            for evaluation in progress.evaluations:
-                int(evaluation["steps"])
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            return cls.model_validate(plain)
+        except pydantic.ValidationError as error:
             raise UserError(
-                f"the evaluations in the checkpoint {checkpoint.folder} are not as train_jax.py "
-                "writes them; give another checkpoint"
+                f"the evaluations in the checkpoint {checkpoint} are damaged "
+                f"({first_mistake(error)}); give another checkpoint"
             ) from error
-        return progress
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data, for JSON."""
-        best = None if self.best is None else self.best.to_dict()
-        return {
-            "best": best,
-            "best_steps": self.best_steps,
-            "solved_steps": self.solved_steps,
-            "evaluations": self.evaluations,
-        }
 
     def results(
         self, trained_steps: int, seconds: dict[str, float], device: str
     ) -> dict[str, Any] | None:
-        """A run's results, plain data; None before any evaluation."""
+        """The content of results.json; None before any evaluation."""
         if self.best is None:
             return None
-        return {
-            "best_steps": self.best_steps,
-            "solved_steps": self.solved_steps,
-            "trained_steps": trained_steps,
-            "seconds": seconds,
-            "device": device,
-            **self.best.to_dict(),
-            "evaluations": self.evaluations,
-        }
+        run = {"trained_steps": trained_steps, "seconds": seconds, "device": device}
+        return self.best.to_dict() | self.model_dump(exclude={"best"}) | run
 
     def has(self, steps: int) -> bool:
         """Whether the state after so many steps was evaluated."""
-        return any(evaluation["steps"] == steps for evaluation in self.evaluations)
+        return any(evaluation.steps == steps for evaluation in self.evaluations)
 
     def improves(self, report: Report, steps: int) -> bool:
-        """Takes a new evaluation in, and tells whether it is the best."""
+        """Adds an evaluation; whether it is the best so far."""
         values = {result.name: result.value for result in report.results}
-        self.evaluations.append({"steps": steps, "passed": report.passed, **values})
+        self.evaluations.append(Evaluation(steps=steps, passed=report.passed, **values))
         if report.passed and self.solved_steps is None:
             self.solved_steps = steps
         if self.best is not None and report.score < self.best.score:
             return False
         self.best, self.best_steps = report, steps
         return True
+
+
+def _report(plain: Any) -> Report:
+    return Report.from_dict(_StoredReport.model_validate(plain).model_dump())
