@@ -2,13 +2,14 @@
 the manifest that tells whether a checkpoint is as it was written."""
 
 import hashlib
+import json
 import os
 import stat
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import pydantic
-import pydantic_core
+from pydantic_core import to_jsonable_python
 
 PARTIAL = ".partial"
 MANIFEST_FILE = "manifest.json"
@@ -26,7 +27,8 @@ class Manifest(pydantic.BaseModel):
 
 def to_json(plain: Any) -> str:
     """Plain data as JSON. A number that is not finite becomes null: JSON cannot spell it."""
-    return pydantic_core.to_json(plain, indent=2, inf_nan_mode="null").decode() + "\n"
+    # Not by `pydantic_core.to_json`, which cannot write a path that is not UTF-8.
+    return json.dumps(to_jsonable_python(plain, inf_nan_mode="null"), indent=2) + "\n"
 
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
@@ -34,9 +36,11 @@ def read_json(path: Path, model: type[ModelT]) -> ModelT:
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise ValueError(f"{path.name} is too large")
     try:
-        return model.model_validate_json(path.read_bytes())
+        return model.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except pydantic.ValidationError as error:
         raise ValueError(f"{path.name}: {first_mistake(error)}") from error
+    except RecursionError as error:
+        raise ValueError(f"{path.name} is nested too deeply") from error
 
 
 def first_mistake(error: pydantic.ValidationError) -> str:

@@ -1,11 +1,10 @@
 """The evaluations of a run, as its checkpoints and results.json store them."""
 
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
@@ -13,48 +12,38 @@ from bounce_mjx.runs.files import first_mistake, read_json
 
 RESULTS_FILE = "results.json"
 
-
-def _not_infinite(value: float) -> float:
-    if math.isinf(value):
-        raise ValueError("the number is infinite")
-    return value
-
-
-# A null, as the apex error of an evaluation without a bounce, is NaN in memory.
-_Number = Annotated[
-    float,
-    BeforeValidator(lambda value: math.nan if value is None else value),
-    AfterValidator(_not_infinite),
-]
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+# Null where there was nothing to measure, as the apex error without a bounce.
+_Figure = _Finite | None
 _Steps = Annotated[int, Field(ge=0, lt=2**63)]
 
 
-class _Numbers(pydantic.BaseModel):
+class _Figures(pydantic.BaseModel):
     """Figures by name: at least those of the class."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, _Number]
+    __pydantic_extra__: dict[str, _Figure]
 
 
-class Evaluation(_Numbers):
+class Evaluation(_Figures):
     """An evaluation in the list of all: the value of each result by its name."""
 
     steps: _Steps
     passed: bool
 
 
-class _Details(_Numbers):
-    episodes: _Number
-    mean_consecutive_bounces: _Number
-    mean_apex_error_m: _Number
-    mean_return: _Number
-    mean_length_s: _Number
+class _Details(_Figures):
+    episodes: _Finite
+    mean_consecutive_bounces: _Finite
+    mean_apex_error_m: _Figure
+    mean_return: _Finite
+    mean_length_s: _Finite
 
 
 class _Result(pydantic.BaseModel):
     name: str
     measured: str
-    value: _Number
+    value: _Figure
     bound: str
     passed: bool | None
 
@@ -71,7 +60,7 @@ class _Results(_StoredReport):
     best_steps: _Steps
     solved_steps: _Steps | None = None
     trained_steps: _Steps = 0
-    seconds: dict[str, _Number] = {}
+    seconds: dict[str, _Finite] = {}
     evaluations: list[Evaluation] = []
 
     @pydantic.model_validator(mode="after")
@@ -102,8 +91,8 @@ class Progress(pydantic.BaseModel):
 
     best: Annotated[
         Report | None,
-        pydantic.PlainValidator(lambda plain: plain and _report(plain)),
-        pydantic.PlainSerializer(lambda report: report and report.to_dict()),
+        pydantic.PlainValidator(lambda plain: None if plain is None else _report(plain)),
+        pydantic.PlainSerializer(lambda report: None if report is None else report.to_dict()),
     ] = None
     best_steps: _Steps = 0
     solved_steps: _Steps | None = None
@@ -140,7 +129,9 @@ class Progress(pydantic.BaseModel):
     def improves(self, report: Report, steps: int) -> bool:
         """Adds an evaluation; whether it is the best so far."""
         values = {result.name: result.value for result in report.results}
-        self.evaluations.append(Evaluation(steps=steps, passed=report.passed, **values))
+        # Not validated: a figure that is not finite is stored as null.
+        new = Evaluation.model_construct(steps=steps, passed=report.passed, **values)
+        self.evaluations.append(new)
         if report.passed and self.solved_steps is None:
             self.solved_steps = steps
         if self.best is not None and report.score < self.best.score:
