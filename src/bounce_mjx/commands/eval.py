@@ -16,6 +16,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.policies import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -60,7 +61,8 @@ def main(args: Sequence[str] | None = None) -> None:
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
-        report, engine = evaluate_policy(
+        report, engine = run_interruptible(
+            evaluate_policy,
             policy,
             config.env,
             config.ppo,

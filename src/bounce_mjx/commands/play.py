@@ -1,6 +1,5 @@
 """Shows a trained policy: `python -m bounce_mjx.play [CHECKPOINT]` (see --help)."""
 
-import contextlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +41,7 @@ class PlayCommand(StrictModel):
 
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error(), contextlib.suppress(KeyboardInterrupt):
+    with exit_on_user_error():
         command = parse(
             PlayCommand,
             sys.argv[1:] if args is None else args,

@@ -11,6 +11,7 @@ from pydantic import Field
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.page import record_checkpoint
@@ -50,7 +51,9 @@ def main(args: Sequence[str] | None = None) -> None:
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:
             env = BounceBall(load_run_config(checkpoints[0].run).env)
-            figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
+            figures["evaluation"] = evaluation_figure(
+                env, run_interruptible(record_checkpoint, checkpoints[0])
+            )
         for name, figure in figures.items():
             for suffix in command.formats:
                 path = command.out / f"{name}.{suffix}"

@@ -10,6 +10,7 @@ import tyro
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.page import record_checkpoint, write_report
 from bounce_mjx.runs.folders import find_checkpoint
 
@@ -33,5 +34,6 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Writes the report of a run, report.html in its folder.",
         )
         checkpoint = find_checkpoint(command.run, command.log_dir)
-        path, _ = write_report(checkpoint.run, record_checkpoint(checkpoint))
+        recording = run_interruptible(record_checkpoint, checkpoint)
+        path, _ = write_report(checkpoint.run, recording)
         print(path)

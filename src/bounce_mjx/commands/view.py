@@ -1,6 +1,5 @@
 """Shows the environment without a policy: `python -m bounce_mjx.view` (see --help)."""
 
-import contextlib
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -39,7 +38,7 @@ class ViewCommand(StrictModel):
 
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error(), contextlib.suppress(KeyboardInterrupt):
+    with exit_on_user_error():
         command = parse(
             ViewCommand,
             sys.argv[1:] if args is None else args,
