@@ -19,9 +19,9 @@ class ReportCommand(StrictModel):
     """The command line."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder; left out: the newest run."""
+    """A run's folder. The default is the newest run."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -30,7 +30,7 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             ReportCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.report",
+            prog="bounce-mjx report",
             description="Writes the report of a run, report.html in its folder.",
         )
         checkpoint = find_checkpoint(command.run, command.log_dir)

@@ -2,12 +2,11 @@
 
 import stat
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import yaml
-from pydantic import Field
 
-from bounce_mjx.config.settings import Count, PlainPath, Steps, StrictModel
+from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPOConfig
@@ -25,7 +24,7 @@ class TrainConfig(StrictModel):
     """The task."""
     ppo: PPOConfig = PPOConfig()
     """The trainer."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: NonNegativeInt = 0
     """Seed of the whole training."""
     num_seeds: Count = 1
     """Independent trainings in one program, from seeds `seed`, `seed` + 1, ...; a folder each."""
@@ -40,9 +39,9 @@ class TrainConfig(StrictModel):
     """Environment steps between two evaluations, rounded to whole blocks."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the five results."""
-    screening_episodes: Annotated[int, Field(ge=0)] = 0
+    screening_episodes: NonNegativeInt = 0
     """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
-    eval_seed: Annotated[int, Field(ge=0, lt=2**31)] = 10_000
+    eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during the training."""
     stop_when_solved: bool = False
     """End at the first evaluation that meets all five results."""

@@ -172,9 +172,9 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     except UserError:
         if log_dir != TrainConfig().log_dir:
             raise
-        console.print(f"no run in {log_dir}: using the policy that comes with the package")
+        console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint()
-    console.print(f"using the newest run: {run}", highlight=False, markup=False, soft_wrap=True)
+    console.out(f"using the newest run: {run}", highlight=False)
     return find_checkpoint(run, log_dir)
 
 
