@@ -32,7 +32,8 @@ from bounce_mjx.reports.figures import (
 )
 from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import load_results, save_config
+from bounce_mjx.runs.folders import save_config
+from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.training import report as report_command
 

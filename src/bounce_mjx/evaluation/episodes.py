@@ -16,8 +16,12 @@ def make_evaluator(
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
     from its own reset; it stops when all have ended or the time is over."""
-    evaluate = make_recording_evaluator(env, networks, episodes, recorded=0)
-    return jax.jit(lambda policy, key: evaluate(policy, key)[0])
+    recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
+
+    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
+        return recording_evaluator(policy, key)[0]
+
+    return jax.jit(evaluate)
 
 
 def make_recording_evaluator(
