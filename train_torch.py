@@ -1,12 +1,8 @@
 """Trains with PyTorch: `python train_torch.py --library rsl_rl` (see --help)."""
 
-import os
-import signal
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    # Ctrl-C during the imports, in which some library would print a traceback or swallow it.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    from bounce_mjx.commands.train_torch import main
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    main()
+    main(["train-torch", *sys.argv[1:]])

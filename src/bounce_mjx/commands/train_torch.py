@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.runs.folder import find_run, latest_checkpoint
+from bounce_mjx.runs.folders import find_run, latest_checkpoint
 from bounce_mjx.training.command import TrainingCommand, path_flag, read_command, run_command
 from bounce_mjx.training.job import library_of
 from bounce_mjx.training.setup import set_up_jax

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
 from bounce_mjx.evaluation.recording import Recording
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.state import State
 
 DEFAULT_EPISODES = 1024
 
@@ -37,9 +37,6 @@ UPWARD_SPEED_RANGE = (0.1, 1.5)
 
 
 UPWARD_SPEED_TARGETS = (0.4, 0.6)
-
-
-_BALL_X, _BALL_VZ = 6, 21
 
 
 class Statistics(NamedTuple):
@@ -75,7 +72,8 @@ class Result(NamedTuple):
     name: str
     measured: str
     """What was measured, with its unit."""
-    value: float
+    value: float | None
+    """None where there was nothing to measure, such as the height without a bounce."""
     bound: str
     passed: bool | None
     """None where the bound does not apply."""
@@ -85,8 +83,9 @@ class Report(NamedTuple):
     """An evaluation."""
 
     results: tuple[Result, ...]
-    details: dict[str, float]
-    """Figures beside the five results."""
+    details: dict[str, float | None]
+    """Further figures: episodes, mean_consecutive_bounces, mean_apex_error_m, mean_return and
+    mean_length_s; None where there was nothing to measure."""
     recording: Recording | None = None
     """Some of the episodes, where they were recorded."""
     screening: bool = False
@@ -131,6 +130,8 @@ def accumulate(
 ) -> Statistics:
     """Adds one control step of E environments (batch last) to their statistics.
 
+    It reads the true state and not the observation, which may be noisy.
+
     Args:
       states: after the step.
       step: its index [], from 0.
@@ -138,7 +139,8 @@ def accumulate(
     s, metrics = statistics, states.metrics
     running = s.running
     settled = running & (step >= round(SETTLING_SECONDS / env.dt))
-    x, vz = states.obs[_BALL_X], states.obs[_BALL_VZ]
+    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
+    x, vz = kinematics.ball_position[0], kinematics.ball_velocity[2]
     centred = jnp.abs(x - env.config.reward.target_x) <= MAX_X_ERROR
     bounced = settled & (metrics["bounced"] > 0)
     accurate = metrics["apex_error"] <= MAX_APEX_ERROR
@@ -162,62 +164,73 @@ def judge(env: BounceBall, statistics: Statistics) -> Report:
     """The five expected results of SPEC.md from the statistics of the episodes."""
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     episodes = len(s.running)
-    enough_bounces = (s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).sum() / episodes
-    centred = _share(s.centred_steps.sum(), s.settled_steps.sum())
-    accurate = _share(s.accurate_bounces.sum(), s.settled_bounces.sum())
-    speed = _share(s.rising_speed.sum(), s.rising_steps.sum())
-    stable = s.running.sum() / episodes
-
-    low, high = env.config.target_height_range
-    speed_applies = UPWARD_SPEED_TARGETS[0] <= low and high <= UPWARD_SPEED_TARGETS[1]
-    speed_bound = f"{UPWARD_SPEED_RANGE[0]} to {UPWARD_SPEED_RANGE[1]}"
-    speed_passed = bool(UPWARD_SPEED_RANGE[0] <= speed <= UPWARD_SPEED_RANGE[1])
+    enough_bounces = float((s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).mean())
+    centred = _ratio(s.centred_steps.sum(), s.settled_steps.sum())
+    accurate = _ratio(s.accurate_bounces.sum(), s.settled_bounces.sum())
+    stable = float(s.running.mean())
     results = (
-        Result(
+        _share_result(
             "consecutive bounces",
-            f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row, %",
-            float(100.0 * enough_bounces),
-            f">= {100 * MIN_EPISODE_SHARE:g}",
-            bool(enough_bounces >= MIN_EPISODE_SHARE),
+            f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
+            enough_bounces,
+            MIN_EPISODE_SHARE,
         ),
-        Result(
+        _share_result(
             "horizontal position",
-            f"steps with |x error| <= {MAX_X_ERROR} m, %",
-            100.0 * centred,
-            f">= {100 * MIN_STEP_SHARE:g}",
-            bool(centred >= MIN_STEP_SHARE),
+            f"steps with |x error| <= {MAX_X_ERROR} m",
+            centred,
+            MIN_STEP_SHARE,
         ),
-        Result(
-            "height",
-            f"bounces with |apex error| <= {MAX_APEX_ERROR} m, %",
-            100.0 * accurate,
-            f">= {100 * MIN_STEP_SHARE:g}",
-            bool(accurate >= MIN_STEP_SHARE),
+        _share_result(
+            "height", f"bounces with |apex error| <= {MAX_APEX_ERROR} m", accurate, MIN_STEP_SHARE
         ),
-        Result(
-            "upward speed",
-            "mean velocity of the rising ball, m/s",
-            speed,
-            speed_bound if speed_applies else f"{speed_bound} (targets 0.4 to 0.6 only)",
-            speed_passed if speed_applies else None,
+        _speed_result(
+            _ratio(s.rising_speed.sum(), s.rising_steps.sum()), env.config.target_height_range
         ),
-        Result(
+        _share_result(
             "stable",
-            f"episodes of {env.config.episode_seconds:g} s without an end, %",
-            float(100.0 * stable),
-            f">= {100 * MIN_EPISODE_SHARE:g}",
-            bool(stable >= MIN_EPISODE_SHARE),
+            f"episodes of {env.config.episode_seconds:g} s without an end",
+            stable,
+            MIN_EPISODE_SHARE,
         ),
     )
     details = {
         "episodes": float(episodes),
         "mean_consecutive_bounces": float(s.max_bounces.mean()),
-        "mean_apex_error_m": _share(s.apex_error.sum(), s.settled_bounces.sum()),
+        "mean_apex_error_m": _ratio(s.apex_error.sum(), s.settled_bounces.sum()),
         "mean_return": float(s.episode_return.mean()),
         "mean_length_s": float(s.steps.mean() * env.dt),
     }
     return Report(results, details)
 
 
-def _share(part: float, whole: float) -> float:
-    return float(part / whole) if whole else 0.0
+def _share_result(name: str, measured: str, share: float | None, minimum: float) -> Result:
+    """A share of all episodes, steps or bounces; a share of none fails."""
+    return Result(
+        name,
+        f"{measured}, %",
+        None if share is None else 100.0 * share,
+        f">= {100 * minimum:g}",
+        share is not None and share >= minimum,
+    )
+
+
+def _speed_result(speed: float | None, target_height_range: tuple[float, float]) -> Result:
+    """The upward speed, which is judged only for targets between `UPWARD_SPEED_TARGETS`."""
+    low, high = UPWARD_SPEED_RANGE
+    bound = f"{low} to {high}"
+    lowest, highest = UPWARD_SPEED_TARGETS
+    judged = lowest <= target_height_range[0] and target_height_range[1] <= highest
+    passed = speed is not None and low <= speed <= high
+    return Result(
+        "upward speed",
+        "mean velocity of the rising ball, m/s",
+        speed,
+        bound if judged else f"{bound} (targets {lowest} to {highest} only)",
+        passed if judged else None,
+    )
+
+
+def _ratio(total: float, count: float) -> float | None:
+    """A mean or a share; None of nothing."""
+    return float(total / count) if count else None

@@ -1,56 +1,120 @@
 """The mjx engine: MuJoCo's own JAX implementation, for any model that has the task's names."""
 
 import contextlib
+import copy
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import find_addresses
+
+_INTEGRATORS = (
+    mujoco.mjtIntegrator.mjINT_EULER,
+    mujoco.mjtIntegrator.mjINT_RK4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
 
 
 class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
 
     model: mjx.Model
+    mj_model: mujoco.MjModel
+    """Its source."""
     paddle_geom: int
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
-    """Constants of a compiled model.
+    """Constants of a compiled model that has no `unsupported_feature`."""
+    model = mjx.put_model(mj_model)
+    return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
 
-    Raises:
-      UserError: mjx does not implement a feature of the model.
+
+def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
+    """A feature of the model that MJX does not compute; None if it computes all.
+
+    MJX refuses some features itself, and ignores others, which are named here.
     """
+    m = mj_model
+    integrator = mujoco.mjtIntegrator(m.opt.integrator)
+    ignored = {
+        f"the integrator {integrator.name} (only Euler, RK4 and implicitfast)": (
+            integrator not in _INTEGRATORS
+        ),
+        "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
+        "plugins": m.nplugin > 0,
+        "flexes (flex, flexcomp)": m.nflex > 0,
+        "delayed actuators (delay)": np.any(m.actuator_delay),
+        "early activations (actearly)": np.any(m.actuator_actearly),
+        "damping or armature given to an actuator": (
+            np.any(m.actuator_damping)
+            or np.any(m.actuator_dampingpoly)
+            or np.any(m.actuator_armature)
+        ),
+        "nonlinear springs (stiffness with several numbers)": (
+            np.any(m.jnt_stiffnesspoly) or np.any(m.tendon_stiffnesspoly)
+        ),
+        "nonlinear damping (damping with several numbers)": (
+            np.any(m.dof_dampingpoly) or np.any(m.tendon_dampingpoly)
+        ),
+        "a solref of mixed signs": np.any(m.pair_solref[:, 0] * m.pair_solref[:, 1] < 0.0),
+        "a solimp without a width": np.any(m.pair_solimp[:, 2] <= mujoco.mjMINVAL),
+        "adhesion": np.any(m.pair_adhesion) or np.any(m.geom_adhesion),
+        "surface velocities (surfacevel)": np.any(m.geom_surfacevel),
+        "sleeping bodies (sleep)": m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
+        "the noslip solver (noslip_iterations)": m.opt.noslip_iterations > 0,
+    }
+    for feature, present in ignored.items():
+        if present:
+            return feature
     try:
-        model = mjx.put_model(mj_model)
+        mjx.put_model(mj_model)
     except NotImplementedError as error:
-        raise UserError(
-            f"MJX does not support this model ({error}); change the MJCF, or use --physics fused"
-        ) from error
-    return MjxModel(model, find_addresses(mj_model).paddle_geom)
+        return f"a feature of the MJCF ({str(error).rstrip('.')})"
+    return None
 
 
 def step(
-    constants: MjxModel, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
+    constants: MjxModel,
+    parameters: PhysicsParameters,
+    state: PhysicsState,
+    ctrl: jax.Array,
+    num_substeps: int = 1,
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu]."""
     with _full_precision():
-        data = mjx.make_data(constants.model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
-        data = jax.lax.fori_loop(
-            0, num_substeps, lambda _, carry: mjx.step(constants.model, carry), data
-        )
-    return PhysicsState(data.qpos, data.qvel)
+        model = in_world(constants, parameters)
+        data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
+        if state.act is not None:
+            data = data.replace(act=state.act)
+        data = jax.lax.fori_loop(0, num_substeps, lambda _, carry: mjx.step(model, carry), data)
+    return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
 
 
-def paddle_position(constants: MjxModel, qpos: jax.Array) -> jax.Array:
+def paddle_position(
+    constants: MjxModel, parameters: PhysicsParameters, qpos: jax.Array
+) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
     with _full_precision():
-        data = mjx.make_data(constants.model).replace(qpos=qpos)
-        return mjx.kinematics(constants.model, data).geom_xpos[constants.paddle_geom]
+        model = in_world(constants, parameters)
+        data = mjx.make_data(model).replace(qpos=qpos)
+        return mjx.kinematics(model, data).geom_xpos[constants.paddle_geom]
+
+
+def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
+    """The model with the given numbers of one environment."""
+    numbers = jax.tree.map(jnp.asarray, parameters)
+    fields, options = edited_fields(constants.mj_model, numbers)
+    replaced = fields | {f"opt.{name}": value for name, value in options.items()}
+    # MJX transforms every geom, whether or not it is known to share its body's frame.
+    replaced.pop("geom_sameframe", None)
+    return constants.model.tree_replace(replaced)
 
 
 def _full_precision() -> contextlib.AbstractContextManager:

@@ -1,10 +1,15 @@
 """The simulated robot: the MJCF file, the names it must have, and where their data lie."""
 
+import hashlib
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
@@ -12,6 +17,21 @@ from bounce_mjx.resources import resource_path
 JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
+
+# Numbers that MuJoCo's compiler computes from others.
+_DERIVED_FIELDS = frozenset(
+    (
+        "actuator_acc0",
+        "actuator_length0",
+        "body_invweight0",
+        "body_subtreemass",
+        "dof_M0",
+        "dof_invweight0",
+        "dof_length",
+        "geom_aabb",
+        "geom_rbound",
+    )
+)
 
 
 class Addresses(NamedTuple):
@@ -34,30 +54,73 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float) -> mujoco.MjModel:
+def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
       mjcf: the file; None for the project's own robot.
       physics_dt: physics time step, s.
+      visual: False leaves out textures and geoms that are only there for pictures, which take most
+        of a model's memory.
 
     Raises:
-      UserError: the file is missing, is no MJCF, or lacks a name that the task needs.
+      UserError: the file is missing, is no MJCF, lacks a name that the task needs, drives a joint
+        by something else than a position servo, or has a number that cannot be simulated.
     """
     path = mjcf or resource_path("mjcf/bounce_ball.xml")
     if not os.path.isfile(path):
         raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
     try:
-        mj_model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+        mj_model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"the MJCF file {path} does not compile ({reason}); mend it") from error
-    mj_model.opt.timestep = physics_dt
     try:
-        find_addresses(mj_model)
+        _check_numbers(mj_model)
+        _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
         raise UserError(f"the MJCF file {path} has {error}") from error
+    mj_model.opt.timestep = physics_dt
     return mj_model
+
+
+def _check_numbers(mj_model: mujoco.MjModel) -> None:
+    """Refuses a time step that is not positive, and numbers that are not finite."""
+    step = mj_model.opt.timestep
+    if not 0.0 < step < np.inf:
+        raise UserError(f"the timestep {step}; give a positive number of seconds")
+    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
+    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
+    # A derived number is not finite because of one in the file, which the message must name.
+    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
+        values = np.asarray(getattr(owner, name))
+        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
+            value = values[~np.isfinite(values)][0]
+            raise UserError(f"the number {value} in {name}; give finite numbers")
+
+
+def _check_servos(mj_model: mujoco.MjModel, at: Addresses) -> None:
+    """Refuses actuators whose control is not the position that they drive their joint to."""
+    plain_or_filtered = (
+        mujoco.mjtDyn.mjDYN_NONE,
+        mujoco.mjtDyn.mjDYN_FILTER,
+        mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    )
+    for name, actuator in zip(JOINT_NAMES, at.actuators, strict=True):
+        is_position_servo = (
+            mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+            and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+            and mujoco.mjtDyn(mj_model.actuator_dyntype[actuator]) in plain_or_filtered
+            and mj_model.actuator_gainprm[actuator, 0] > 0.0
+            and mj_model.actuator_biasprm[actuator, 1] < 0.0
+        )
+        if not is_position_servo:
+            raise UserError(
+                f"an actuator on {name} that is no position servo; drive it by "
+                f'<position joint="{name}"/>'
+            )
 
 
 def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
@@ -100,6 +163,54 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
         ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
         paddle_geom=paddle_geom,
     )
+
+
+def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> jax.Array | None:
+    """Activations [na] at which the servos hold the joint positions qpos [nq] (a servo with a
+    `timeconst` filters its target); None where the model has none."""
+    if mj_model.na == 0:
+        return None
+    activations = [jnp.zeros_like(qpos[0])] * mj_model.na
+    for actuator in range(mj_model.nu):
+        if mj_model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+            joint = mj_model.actuator_trnid[actuator, 0]
+            length = mj_model.actuator_gear[actuator, 0] * qpos[mj_model.jnt_qposadr[joint]]
+            first = mj_model.actuator_actadr[actuator]
+            for i in range(first, first + mj_model.actuator_actnum[actuator]):
+                activations[i] = length
+    return jnp.stack(activations)
+
+
+def fingerprint(mj_model: mujoco.MjModel) -> bytes:
+    """A hash of the numbers that a simulation depends on; pictures' colours and markers are not
+    among them."""
+    digest = hashlib.blake2b()
+    for owner, names in (
+        (mj_model, _physical_fields(mj_model)),
+        (mj_model.opt, [name for name in dir(mj_model.opt) if not name.startswith("_")]),
+    ):
+        for name in names:
+            digest.update(np.asarray(getattr(owner, name)).tobytes())
+    return digest.digest()
+
+
+def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
+    """Checks that a model still is the one whose `fingerprint` is given.
+
+    Raises:
+      UserError: the model was edited, which no engine that was built from it would notice.
+    """
+    if fingerprint(mj_model) != built_from:
+        raise UserError(
+            "env.mj_model was edited after the environment had been built, which does not reach "
+            "its physics; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
+        )
+
+
+def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
+    kinds = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
+    pictured = ("geom_rgba", "geom_matid", "geom_group")
+    return [name for name in dir(mj_model) if name.startswith(kinds) and name not in pictured]
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:

@@ -1,9 +1,7 @@
 """The common part of the commands that train: flags, start, results."""
 
 import importlib
-import os
 import shlex
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,11 +13,13 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import leave
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import RESUMABLE_KEYS, find_run, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import find_run
 from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.runs.reading import RESUMABLE_KEYS
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
@@ -102,10 +102,8 @@ def run_command(
         )
     except TrainingStopped as stopped:
         say(console, str(stopped))
-        # Without waiting for a compilation or an evaluation that is still going on.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(0)
+        # Without waiting for a compilation or an evaluation in another thread.
+        leave(0)
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
         leave_report(best, console)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.reports.tables import results_markdown
+from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
 
 if typing.TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Reporter:
         say(self._console, line)
 
     def flush(self) -> None:
-        """Writes to the logs what was reported so far."""
+        """Writes everything reported so far to the logs' files."""
         for log in self._logs:
             log.flush()
 
@@ -128,15 +128,17 @@ class Reporter:
             if not sound:
                 continue
             group = "screening" if report.screening else "results"
-            for result in report.results:
-                log.add_scalar(f"{group}/{result.name.replace(' ', '_')}", result.value, steps)
-            for name, value in report.details.items():
-                log.add_scalar(f"{group}/{name}", value, steps)
+            values = {result.name.replace(" ", "_"): result.value for result in report.results}
+            for name, value in (values | report.details).items():
+                if value is not None:
+                    log.add_scalar(f"{group}/{name}", value, steps)
             log.add_text(group, results_markdown(report), steps)
         if len(reports) == 1:
             (report,) = reports
             met = sum(result.passed is not False for result in report.results)
-            figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
+            figures = ", ".join(
+                f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
+            )
             line = f"{met} of {len(report.results)} results met ({figures})"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
@@ -148,7 +150,7 @@ class Reporter:
 
 
 def say(console: Console, line: str) -> None:
-    """Prints a line as it is: rich would take square brackets in a path for its markup."""
+    """Prints a line as it is: rich would read square brackets in a path as markup."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 

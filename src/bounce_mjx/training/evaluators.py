@@ -11,7 +11,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.learning.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts

@@ -22,22 +22,20 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
+from bounce_mjx.runs.folders import (
     Checkpoint,
-    CheckpointWriter,
     best_checkpoint,
     create_run,
     find_run,
     has_checkpoint,
     latest_checkpoint,
-    load_policy,
-    load_progress,
-    load_training_state,
     save_config,
     seed_folders,
 )
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
@@ -481,7 +479,7 @@ class _Job:
         self.reporter.flush()
         several = self.config.num_seeds > 1
         library = {"library": self.trainer.library}
-        plain = [member.progress.to_dict() | library for member in self.members]
+        plain = [member.progress.model_dump() | library for member in self.members]
         if several and self.writers:
             self.writers[0].save(("latest",), self.steps, policy, state, {"seeds": plain} | library)
         for i, writer in enumerate(self.writers[-len(self.members) :]):
@@ -537,7 +535,7 @@ def library_of(checkpoint: Checkpoint) -> str:
     Raises:
       UserError: the checkpoint is damaged.
     """
-    return str(load_progress(checkpoint).get("library", JAX))
+    return str(read_record(checkpoint).progress.get("library", JAX))
 
 
 def _wait_until_saved(
@@ -570,7 +568,7 @@ def _write_config(run: Path, config: TrainConfig) -> None:
 
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> Progress:
     """The evaluations from which a seed goes on."""
-    progress = Progress.from_dict(plain, latest)
+    progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
         return progress
     # The best checkpoint itself knows best what it holds: it may be older than the latest one
@@ -578,7 +576,7 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = best_checkpoint(run)
-        stored = Progress.from_dict(load_progress(best), best)
+        stored = Progress.from_dict(read_record(best).progress, best.folder)
         progress.best, progress.best_steps = stored.best, stored.best_steps
     return progress
 

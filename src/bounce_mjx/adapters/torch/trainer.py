@@ -12,7 +12,7 @@ from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.ppo import rollout_metrics
+from bounce_mjx.learning.metrics import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.devices import make_mesh
