@@ -173,6 +173,8 @@ class _Job:
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
         say(console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        for warning in self.env.engine.warnings:
+            say(console, f"warning: {warning}")
         library = "" if self.trainer.library == JAX else f"library: {self.trainer.library}  "
         say(console, f"device: {self.device}  {library}run: {self.run}")
         self.clock.lap("setup")
