@@ -19,6 +19,7 @@ from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.runs.choice import choose_checkpoint
 from bounce_mjx.runs.folder import load_policy, load_run_config
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -73,6 +74,9 @@ def main(args: Sequence[str] | None = None) -> None:
             highlight=False,
             soft_wrap=True,
         )
+        if command.physics == "mujoco":
+            for warning in BounceBall(config.env).engine.warnings:
+                console.print(f"warning: {warning}", highlight=False, markup=False)
         console.print(results_table(report, "the five results"))
         console.print(details_line(report), highlight=False)
         if command.json_file is not None:

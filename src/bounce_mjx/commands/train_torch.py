@@ -111,6 +111,8 @@ def train(command: TorchTrainCommand, console: Console) -> Outcome:
     eval_steps = block_steps * max(1, round(config.eval_every / block_steps))
     run, progress = create_run(config), Progress()
     console.print(f"physics: {env.engine.name} ({env.engine.reason})", highlight=False)
+    for warning in env.engine.warnings:
+        console.print(f"warning: {warning}", highlight=False, markup=False)
     device = jax.devices()[0].device_kind
     console.print(
         f"device: {device}  library: {command.library}  run: {run}",

@@ -151,6 +151,8 @@ class _Job:
         console.print(
             f"physics: {self.env.engine.name} ({self.env.engine.reason})", highlight=False
         )
+        for warning in self.env.engine.warnings:
+            console.print(f"warning: {warning}", highlight=False, markup=False)
         console.print(f"device: {self.device}  run: {self.run}", highlight=False, soft_wrap=True)
         self.clock.lap("setup")
 
