@@ -9,6 +9,7 @@ import mujoco
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import fused
+from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 
 
@@ -19,10 +20,12 @@ class Engine(NamedTuple):
     """fused or mjx."""
     reason: str
     """Why this one was chosen, for the user."""
-    step: Callable[[PhysicsState, jax.Array, int], PhysicsState]
-    """(state, ctrl [nu], number of physics steps) -> state."""
-    paddle_position: Callable[[jax.Array], jax.Array]
-    """qpos [nq] -> world position [3] of the paddle's centre, m."""
+    step: Callable[[PhysicsParameters, PhysicsState, jax.Array, int], PhysicsState]
+    """(parameters, state, ctrl [nu], number of physics steps) -> state."""
+    paddle_position: Callable[[PhysicsParameters, jax.Array], jax.Array]
+    """(parameters, qpos [nq]) -> world position [3] of the paddle's centre, m."""
+    warnings: tuple[str, ...] = ()
+    """Differences to MuJoCo's C engine that the user should know; one sentence each."""
 
 
 def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:

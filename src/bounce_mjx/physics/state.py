@@ -12,3 +12,5 @@ class PhysicsState(NamedTuple):
     """Positions [nq]: joint angles in rad; the ball's position in m and quaternion [w, x, y, z]."""
     qvel: jax.Array
     """Velocities [nv]: joints in rad/s; the ball in m/s (world) and rad/s (ball's frame)."""
+    act: jax.Array | None = None
+    """Activations [na] of the actuators; None where the model has none."""

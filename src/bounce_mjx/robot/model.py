@@ -1,10 +1,15 @@
 """The simulated robot: the MJCF file, the names it must have, and where their data lie."""
 
+import hashlib
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
@@ -100,6 +105,54 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
         ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
         paddle_geom=paddle_geom,
     )
+
+
+def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> jax.Array | None:
+    """Activations [na] at which the servos hold the joint positions qpos [nq] (a servo with a
+    `timeconst` filters its target); None where the model has none."""
+    if mj_model.na == 0:
+        return None
+    activations = [jnp.zeros_like(qpos[0])] * mj_model.na
+    for actuator in range(mj_model.nu):
+        if mj_model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+            joint = mj_model.actuator_trnid[actuator, 0]
+            length = mj_model.actuator_gear[actuator, 0] * qpos[mj_model.jnt_qposadr[joint]]
+            first = mj_model.actuator_actadr[actuator]
+            for i in range(first, first + mj_model.actuator_actnum[actuator]):
+                activations[i] = length
+    return jnp.stack(activations)
+
+
+def fingerprint(mj_model: mujoco.MjModel) -> bytes:
+    """A hash of the numbers that a simulation depends on; pictures' colours and markers are not
+    among them."""
+    digest = hashlib.blake2b()
+    for owner, names in (
+        (mj_model, _physical_fields(mj_model)),
+        (mj_model.opt, [name for name in dir(mj_model.opt) if not name.startswith("_")]),
+    ):
+        for name in names:
+            digest.update(np.asarray(getattr(owner, name)).tobytes())
+    return digest.digest()
+
+
+def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
+    """Checks that a model still is the one whose `fingerprint` is given.
+
+    Raises:
+      UserError: the model was edited, which no engine that was built from it would notice.
+    """
+    if fingerprint(mj_model) != built_from:
+        raise UserError(
+            "env.mj_model was edited after the environment had been built, which does not reach "
+            "its physics; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
+        )
+
+
+def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
+    kinds = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
+    pictured = ("geom_rgba", "geom_matid", "geom_group")
+    return [name for name in dir(mj_model) if name.startswith(kinds) and name not in pictured]
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:

@@ -1,5 +1,6 @@
 """`BounceBall`: the arm, the ball, and the task of bouncing it at a chosen height."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -7,8 +8,15 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from bounce_mjx.physics import Engine, PhysicsState, make_engine
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses, load_model
+from bounce_mjx.physics import Engine, PhysicsParameters, PhysicsState, make_engine
+from bounce_mjx.robot.model import (
+    JOINT_NAMES,
+    check_unedited,
+    find_addresses,
+    fingerprint,
+    load_model,
+    resting_activations,
+)
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.rewards import TERM_NAMES, RewardInputs, weighted_terms
 
@@ -37,6 +45,8 @@ class BounceState(NamedTuple):
 
     physics: PhysicsState
     task: TaskState
+    parameters: PhysicsParameters = PhysicsParameters()
+    """The world of this environment; drawn at its reset."""
 
 
 class BounceBall(Env):
@@ -45,8 +55,16 @@ class BounceBall(Env):
     `done` is 1 where the episode terminated; time-outs belong to the training wrapper.
     """
 
-    def __init__(self, config: EnvConfig | None = None):
+    def __init__(
+        self,
+        config: EnvConfig | None = None,
+        randomize: Callable[[jax.Array], PhysicsParameters] | None = None,
+    ):
         """Compiles the model and chooses the physics engine.
+
+        Args:
+          randomize: a key -> the world of one episode, drawn at each reset; None for the model's
+            own world.
 
         Raises:
           UserError: the MJCF file or the engine does not fit the task.
@@ -55,6 +73,8 @@ class BounceBall(Env):
         self.mj_model: mujoco.MjModel = load_model(self.config.mjcf, self.config.physics_dt)
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
+        self._randomize = randomize
+        self._fingerprint = fingerprint(self.mj_model)
 
     @property
     def dt(self) -> float:
@@ -78,7 +98,12 @@ class BounceBall(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
+        check_unedited(self.mj_model, self._fingerprint)
         config, at = self.config, self._addresses
+        parameters = PhysicsParameters()
+        if self._randomize is not None:
+            rng, world_rng = jax.random.split(rng)
+            parameters = self._randomize(world_rng)
         # One draw for everything: the keys of separate draws would cost more than the numbers.
         noise = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
         zero = jnp.zeros((), noise.dtype)
@@ -93,7 +118,9 @@ class BounceBall(Env):
             qpos[at.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
             qpos[at.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
-        physics = PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
+        physics = PhysicsState(
+            jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
+        )
 
         task = TaskState(
             target_height=low + (high - low) * 0.5 * (noise[15] + 1.0),
@@ -107,8 +134,10 @@ class BounceBall(Env):
             ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"), zero
         )
         return State(
-            pipeline_state=BounceState(physics, task),
-            obs=self._observation(physics, task, self.engine.paddle_position(physics.qpos)),
+            pipeline_state=BounceState(physics, task, parameters),
+            obs=self._observation(
+                physics, task, self.engine.paddle_position(parameters, physics.qpos)
+            ),
             reward=zero,
             done=zero,
             metrics=metrics,
@@ -116,23 +145,28 @@ class BounceBall(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [6], clipped to [-1, 1]."""
+        check_unedited(self.mj_model, self._fingerprint)
         action = jnp.clip(action, -1.0, 1.0)
         before = state.pipeline_state
+        targets = self.servo_targets(before.physics, action)
         physics = self.engine.step(
-            before.physics, self.servo_targets(before.physics, action), self.config.num_substeps
+            before.parameters, before.physics, targets, self.config.num_substeps
         )
         return self.finish_step(state, action, physics)
 
     def servo_targets(self, physics: PhysicsState, action: jax.Array) -> jax.Array:
-        """Servo targets ctrl [nu] (rad) of a clipped action [6]: the measured joint angles plus
-        the scaled action, clipped to the joint ranges."""
-        at = self._addresses
-        ranges = self.mj_model.jnt_range[at.arm_joints,]
-        targets = [jnp.zeros_like(action[0])] * self.mj_model.nu
+        """Servo targets ctrl [nu] of a clipped action [6]: the measured joint angles plus the
+        scaled action (rad), clipped to the range of each joint that has one, times the gear."""
+        model, at = self.mj_model, self._addresses
+        targets = [jnp.zeros_like(action[0])] * model.nu
         # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
         for i, actuator in enumerate(at.actuators):
             target = physics.qpos[at.arm_qpos[i]] + self.config.action_scale * action[i]
-            targets[actuator] = jnp.clip(target, *(float(limit) for limit in ranges[i]))
+            low, high = (float(limit) for limit in model.jnt_range[at.arm_joints[i]])
+            if low < high:
+                target = jnp.clip(target, low, high)
+            gear = float(model.actuator_gear[actuator, 0])
+            targets[actuator] = target if gear == 1.0 else gear * target
         return jnp.stack(targets)
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
@@ -145,7 +179,7 @@ class BounceBall(Env):
         config, at = self.config, self._addresses
         before = state.pipeline_state
         finite = jnp.array(True)
-        for coordinates in physics:
+        for coordinates in jax.tree.leaves(physics):
             finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
         # What came before is itself looked at, in case the memory was damaged.
         physics = jax.tree.map(
@@ -160,7 +194,7 @@ class BounceBall(Env):
         ball = jnp.stack([physics.qpos[i] for i in at.ball_qpos[:3]])
         ball_velocity = jnp.stack([physics.qvel[i] for i in at.ball_qvel[:3]])
         joint_velocity = jnp.stack([physics.qvel[i] for i in at.arm_qvel])
-        paddle = self.engine.paddle_position(physics.qpos)
+        paddle = self.engine.paddle_position(before.parameters, physics.qpos)
 
         task, bounced = update_task(config, before.task, ball, ball_velocity, paddle, action)
         terms = weighted_terms(
@@ -191,7 +225,7 @@ class BounceBall(Env):
             "non_finite": (~finite).astype(dtype),
         }
         return state.replace(
-            pipeline_state=BounceState(physics, task),
+            pipeline_state=before._replace(physics=physics, task=task),
             obs=self._observation(physics, task, paddle),
             reward=sum(terms.values()),
             done=ended.astype(dtype),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from bounce_mjx.physics.scalars import (
+from bounce_mjx.physics.fused.scalars import (
     IDENTITY3,
     ZERO3,
     Mat3,
@@ -39,7 +39,7 @@ SquareMatrix = list[list[Scalar]]
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """Constants of one hinge and the link that it carries."""
+    """Numbers of one hinge and the link that it carries."""
 
     offset: tuple[float, float, float]
     """Origin of the link in the frame of its parent, m."""
@@ -49,15 +49,15 @@ class Link:
     """Unit axis of the hinge."""
     zero_angle: float
     """Joint angle at which the link stands at `rotation`, rad."""
-    mass: float
+    mass: Scalar
     """kg."""
-    first_moment: tuple[float, float, float]
+    first_moment: Vec3
     """Mass times centre of mass, kg m."""
-    inertia: tuple[tuple[float, float, float], ...]
+    inertia: Mat3
     """Rotational inertia about the origin of the link, kg m^2."""
-    armature: float
+    armature: Scalar
     """Inertia of the rotor, seen at the joint, kg m^2."""
-    damping: float
+    damping: Scalar
     """Viscous damping of the joint, N m s/rad."""
 
 
@@ -125,10 +125,11 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     """Joint-space inertia matrix [n, n] (kg m^2), armature included: composite rigid bodies."""
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
-    mass, first_moment, inertia = 0.0, ZERO3, ((0.0,) * 3,) * 3
+    mass: Scalar = 0.0
+    first_moment, inertia = ZERO3, ((0.0,) * 3,) * 3
     for i in reversed(range(n)):
         link = links[i]
-        mass += link.mass
+        mass = add(mass, link.mass)
         first_moment = vadd(first_moment, link.first_moment)
         inertia = tuple(vadd(a, b) for a, b in zip(inertia, link.inertia, strict=True))
 
@@ -204,17 +205,17 @@ def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[V
 
 
 def _inertia_to_parent(
-    link: Link, rotation: Mat3, mass: float, first_moment: Vec3, inertia: Mat3
+    link: Link, rotation: Mat3, mass: Scalar, first_moment: Vec3, inertia: Mat3
 ) -> tuple[Vec3, Mat3]:
     """First moment and inertia of the composite body, seen in the parent's frame about its origin
     (the parallel-axis theorem with the offset p of the link's origin)."""
     p = link.offset
     h = matvec(rotation, first_moment)
     rotated = congruence(rotation, inertia)
-    diagonal = add(mul(2.0, dot(p, h)), mass * sum(x * x for x in p))
+    diagonal = add(mul(2.0, dot(p, h)), mul(mass, sum(x * x for x in p)))
 
     def entry(i: int, j: int) -> Scalar:
-        off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mass * p[i] * p[j])
+        off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mul(mul(mass, p[i]), p[j]))
         return sub(add(rotated[i][j], diagonal if i == j else 0.0), off)
 
     xx, xy, xz, yy, yz, zz = (

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.scalars import Mat3, Scalar, Vec3, dot, matvec, transpose, vsub
+from bounce_mjx.physics.fused.scalars import Mat3, Scalar, Vec3, dot, matvec, transpose, vsub
 
 # MuJoCo's mjMINVAL: a centre closer to the box than this counts as inside it.
 _MIN_DISTANCE = 1e-15
@@ -18,20 +18,22 @@ _MIN_DISTANCE = 1e-15
 
 @dataclasses.dataclass(frozen=True)
 class ContactModel:
-    """Constants of the pair."""
+    """Numbers of the pair."""
 
-    radius: float
+    radius: Scalar
     """Radius of the sphere, m."""
     half_size: tuple[float, float, float]
     """Half sizes of the box, m."""
-    stiffness: float
+    stiffness: Scalar
     """k of the reference acceleration, 1/s^2."""
-    damping: float
+    damping: Scalar
     """b of the reference acceleration, 1/s."""
     solimp: tuple[float, float, float, float, float]
     """dmin, dmax, width (m), midpoint, power of the impedance."""
-    inverse_weight: float
-    """Translational inverse inertia of the two bodies at the reference pose, 1/kg."""
+    paddle_inverse_weight: float
+    """Translational inverse inertia of the paddle's body at the reference pose, 1/kg."""
+    ball_inverse_weight: Scalar
+    """That of the ball, 1/kg."""
 
 
 class Contact(NamedTuple):
@@ -97,6 +99,6 @@ def normal_force(
     """
     d = impedance(model, contact.distance)
     reference = -model.damping * normal_velocity - model.stiffness * d * contact.distance
-    regulariser = (1.0 - d) / d * model.inverse_weight
+    regulariser = (1.0 - d) / d * (model.paddle_inverse_weight + model.ball_inverse_weight)
     force = (reference - free_acceleration) / (inverse_inertia + regulariser)
     return jnp.where(contact.distance < 0.0, jnp.maximum(force, 0.0), 0.0)

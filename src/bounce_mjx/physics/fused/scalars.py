@@ -134,6 +134,25 @@ def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) ->
     )
 
 
+def quaternion_matrix(quaternion: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat3:
+    """Rotation matrix of a unit quaternion [w, x, y, z]."""
+    w, x, y, z = quaternion
+
+    def diagonal(a: Scalar, b: Scalar) -> Scalar:
+        return sub(1.0, mul(2.0, add(mul(a, a), mul(b, b))))
+
+    def off(product: Scalar, turned: Scalar) -> Scalar:
+        return mul(2.0, add(product, turned))
+
+    xy, xz, yz = mul(x, y), mul(x, z), mul(y, z)
+    wx, wy, wz = mul(w, x), mul(w, y), mul(w, z)
+    return (
+        (diagonal(y, z), off(xy, neg(wz)), off(xz, wy)),
+        (off(xy, wz), diagonal(x, z), off(yz, neg(wx))),
+        (off(xz, neg(wy)), off(yz, wx), diagonal(x, y)),
+    )
+
+
 # Half of pi in three parts, of which the first two have so few digits that their products with a
 # small whole number are exact.
 _HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)

@@ -1,0 +1,12 @@
+"""The fused engine: MuJoCo's equations for one kind of model, as straight-line scalar arithmetic.
+
+The kind: a serial chain of hinges with position servos, a free ball, one frictionless contact pair
+of the ball (a sphere) and the paddle (a box), the implicitfast integrator. `read_model` takes the
+constants from a compiled `mujoco.MjModel` and refuses any other kind.
+"""
+
+from bounce_mjx.physics.fused.dynamics import paddle_position, step
+from bounce_mjx.physics.fused.model import FusedModel, read_model
+from bounce_mjx.physics.fused.support import UnsupportedModelError
+
+__all__ = ["FusedModel", "UnsupportedModelError", "paddle_position", "read_model", "step"]

@@ -1,0 +1,244 @@
+"""The fused engine's step, unrolled into scalar arithmetic while tracing.
+
+Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physics step into a few
+loops; on a GPU all physics steps of a control step are one kernel (`kernel.py`).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.contact import normal_force, sphere_box
+from bounce_mjx.physics.fused.kernel import elementwise
+from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
+from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
+from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.state import PhysicsState
+
+
+class Motion(NamedTuple):
+    """What a substep changes, one scalar a coordinate."""
+
+    q: tuple[Scalar, ...]
+    v: tuple[Scalar, ...]
+    ball_position: Vec3
+    ball_velocity: Vec3
+
+
+def step(
+    model: FusedModel,
+    parameters: PhysicsParameters,
+    state: PhysicsState,
+    ctrl: jax.Array,
+    num_substeps: int = 1,
+) -> PhysicsState:
+    """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu].
+
+    The parameters that are given enter the program as inputs; the others fold as constants. The
+    coordinates go through the loop as scalars. The ball's spin is constant, as the only
+    contact is frictionless and goes through its centre; so its orientation turns once, by the
+    angle of the whole interval.
+    """
+    at = model.addresses
+    motion = Motion(
+        q=tuple(state.qpos[i] for i in at.arm_qpos),
+        v=tuple(state.qvel[i] for i in at.arm_qvel),
+        ball_position=tuple(state.qpos[i] for i in at.ball_qpos[:3]),
+        ball_velocity=tuple(state.qvel[i] for i in at.ball_qvel[:3]),
+    )
+    leaves, tree = jax.tree.flatten(motion)
+    numbers, given = jax.tree.flatten(as_scalars(parameters, state.qpos.dtype))
+    advance = elementwise(_substeps(model, given, num_substeps), num_results=len(leaves))
+    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in at.actuators), *numbers))
+    quaternion = turn(
+        tuple(state.qpos[i] for i in at.ball_qpos[3:]),
+        tuple(state.qvel[i] for i in at.ball_qvel[3:]),
+        num_substeps * model.dt,
+    )
+
+    qpos = [state.qpos[i] for i in range(model.nq)]
+    qvel = [state.qvel[i] for i in range(model.nv)]
+    positions = (*motion.q, *motion.ball_position, *quaternion)
+    for i, value in zip(at.arm_qpos + at.ball_qpos, positions, strict=True):
+        qpos[i] = value
+    for i, value in zip(
+        at.arm_qvel + at.ball_qvel[:3], (*motion.v, *motion.ball_velocity), strict=True
+    ):
+        qvel[i] = value
+    return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
+
+
+def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
+    """World position [3] (m) of the paddle's centre at qpos [nq]."""
+    relevant = PhysicsParameters(paddle_position=parameters.paddle_position)
+    numbers, given = jax.tree.flatten(as_scalars(relevant, qpos.dtype))
+    # A kernel of its own: XLA would take long to fuse such a chain with the program around it.
+    position = elementwise(_paddle_position(model, given), num_results=3)
+    return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
+
+
+def as_scalars(parameters: PhysicsParameters, dtype: jnp.dtype) -> PhysicsParameters:
+    """The given arrays of one environment as scalars, or tuples of scalars, of one type."""
+
+    def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
+        array = jnp.asarray(array, dtype)
+        return array if array.ndim == 0 else tuple(array[i] for i in range(len(array)))
+
+    return jax.tree.map(scalars, parameters)
+
+
+@functools.lru_cache
+def _substeps(
+    model: FusedModel, given: jax.tree_util.PyTreeDef, num_substeps: int
+) -> Callable[..., tuple[Scalar, ...]]:
+    """Physics steps as a function of scalars: those of a `Motion`, the servo targets, and those of
+    the `given` structure of parameters.
+
+    The cache and the inline jit let JAX trace this long function once for all the programs that
+    have it; each trace takes some tenths of a second.
+    """
+    n = len(model.links)
+    num_coordinates = 2 * n + 6
+
+    def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
+        q, v, ball = scalars[:n], scalars[n : 2 * n], scalars[2 * n : num_coordinates]
+        targets = scalars[num_coordinates : num_coordinates + n]
+        world = in_world(model, given.unflatten(scalars[num_coordinates + n :]))
+        motion = jax.lax.fori_loop(
+            0,
+            num_substeps,
+            lambda _, motion: substep(world, motion, targets),
+            Motion(q, v, ball[:3], ball[3:]),
+        )
+        return tuple(jax.tree.leaves(motion))
+
+    return jax.jit(substeps, inline=True)
+
+
+@functools.lru_cache
+def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec3]:
+    """`paddle_position` as a function of the joint angles and the given parameters; cached as
+    `_substeps` is."""
+    n = len(model.links)
+
+    def position(*scalars: Scalar) -> Vec3:
+        world = in_world(model, given.unflatten(scalars[n:]))
+        return _paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
+
+    return jax.jit(position, inline=True)
+
+
+def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
+    """One physics step: mj_step of this kind of model."""
+    pose = chain.forward_kinematics(model.links, motion.q)
+    bias = chain.bias_force(model.links, pose, motion.v, model.gravity)
+    inertia = chain.mass_matrix(model.links, pose)
+    applied = [
+        servo_torque(servo, target, q, v) - link.damping * v - b
+        for link, servo, target, q, v, b in zip(
+            model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
+        )
+    ]
+    contact_torque, ball_acceleration = contact_response(model, motion, pose, inertia, applied)
+    return integrate(
+        model,
+        motion,
+        inertia,
+        [add(a, c) for a, c in zip(applied, contact_torque, strict=True)],
+        ball_acceleration,
+    )
+
+
+def servo_torque(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> Scalar:
+    """Torque (N m) of MuJoCo's affine actuator for the servo target (rad)."""
+    if servo.ctrl_range is not None:
+        target = jnp.clip(target, *servo.ctrl_range)
+    return servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+
+
+def contact_response(
+    model: FusedModel,
+    motion: Motion,
+    pose: chain.Pose,
+    inertia: chain.SquareMatrix,
+    applied: list[Scalar],
+) -> tuple[list[Scalar], Vec3]:
+    """Joint torques (N m) of the contact, and the ball's acceleration (m/s^2) with it."""
+    contact = sphere_box(
+        model.contact,
+        motion.ball_position,
+        _paddle_origin(model, pose),
+        matmul(pose.world_rotation[-1], model.paddle_rotation),
+    )
+    # The torque of a force along the normal is the same at the contact as at the ball's centre.
+    jacobian = [
+        -entry
+        for entry in chain.point_jacobian(model.links, pose, motion.ball_position, contact.normal)
+    ]
+    factor = chain.cholesky(inertia)
+    half_jacobian = chain.solve_lower(factor, jacobian)
+    half_applied = chain.solve_lower(factor, applied)
+
+    normal_velocity = dot(contact.normal, motion.ball_velocity)
+    free_acceleration = dot(contact.normal, model.gravity)
+    inverse_inertia = 1.0 / model.ball_mass
+    for j, v, half_j, half_a in zip(jacobian, motion.v, half_jacobian, half_applied, strict=True):
+        normal_velocity = normal_velocity + j * v
+        free_acceleration = free_acceleration + half_j * half_a
+        inverse_inertia = inverse_inertia + half_j * half_j
+    force = normal_force(
+        model.contact, contact, normal_velocity, free_acceleration, inverse_inertia
+    )
+    ball_acceleration = vadd(model.gravity, scale(contact.normal, force / model.ball_mass))
+    return [j * force for j in jacobian], ball_acceleration
+
+
+def integrate(
+    model: FusedModel,
+    motion: Motion,
+    inertia: chain.SquareMatrix,
+    torque: list[Scalar],
+    ball_acceleration: Vec3,
+) -> Motion:
+    """MuJoCo's implicitfast integrator: semi-implicit Euler, implicit in the velocity-dependent
+    torques of servos and joint damping (documentation, "Computation", numerical integration)."""
+    dt = model.dt
+    implicit = [list(row) for row in inertia]
+    for i, (link, servo) in enumerate(zip(model.links, model.servos, strict=True)):
+        implicit[i][i] = add(implicit[i][i], dt * (link.damping - servo.damping))
+    factor = chain.cholesky(implicit)
+    acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
+    v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
+    q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
+    ball_velocity = vadd(motion.ball_velocity, scale(ball_acceleration, dt))
+    ball_position = vadd(motion.ball_position, scale(ball_velocity, dt))
+    return Motion(q, v, ball_position, ball_velocity)
+
+
+def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[Scalar, ...]:
+    """Quaternion [w, x, y, z] after turning at a constant spin (rad/s, body frame): the axis-angle
+    product of MuJoCo's mju_quatIntegrate."""
+    w, x, y, z = quaternion
+    inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = (c * inverse_norm for c in quaternion)
+    squared_speed = dot(spin, spin)
+    still = squared_speed == 0.0
+    speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
+    half_angle = 0.5 * duration * speed
+    sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
+    c = jnp.where(still, 1.0, jnp.cos(half_angle))
+    a, b, d = scale(spin, sine)
+    return (
+        w * c - x * a - y * b - z * d,
+        w * a + x * c + y * d - z * b,
+        w * b - x * d + y * c + z * a,
+        w * d + x * b - y * a + z * c,
+    )
+
+
+def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:
+    return vadd(pose.world_origin[-1], matvec(pose.world_rotation[-1], model.paddle_origin))

@@ -1,0 +1,222 @@
+"""The fused engine's model: the constants of a compiled MJCF, and one environment's numbers."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.contact import ContactModel
+from bounce_mjx.physics.fused.scalars import Mat3, Scalar, Vec3, mul, quaternion_matrix, scale
+from bounce_mjx.physics.fused.support import check_supported
+from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.robot.model import Addresses, find_addresses
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo:
+    """A position servo: torque = gain * ctrl + bias + stiffness * angle + damping * velocity."""
+
+    gain: Scalar
+    bias: float
+    stiffness: Scalar
+    damping: Scalar
+    gear: float
+    """Length of the actuator per joint angle."""
+    ctrl_range: tuple[float, float] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedModel:
+    """Numbers of the fused engine, in SI units.
+
+    `read_model` gives constants alone, which fold while tracing; `in_world` puts scalars of one
+    environment in the place of some.
+    """
+
+    dt: float
+    gravity: Vec3
+    links: tuple[chain.Link, ...]
+    servos: tuple[Servo, ...]
+    """In the order of the joints."""
+    paddle_origin: Vec3
+    """Centre of the paddle in the frame of the last link."""
+    paddle_rotation: Mat3
+    """Orientation of the paddle in the frame of the last link."""
+    ball_mass: Scalar
+    contact: ContactModel
+    addresses: Addresses
+    nq: int
+    nv: int
+
+
+def read_model(mj_model: mujoco.MjModel) -> FusedModel:
+    """Constants of a compiled model.
+
+    Raises:
+      UnsupportedModelError: the model has a feature outside the fused engine's kind; the text
+        names it.
+    """
+    at = find_addresses(mj_model)
+    check_supported(mj_model, at)
+    return FusedModel(
+        dt=float(mj_model.opt.timestep),
+        gravity=_floats(mj_model.opt.gravity),
+        links=tuple(_read_link(mj_model, joint) for joint in at.arm_joints),
+        servos=tuple(_read_servo(mj_model, actuator) for actuator in at.actuators),
+        paddle_origin=_floats(mj_model.geom_pos[at.paddle_geom]),
+        paddle_rotation=_rotation(mj_model.geom_quat[at.paddle_geom]),
+        ball_mass=float(mj_model.body_mass[at.ball_body]),
+        contact=_read_contact(mj_model, at),
+        addresses=at,
+        nq=mj_model.nq,
+        nv=mj_model.nv,
+    )
+
+
+def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
+    """The model with the given numbers of one environment.
+
+    Args:
+      parameters: as scalars, or tuples of scalars; without any, the model stays as it is.
+    """
+    p, contact = parameters, model.contact
+    if p.ball_mass is not None:
+        ratio = model.ball_mass / p.ball_mass
+        contact = dataclasses.replace(
+            contact, ball_inverse_weight=mul(contact.ball_inverse_weight, ratio)
+        )
+    if p.ball_radius is not None:
+        contact = dataclasses.replace(contact, radius=p.ball_radius)
+    # The direct format of solref, scaled by the impedance as MuJoCo does.
+    max_impedance = contact.solimp[1]
+    if p.contact_stiffness is not None:
+        stiffness = mul(p.contact_stiffness, 1.0 / max_impedance**2)
+        contact = dataclasses.replace(contact, stiffness=stiffness)
+    if p.contact_damping is not None:
+        damping = mul(p.contact_damping, 1.0 / max_impedance)
+        contact = dataclasses.replace(contact, damping=damping)
+    none = (None,) * len(model.links)
+    links = zip(
+        model.links, p.link_mass or none, p.armature or none, p.damping or none, strict=True
+    )
+    servos = zip(model.servos, p.servo_gain or none, p.servo_damping or none, strict=True)
+    rotation = p.paddle_rotation
+    return dataclasses.replace(
+        model,
+        gravity=_given(p.gravity, model.gravity),
+        links=tuple(_link_in_world(*link) for link in links),
+        servos=tuple(_servo_in_world(*servo) for servo in servos),
+        paddle_origin=_given(p.paddle_position, model.paddle_origin),
+        paddle_rotation=model.paddle_rotation if rotation is None else quaternion_matrix(rotation),
+        ball_mass=_given(p.ball_mass, model.ball_mass),
+        contact=contact,
+    )
+
+
+def _link_in_world(
+    link: chain.Link, mass: Scalar | None, armature: Scalar | None, damping: Scalar | None
+) -> chain.Link:
+    if mass is not None:
+        ratio = mul(mass, 1.0 / link.mass)
+        link = dataclasses.replace(
+            link,
+            mass=mass,
+            first_moment=scale(link.first_moment, ratio),
+            inertia=tuple(scale(row, ratio) for row in link.inertia),
+        )
+    return dataclasses.replace(
+        link, armature=_given(armature, link.armature), damping=_given(damping, link.damping)
+    )
+
+
+def _servo_in_world(servo: Servo, gain: Scalar | None, damping: Scalar | None) -> Servo:
+    if gain is not None:
+        gain = mul(gain, servo.gear)
+        servo = dataclasses.replace(servo, gain=gain, stiffness=mul(gain, -servo.gear))
+    if damping is not None:
+        servo = dataclasses.replace(servo, damping=mul(damping, -(servo.gear**2)))
+    return servo
+
+
+def _given(value, default):
+    return default if value is None else value
+
+
+def _floats(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(v) for v in values)
+
+
+def _rotation(quaternion: np.ndarray) -> Mat3:
+    """Rotation matrix, its entries within rounding of -1, 0 and 1 made exact so that they fold."""
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    nearest = np.round(matrix)
+    matrix = np.where(np.abs(matrix - nearest) < 1e-12, nearest, matrix).reshape(3, 3)
+    return tuple(_floats(row) for row in matrix)
+
+
+def _read_link(mj_model: mujoco.MjModel, joint: int) -> chain.Link:
+    body = mj_model.jnt_bodyid[joint]
+    dof = mj_model.jnt_dofadr[joint]
+    mass = float(mj_model.body_mass[body])
+    centre = mj_model.body_ipos[body]
+    principal = np.array(_rotation(mj_model.body_iquat[body]))
+    about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
+    about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return chain.Link(
+        offset=_floats(mj_model.body_pos[body]),
+        rotation=_rotation(mj_model.body_quat[body]),
+        axis=_floats(mj_model.jnt_axis[joint]),
+        zero_angle=float(mj_model.qpos0[mj_model.jnt_qposadr[joint]]),
+        mass=mass,
+        first_moment=_floats(mass * centre),
+        inertia=tuple(_floats(row) for row in about_origin),
+        armature=float(mj_model.dof_armature[dof]),
+        damping=float(mj_model.dof_damping[dof]),
+    )
+
+
+def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
+    gear = float(mj_model.actuator_gear[actuator, 0])
+    bias, stiffness, damping = (float(b) for b in mj_model.actuator_biasprm[actuator, :3])
+    limited = bool(mj_model.actuator_ctrllimited[actuator])
+    return Servo(
+        gain=gear * float(mj_model.actuator_gainprm[actuator, 0]),
+        bias=gear * bias,
+        stiffness=gear**2 * stiffness,
+        damping=gear**2 * damping,
+        gear=gear,
+        ctrl_range=_floats(mj_model.actuator_ctrlrange[actuator]) if limited else None,
+    )
+
+
+def _read_contact(mj_model: mujoco.MjModel, at: Addresses) -> ContactModel:
+    solref, solimp = mj_model.pair_solref[0], mj_model.pair_solimp[0]
+    # The limits that MuJoCo's engine puts on solimp (mjMINIMP, mjMAXIMP).
+    dmin, dmax, midpoint = np.clip(solimp[[0, 1, 3]], 1e-4, 1.0 - 1e-4)
+    if solref[0] > 0.0:
+        # solref is (time constant, damping ratio); the time constant spans two steps at least.
+        time_constant = max(solref[0], 2.0 * mj_model.opt.timestep)
+        stiffness = 1.0 / (dmax * time_constant * solref[1]) ** 2
+        damping = 2.0 / (dmax * time_constant)
+    else:
+        stiffness, damping = -solref[0] / dmax**2, -solref[1] / dmax
+    power = max(1.0, float(solimp[4]))
+    paddle_body = mj_model.geom_bodyid[at.paddle_geom]
+    weights = mj_model.body_invweight0
+    return ContactModel(
+        radius=float(mj_model.geom_size[at.ball_geom, 0]),
+        half_size=_floats(mj_model.geom_size[at.paddle_geom]),
+        stiffness=float(stiffness),
+        damping=float(damping),
+        solimp=(
+            float(dmin),
+            float(dmax),
+            float(solimp[2]),
+            float(midpoint),
+            int(power) if power.is_integer() else power,
+        ),
+        paddle_inverse_weight=float(weights[paddle_body, 0]),
+        ball_inverse_weight=float(weights[at.ball_body, 0]),
+    )

@@ -1,0 +1,128 @@
+"""Which models the fused engine computes; any other is refused by the name of a feature."""
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.robot.model import Addresses
+
+
+class UnsupportedModelError(ValueError):
+    """The model has a feature that the fused engine does not compute; the text names it."""
+
+
+def check_supported(mj_model: mujoco.MjModel, at: Addresses) -> None:
+    """Checks that the fused engine computes every feature of a model.
+
+    Raises:
+      UnsupportedModelError: it does not; the text names the feature.
+    """
+    _check_options(mj_model)
+    _check_bodies(mj_model, at)
+    _check_constraints(mj_model, at)
+    _check_actuators(mj_model)
+
+
+def _require(condition: bool, feature: str) -> None:
+    if not condition:
+        raise UnsupportedModelError(feature)
+
+
+# Flags of the MJCF that change nothing in a model of the fused engine's kind.
+_HARMLESS_DISABLED = frozenset(
+    "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
+    "autoreset nativeccd island multiccd".split()
+)
+_HARMLESS_ENABLED = frozenset(("energy", "fwdinv", "invdiscrete"))
+# MuJoCo's mjMINVAL: an impedance of no greater width is the mean of dmin and dmax.
+_MIN_WIDTH = 1e-15
+
+
+def _check_options(m: mujoco.MjModel) -> None:
+    integrator = mujoco.mjtIntegrator(m.opt.integrator)
+    _require(
+        integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        f"the integrator {integrator.name} (only implicitfast)",
+    )
+    disabled = _flags(m.opt.disableflags, mujoco.mjtDisableBit) - _HARMLESS_DISABLED
+    _require(not disabled, f"disabled parts of the engine ({', '.join(sorted(disabled))})")
+    enabled = _flags(m.opt.enableflags, mujoco.mjtEnableBit) - _HARMLESS_ENABLED
+    _require(not enabled, f"enabled options of the engine ({', '.join(sorted(enabled))})")
+    _require(m.opt.disableactuator == 0, "disabled actuators (actuatorgroupdisable)")
+    fluid = m.opt.density or m.opt.viscosity or np.any(m.opt.wind)
+    _require(not fluid, "a medium (density, viscosity or wind)")
+    _require(m.nplugin == 0, "plugins")
+    _require(m.nflex == 0, "flexes (flex, flexcomp)")
+
+
+def _flags(bits: int, kind: type) -> set[str]:
+    """Names of the flags set in `bits`, as the MJCF writes them."""
+    return {
+        name.partition("BL_")[2].lower()  # mjDSBL_GRAVITY, mjENBL_ENERGY; not the count mjNENABLE
+        for name, flag in kind.__members__.items()
+        if "BL_" in name and bits & int(flag)
+    }
+
+
+def _check_bodies(m: mujoco.MjModel, at: Addresses) -> None:
+    bodies = [int(m.jnt_bodyid[joint]) for joint in at.arm_joints]
+    _require(m.njnt == len(at.arm_joints) + 1, "joints other than Joint1..Joint6 and the ball's")
+    _require(m.nbody == len(bodies) + 2, "bodies other than the six links and the ball")
+    hinge = mujoco.mjtJoint.mjJNT_HINGE
+    _require(all(m.jnt_type[j] == hinge for j in at.arm_joints), "arm joints that are not hinges")
+    _require(not np.any(m.jnt_pos[at.arm_joints,]), "a joint away from its body's origin (pos)")
+    parents = [0, *bodies[:-1]]
+    _require(
+        all(m.body_parentid[b] == p for b, p in zip(bodies, parents, strict=True)),
+        "an arm that is not one serial chain of Joint1..Joint6",
+    )
+    _require(m.geom_bodyid[at.paddle_geom] == bodies[-1], "a paddle that is not on the last link")
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _require(m.geom_type[at.paddle_geom] == box, "a paddle that is not a box")
+    _require(not np.any(m.body_gravcomp), "gravity compensation (gravcomp)")
+    springs = np.any(m.jnt_stiffness) or np.any(m.jnt_stiffnesspoly)
+    _require(not springs, "joint springs (stiffness)")
+    _require(not np.any(m.dof_dampingpoly), "nonlinear joint damping")
+    _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
+    _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
+    inertia = m.body_inertia[at.ball_body]
+    plain_ball = (
+        m.geom_type[at.ball_geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+        and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
+        and not np.any(m.body_ipos[at.ball_body])
+        and not np.any(m.geom_pos[at.ball_geom])
+        and not np.any(m.dof_damping.reshape(m.nv, -1)[at.ball_qvel,])
+        and not np.any(m.dof_armature[at.ball_qvel,])
+    )
+    _require(plain_ball, "a ball that is not one undamped homogeneous sphere")
+
+
+def _check_constraints(m: mujoco.MjModel, at: Addresses) -> None:
+    _require(m.neq == 0, "equality constraints")
+    _require(m.ntendon == 0, "tendons")
+    colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    _require(not np.any(colliding), "contacts by contype and conaffinity (only the one pair)")
+    _require(m.npair == 1, "other than one contact pair")
+    pair = {int(m.pair_geom1[0]), int(m.pair_geom2[0])}
+    _require(pair == {at.paddle_geom, at.ball_geom}, "a pair other than of the ball and the paddle")
+    _require(m.pair_dim[0] == 1, f"a pair with friction (condim {m.pair_dim[0]}; only condim 1)")
+    _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
+    _require(m.pair_adhesion[0] == 0.0, "adhesion")
+    solref, width = m.pair_solref[0], m.pair_solimp[0, 2]
+    _require((solref[0] > 0.0) == (solref[1] > 0.0), "a solref of mixed signs")
+    _require(width > _MIN_WIDTH, "a solimp without a width")
+
+
+def _check_actuators(m: mujoco.MjModel) -> None:
+    _require(m.nu == m.njnt - 1, "actuators other than one position servo on each joint")
+    plain = (
+        np.all(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
+        and np.all(m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+        and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
+    )
+    _require(bool(plain), "actuators that are not position servos")
+    limited = np.any(m.actuator_forcelimited) or np.any(m.jnt_actfrclimited)
+    _require(not limited, "force limits (forcerange)")
+    _require(not np.any(m.actuator_delay), "delayed actuators (delay)")
+    rotor = (m.actuator_damping, m.actuator_dampingpoly, m.actuator_armature)
+    _require(not any(map(np.any, rotor)), "damping or armature given to an actuator")

@@ -1,0 +1,221 @@
+"""The world's numbers: the part of a model that may differ between environments."""
+
+import copy
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+
+Array = np.ndarray | jax.Array
+
+
+class PhysicsParameters(NamedTuple):
+    """Numbers of one environment's world; None stands for the model's own value.
+
+    A given number replaces the same number of the model in every engine; `mj_step` on the model
+    that `edited_model` returns defines the result. Quantities of joints and links are in the order
+    of Joint1..Joint6. `jax.vmap` batches the given arrays.
+    """
+
+    ball_mass: Array | None = None
+    """Mass [] of the ball, kg; its inertia changes in proportion."""
+    ball_radius: Array | None = None
+    """Radius [] of the ball, m; its mass stays, its inertia changes with the square."""
+    contact_stiffness: Array | None = None
+    """Stiffness [] of the contact, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
+    contact_damping: Array | None = None
+    """Damping [] of the contact, 1/s: b of `solref="-k -b"`."""
+    servo_gain: Array | None = None
+    """Stiffness [6] of the position servos, N m/rad: `kp`."""
+    servo_damping: Array | None = None
+    """Damping [6] of the position servos, N m s/rad: `kv`."""
+    armature: Array | None = None
+    """Rotor inertia [6] at the joints, kg m^2."""
+    damping: Array | None = None
+    """Viscous damping [6] of the joints, N m s/rad."""
+    link_mass: Array | None = None
+    """Masses [6] of the links, kg; first moment and inertia change in proportion, the centre of
+    mass stays."""
+    paddle_position: Array | None = None
+    """Centre [3] of the paddle in the frame of the last link, m."""
+    paddle_rotation: Array | None = None
+    """Orientation [4] of the paddle in the frame of the last link: a unit quaternion w, x, y, z."""
+    gravity: Array | None = None
+    """Acceleration [3] of gravity in the world, m/s^2."""
+
+
+MODEL_PARAMETERS = PhysicsParameters()
+"""The model's own world: nothing is given."""
+
+_NUM_JOINTS = len(JOINT_NAMES)
+SHAPES = PhysicsParameters(
+    ball_mass=(),
+    ball_radius=(),
+    contact_stiffness=(),
+    contact_damping=(),
+    servo_gain=(_NUM_JOINTS,),
+    servo_damping=(_NUM_JOINTS,),
+    armature=(_NUM_JOINTS,),
+    damping=(_NUM_JOINTS,),
+    link_mass=(_NUM_JOINTS,),
+    paddle_position=(3,),
+    paddle_rotation=(4,),
+    gravity=(3,),
+)
+"""Shape of each parameter of one environment."""
+
+
+def check_shapes(parameters: PhysicsParameters) -> None:
+    """Checks the parameters of one environment.
+
+    Raises:
+      UserError: an array has another shape than its field.
+    """
+    for name, value, shape in zip(parameters._fields, parameters, SHAPES, strict=True):
+        if value is not None and jnp.shape(value) != shape:
+            raise UserError(
+                f"the physics parameter {name} has the shape {jnp.shape(value)}; give an array of "
+                f"the shape {shape} for one environment, and batch environments with jax.vmap"
+            )
+
+
+def edited_fields(
+    mj_model: mujoco.MjModel, parameters: PhysicsParameters
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Arrays of a `MjModel`, and of its `opt`, that replace the model's own ones.
+
+    NumPy's numbers give NumPy's arrays, for MuJoCo's C engine; traced ones give JAX's, for MJX.
+
+    `body_invweight0`, which scales the contact's softness, follows the ball's mass; the last
+    link's share, a thousandth of the sum, stays that of the unedited model.
+    """
+    m, at, p = mj_model, find_addresses(mj_model), parameters
+    links, dofs, servos = (
+        m.jnt_bodyid[at.arm_joints,],
+        np.array(at.arm_qvel),
+        np.array(at.actuators),
+    )
+    ball, ball_geom, paddle = at.ball_body, at.ball_geom, at.paddle_geom
+    fields: dict[str, Array] = {}
+
+    def current(field: str) -> Array:
+        return fields.get(field, getattr(m, field))
+
+    def put(field: str, index, value) -> None:
+        fields[field] = _replaced(current(field), index, value)
+
+    if p.ball_mass is not None:
+        ratio = p.ball_mass / m.body_mass[ball]
+        put("body_mass", ball, p.ball_mass)
+        put("body_inertia", ball, current("body_inertia")[ball] * ratio)
+        put("body_invweight0", ball, current("body_invweight0")[ball] / ratio)
+    if p.ball_radius is not None:
+        ratio = (p.ball_radius / m.geom_size[ball_geom, 0]) ** 2
+        put("geom_size", (ball_geom, 0), p.ball_radius)
+        put("geom_rbound", ball_geom, p.ball_radius)
+        put("geom_aabb", (ball_geom, slice(3, 6)), p.ball_radius)
+        put("body_inertia", ball, current("body_inertia")[ball] * ratio)
+        put("body_invweight0", (ball, 1), current("body_invweight0")[ball, 1] / ratio)
+    if p.contact_stiffness is not None or p.contact_damping is not None:
+        stiffness, damping = direct_solref(m)
+        pair = _contact_pair(m)
+        put("pair_solref", (pair, 0), -_given(p.contact_stiffness, stiffness))
+        put("pair_solref", (pair, 1), -_given(p.contact_damping, damping))
+    if p.servo_gain is not None:
+        put("actuator_gainprm", (servos, 0), p.servo_gain)
+        put("actuator_biasprm", (servos, 1), -p.servo_gain)
+    if p.servo_damping is not None:
+        put("actuator_biasprm", (servos, 2), -p.servo_damping)
+    if p.armature is not None:
+        put("dof_armature", dofs, p.armature)
+    if p.damping is not None:
+        put("dof_damping", dofs, p.damping)
+    if p.link_mass is not None:
+        ratio = p.link_mass / m.body_mass[links]
+        put("body_mass", links, p.link_mass)
+        put("body_inertia", links, current("body_inertia")[links] * ratio[:, None])
+    if p.ball_mass is not None or p.link_mass is not None:
+        fields["body_subtreemass"] = _subtree_masses(m, current("body_mass"))
+    if p.paddle_position is not None:
+        put("geom_pos", paddle, p.paddle_position)
+    if p.paddle_rotation is not None:
+        put("geom_quat", paddle, p.paddle_rotation)
+    if p.paddle_position is not None or p.paddle_rotation is not None:
+        # MuJoCo skips the transformation of a geom that is known to share its body's frame.
+        put("geom_sameframe", paddle, int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE))
+    return fields, {} if p.gravity is None else {"gravity": p.gravity}
+
+
+def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:
+    """A copy of the model that has the given numbers of one environment.
+
+    Raises:
+      UserError: an array has another shape than its field.
+    """
+    check_shapes(parameters)
+    numbers = jax.tree.map(lambda x: np.asarray(x, np.float64), parameters)
+    fields, options = edited_fields(mj_model, numbers)
+    model = copy.copy(mj_model)
+    _assign(model, fields)
+    _assign(model.opt, options)
+    return model
+
+
+def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
+    """k and b of the contact pair's `solref` in MuJoCo's direct format, `solref="-k -b"`.
+
+    The standard format, a time constant and a damping ratio, has an equal in the direct one
+    (documentation, "Modeling", solver parameters).
+    """
+    first, second = (float(x) for x in mj_model.pair_solref[_contact_pair(mj_model)])
+    if first <= 0.0:
+        return -first, -second
+    # MuJoCo's limit: the time constant spans two steps at least.
+    time_constant = max(first, 2.0 * mj_model.opt.timestep)
+    return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
+
+
+def _contact_pair(mj_model: mujoco.MjModel) -> int:
+    """Index of the pair of the ball and the paddle."""
+    at = find_addresses(mj_model)
+    for pair in range(mj_model.npair):
+        geoms = {int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair])}
+        if geoms == {at.ball_geom, at.paddle_geom}:
+            return pair
+    raise UserError(
+        "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness and "
+        "contact_damping change; add <pair> to <contact>"
+    )
+
+
+def _given(value: Array | None, default: float) -> Array | float:
+    return default if value is None else value
+
+
+def _replaced(array: Array, index, value) -> Array:
+    """A copy of the array with new entries."""
+    if isinstance(array, jax.Array) or isinstance(value, jax.Array):
+        return jnp.asarray(array).at[index].set(value)
+    array = np.array(array)
+    array[index] = value
+    return array
+
+
+def _subtree_masses(mj_model: mujoco.MjModel, mass: Array) -> Array:
+    """Mass of each body with all that it carries; MuJoCo numbers parents before children."""
+    total = list(mass)
+    for body in range(mj_model.nbody - 1, 0, -1):
+        parent = mj_model.body_parentid[body]
+        total[parent] = total[parent] + total[body]
+    return (jnp if isinstance(mass, jax.Array) else np).stack(total)
+
+
+def _assign(target: object, fields: Mapping[str, Array]) -> None:
+    for name, value in fields.items():
+        getattr(target, name)[...] = value
