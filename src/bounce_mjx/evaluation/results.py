@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
 from bounce_mjx.evaluation.recording import Recording
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.state import State
 
 DEFAULT_EPISODES = 1024
 
@@ -37,9 +37,6 @@ UPWARD_SPEED_RANGE = (0.1, 1.5)
 
 
 UPWARD_SPEED_TARGETS = (0.4, 0.6)
-
-
-_BALL_X, _BALL_VZ = 6, 21
 
 
 class Statistics(NamedTuple):
@@ -128,6 +125,8 @@ def accumulate(
 ) -> Statistics:
     """Adds one control step of E environments (batch last) to their statistics.
 
+    It reads the true state and not the observation, which may be noisy.
+
     Args:
       states: after the step.
       step: its index [], from 0.
@@ -135,7 +134,8 @@ def accumulate(
     s, metrics = statistics, states.metrics
     running = s.running
     settled = running & (step >= round(SETTLING_SECONDS / env.dt))
-    x, vz = states.obs[_BALL_X], states.obs[_BALL_VZ]
+    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
+    x, vz = kinematics.ball_position[0], kinematics.ball_velocity[2]
     centred = jnp.abs(x - env.config.reward.target_x) <= MAX_X_ERROR
     bounced = settled & (metrics["bounced"] > 0)
     accurate = metrics["apex_error"] <= MAX_APEX_ERROR

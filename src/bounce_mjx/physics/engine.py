@@ -1,6 +1,8 @@
 """The interface of a physics engine, and the choice of one for a model."""
 
+import contextlib
 import functools
+import io
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -51,8 +53,10 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
 
 
 def _mjx(mj_model: mujoco.MjModel, reason: str) -> Engine:
-    # MJX takes a second to import, which the fused engine saves.
-    from bounce_mjx.physics import mjx_engine
+    # MJX takes a second to import, which the fused engine saves; and it prints a line for each of
+    # its optional parts that is not installed.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from bounce_mjx.physics import mjx_engine
 
     constants = mjx_engine.read_model(mj_model)
     return Engine(

@@ -30,13 +30,14 @@ from bounce_mjx.config.files import differing_keys, dump_config
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.learning.policy import OBSOLETE_ARRAYS, Policy, make_networks
 from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs import checkpoint as checkpoints
 from bounce_mjx.runs.checkpoint import stored_checkpoints
 from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.task.env import OBSERVATION_SIZE
+from bounce_mjx.task.observation import OBSERVATION
 
 CheckpointName = Literal["latest", "best"]
 CONFIG_FILE = "config.yaml"
@@ -214,13 +215,13 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     Raises:
       UserError: the checkpoint is damaged or of another network.
     """
-    networks = make_networks(config.ppo, OBSERVATION_SIZE, len(JOINT_NAMES))
+    networks = make_networks(config.ppo, OBSERVATION.size, len(JOINT_NAMES))
 
     def template() -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))
-        return Policy(init_normalizer(OBSERVATION_SIZE), params)
+        return Policy(init_normalizer(OBSERVATION.size), params)
 
-    return _restore(checkpoint, "policy", jax.eval_shape(template))[0]
+    return _restore(checkpoint, "policy", jax.eval_shape(template), OBSOLETE_ARRAYS)[0]
 
 
 def load_training_state(
@@ -389,11 +390,14 @@ def _read_record(checkpoint: Checkpoint) -> dict[str, Any]:
     return record
 
 
-def _restore(checkpoint: Checkpoint, item: str, template: Any) -> tuple[Any, dict[str, Any]]:
-    """An item in the structure of `template`, and the record."""
+def _restore(
+    checkpoint: Checkpoint, item: str, template: Any, dropped: frozenset[str] = frozenset()
+) -> tuple[Any, dict[str, Any]]:
+    """An item in the structure of `template`, without its arrays `dropped`, and the record."""
     record = _read_record(checkpoint)
     try:
         stored = checkpoints.open_item(checkpoint.folder, item)
+        stored = {name: array for name, array in stored.items() if name not in dropped}
     except Exception as error:
         raise _damaged(checkpoint, error) from error
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
