@@ -13,14 +13,8 @@ from rich.console import Console
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.results import (
-    Report,
-    Result,
-    Statistics,
-    accumulate,
-    empty_statistics,
-    judge,
-)
+from bounce_mjx.evaluation.results import Report, Result, judge
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
