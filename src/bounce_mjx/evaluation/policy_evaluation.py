@@ -60,5 +60,5 @@ def evaluate_policy(
         judge(env, statistics),
         engine="mujoco" if on_c else env.engine.name,
         # They tell of models on which MuJoCo's solver does not converge, unlike the fused physics.
-        warnings=getattr(env.engine, "warnings", ()) if on_c else (),
+        warnings=env.engine.warnings if on_c else (),
     )
