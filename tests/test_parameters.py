@@ -119,7 +119,9 @@ def c_steps(mj_model, parameters: PhysicsParameters, states: States) -> tuple[Ph
         state, touching = c_step(edited_model(mj_model, world(parameters, i)), one)
         after.append(state)
         contacts += int(touching[0])
-    return PhysicsState(*(np.concatenate(x) for x in zip(*(s[:2] for s in after)))), contacts
+    return PhysicsState(
+        *(np.concatenate(x) for x in zip(*(s[:2] for s in after), strict=True))
+    ), contacts
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
@@ -197,7 +199,7 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
         state = step(parameters, state, ctrl)
         for j, c in enumerate(reference):
             contacts += c.step(c_ctrl[j : j + 1], 1)
-        expected = [np.concatenate(x) for x in zip(*(c.state[:2] for c in reference))]
+        expected = [np.concatenate(x) for x in zip(*(c.state[:2] for c in reference), strict=True)]
         error = max(error, *difference(state, PhysicsState(*expected)))
     record_property("largest_difference", error)
     print(f"500 steps x {NUM_WORLDS} worlds: {contacts} contact steps, difference {error:.1e}")
@@ -323,7 +325,7 @@ def test_each_environment_of_a_batch_has_its_own_ball():
         assert np.all(contacts > 0)
         assert not np.any(state.done)
         expected = PhysicsState(
-            *(np.concatenate(x) for x in zip(*(c.state[:2] for c in reference)))
+            *(np.concatenate(x) for x in zip(*(c.state[:2] for c in reference), strict=True))
         )
         assert max(difference(state.pipeline_state.physics, expected)) < 1e-9
         np.testing.assert_array_equal(

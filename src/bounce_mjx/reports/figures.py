@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
-from bounce_mjx.evaluation.results import MAX_APEX_ERROR, SETTLING_SECONDS
+from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
 from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.rewards import TERM_NAMES
