@@ -20,6 +20,7 @@ from bounce_mjx.evaluation.c_episodes import (
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.learning import policy as policies
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
 from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import SHAPES, direct_solref
@@ -337,14 +338,16 @@ def test_each_environment_of_a_batch_has_its_own_ball():
 @pytest.fixture(scope="module")
 def networks():
     env = BounceBall()
-    return policies.make_networks(PPOConfig(), env.observation_size, env.action_size)
+    return policies.make_networks(
+        PPOConfig(hidden_layers=(16,)), env.observation_size, env.action_size
+    )
 
 
 @pytest.fixture(scope="module")
 def untrained(networks):
     """A policy before any training."""
     params = networks.policy_network.init(jax.random.PRNGKey(5))
-    return policies.Policy(policies.init_normalizer(BounceBall().observation_size), params)
+    return policies.Policy(init_normalizer(BounceBall().observation_size), params)
 
 
 def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):

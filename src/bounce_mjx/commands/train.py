@@ -17,9 +17,10 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import RESUMABLE_KEYS, find_run, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import find_run
 from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.runs.reading import RESUMABLE_KEYS
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.job import REPORT_MODULE, Outcome, TrainingStopped, train

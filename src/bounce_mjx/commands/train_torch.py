@@ -22,9 +22,10 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.ppo import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import CheckpointWriter, create_run
+from bounce_mjx.runs.folders import create_run
 from bounce_mjx.runs.presets import read_preset
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.console import Reporter
@@ -146,7 +147,7 @@ def train(command: TorchTrainCommand, console: Console) -> Outcome:
                     "library": command.library,
                     **progress.results(steps, clock.seconds, device),
                 }
-                writer.save(names, steps, policy, None, progress.to_dict(), results)
+                writer.save(names, steps, policy, None, progress.model_dump(), results)
                 reporter.saving_problem(writer.problem(wait=False))
                 clock.lap("save")
                 over |= report.passed and config.stop_when_solved

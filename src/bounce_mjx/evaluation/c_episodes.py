@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.training.agents.ppo.networks import PPONetworks
 from mujoco import rollout
 
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Policy, act
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.task.env import BounceBall
@@ -20,7 +19,7 @@ _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def make_mujoco_evaluator(
-    env: BounceBall, networks: PPONetworks, episodes: int
+    env: BounceBall, networks: Networks, episodes: int
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 

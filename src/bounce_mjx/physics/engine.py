@@ -1,6 +1,8 @@
 """The interface of a physics engine, and the choice of one for a model."""
 
+import contextlib
 import functools
+import io
 from collections.abc import Callable
 from types import ModuleType
 from typing import NamedTuple
@@ -47,10 +49,7 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     if beyond_mjx is not None:
         raise UserError(_refusal(beyond_fused, beyond_mjx, "mjx"))
     reason = "chosen by --physics mjx" if choice == "mjx" else _lacks("fused", beyond_fused)
-    # MJX takes a second to import, which the fused engine saves.
-    from bounce_mjx.physics import mjx_engine
-
-    return _engine("mjx", reason, mjx_engine, mj_model, ())
+    return _engine("mjx", reason, _mjx_engine(), mj_model, ())
 
 
 def _engine(
@@ -78,9 +77,15 @@ def _engine(
 
 
 def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
-    from bounce_mjx.physics import mjx_engine
+    return _mjx_engine().unsupported_feature(mj_model)
 
-    return mjx_engine.unsupported_feature(mj_model)
+
+def _mjx_engine() -> ModuleType:
+    # MJX takes seconds to import, which the fused engine saves, and prints a line for each of its
+    # optional parts that is not installed.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from bounce_mjx.physics import mjx_engine
+    return mjx_engine
 
 
 def _refusal(beyond_fused: str | None, beyond_mjx: str | None, choice: str) -> str:

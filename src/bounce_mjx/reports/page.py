@@ -25,14 +25,11 @@ from bounce_mjx.reports.figures import (
     image,
     rewards_figure,
 )
-from bounce_mjx.reports.tables import details_line, verdict
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    Checkpoint,
-    load_policy,
-    load_results,
-    load_run_config,
-)
+from bounce_mjx.reports.tables import details_line, figure_text, verdict
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.env import BounceBall
 
 REPORT_FILE = "report.html"
@@ -92,7 +89,11 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [f"{e['steps']:,}", *[f"{e[name]:.2f}" for name in names], "pass" if e["passed"] else "-"]
+        [
+            f"{e['steps']:,}",
+            *[figure_text(e[name]) for name in names],
+            "pass" if e["passed"] else "-",
+        ]
         for e in results["evaluations"]
     ]
     return f"""<!DOCTYPE html>
@@ -123,7 +124,7 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 
 def _results(report: Report) -> str:
     rows = [
-        [result.name, result.measured, f"{result.value:.2f}", result.bound, verdict(result)]
+        [result.name, result.measured, figure_text(result.value), result.bound, verdict(result)]
         for result in report.results
     ]
     return _table(["result", "measured", "value", "bound", ""], rows)

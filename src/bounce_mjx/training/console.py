@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.reports.tables import results_markdown
+from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
 
 if typing.TYPE_CHECKING:
@@ -123,14 +123,18 @@ class Reporter:
             if not sound:
                 continue
             for result in report.results:
-                log.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
+                if result.value is not None:
+                    log.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
             for name, value in report.details.items():
-                log.add_scalar(f"results/{name}", value, steps)
+                if value is not None:
+                    log.add_scalar(f"results/{name}", value, steps)
             log.add_text("results", results_markdown(report), steps)
         if len(reports) == 1:
             (report,) = reports
             met = sum(result.passed is not False for result in report.results)
-            figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
+            figures = ", ".join(
+                f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
+            )
             line = f"{met} of {len(report.results)} results met ({figures})"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))

@@ -19,20 +19,19 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
+from bounce_mjx.runs.folders import (
     Checkpoint,
-    CheckpointWriter,
     best_checkpoint,
     create_run,
     find_run,
     has_checkpoint,
     latest_checkpoint,
-    load_progress,
-    load_training_state,
     save_config,
     seed_folders,
 )
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.reading import load_training_state, read_record
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter
@@ -385,7 +384,7 @@ class _Job:
             member.progress.results(self.steps, self.clock.seconds, self.device)
             for member in self.members
         ]
-        plain = [member.progress.to_dict() for member in self.members]
+        plain = [member.progress.model_dump() for member in self.members]
         if self.config.num_seeds == 1:
             names = ("latest", "best") if best else ("latest",)
             self.writers[0].save(names, self.steps, policy_of(state), state, plain[0], results[0])
@@ -429,7 +428,7 @@ def _write_config(run: Path, config: TrainConfig) -> None:
 
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> Progress:
     """The evaluations from which a seed goes on."""
-    progress = Progress.from_dict(plain, latest)
+    progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
         return progress
     # The best checkpoint itself knows best what it holds: it may be older than the latest one
@@ -437,7 +436,7 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = best_checkpoint(run)
-        stored = Progress.from_dict(load_progress(best), best)
+        stored = Progress.from_dict(read_record(best).progress, best.folder)
         progress.best, progress.best_steps = stored.best, stored.best_steps
     return progress
 

@@ -2,6 +2,9 @@
 
 import time
 
+SPEED_RANGE = (0.1, 2.0)
+"""Slowest and fastest speed of a viewer, as factors of real time."""
+
 # A program that falls behind by more than this slows down instead of catching up, s.
 _MAX_LAG = 0.1
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,10 +15,12 @@ from bounce_mjx.viewers.simulation import Frame, Simulation, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
+# A page that is stopped in a debugger, or a stalled network, keeps viser's `stop` waiting for 6 s.
+_STOP_SECONDS = 1.0
 
 
 def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | None) -> None:
-    """Writes a recording of the simulation, with all its environments, as a page.
+    """Writes a recording of all environments of the simulation as a page.
 
     Raises:
       UserError: the file cannot be written.
@@ -45,11 +48,16 @@ def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | 
 
 @contextlib.contextmanager
 def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
-    """A viser server, without the lines that it prints; port 0 is any free one."""
+    """A viser server that prints nothing; port 0 takes any free one.
+
+    Its end takes a second at most: clients that do not answer are left to a background thread.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
         yield server
     finally:
+        stopping = threading.Thread(target=server.stop, daemon=True)
         with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+            stopping.start()
+            stopping.join(_STOP_SECONDS)

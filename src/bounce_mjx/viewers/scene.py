@@ -1,6 +1,7 @@
 """The three-dimensional scene of the web page and of the replay page, made with viser."""
 
 import collections
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -141,14 +142,16 @@ class Scene:
         return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
     def _look(self) -> None:
-        """Turns the camera of every page to the environments."""
+        """Turns the camera of every page towards the environments."""
         extent = 1.0 + 1.25 * np.linalg.norm(np.ptp(self._offsets, axis=0))
         position = _LOOK_AT + extent * _VIEW
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(position), tuple(_LOOK_AT)
         camera.up, camera.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, _LOOK_AT
+            # A page whose own camera is invalid keeps it.
+            with contextlib.suppress(ValueError, TypeError, AssertionError):
+                client.camera.position, client.camera.look_at = position, _LOOK_AT
 
 
 def _grid(number: int) -> np.ndarray:

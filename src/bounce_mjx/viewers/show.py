@@ -1,5 +1,6 @@
 """The part of the command lines that `view` and `play` share."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,10 +9,12 @@ from rich.console import Console
 
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
+from bounce_mjx.viewers.pace import SPEED_RANGE
 from bounce_mjx.viewers.scene import MAX_ENVS
 from bounce_mjx.viewers.simulation import Simulation
 
@@ -32,7 +35,7 @@ class ViewerOptions(StrictModel):
     """Simulated time, s; left out: 10 of a recording, and a viewer until it is closed."""
     num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
     """Robots side by side, on the page and in the replay."""
-    speed: Annotated[float, Field(ge=0.1, le=2.0)] = 1.0
+    speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
     """Speed of a viewer, as a factor of real time."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None
     """Pictures a second of a recording; left out: 60 of a video, 25 of a GIF, 30 of a page."""
@@ -58,10 +61,11 @@ def show(
     target_height: float | None,
     console: Console,
 ) -> None:
-    """Shows or records an environment under a controller.
+    """Shows or records an environment under a controller; Ctrl-C closes a viewer.
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here.
+      KeyboardInterrupt: Ctrl-C came during the compilation or the recording.
     """
     recorded = options.video is not None or options.html is not None
     if recorded and options.viewer != "auto":
@@ -93,7 +97,7 @@ def show(
     if not recorded and viewer == "browser" and env.engine.name == "fused":
         num_envs = MAX_ENVS
     with console.status("compiling"):
-        simulation = Simulation(env, controller, num_envs, options.seed)
+        simulation = run_interruptible(Simulation, env, controller, num_envs, options.seed)
         simulation.target_height = target_height
 
     if recorded:
@@ -105,17 +109,20 @@ def show(
                 write_page(options.html, simulation, recording, options.fps)
         for path in (options.video, options.html):
             if path is not None:
-                console.print(f"written: {path}", highlight=False, soft_wrap=True)
-    elif viewer == "native":
-        run_native(simulation, speed=options.speed, seconds=options.seconds)
-    else:
-        run_browser(
-            simulation,
-            shown=options.num_envs,
-            speed=options.speed,
-            seconds=options.seconds,
-            host=options.host,
-            port=port,
-            title=title,
-            console=console,
-        )
+                # A path in brackets would be taken for markup.
+                console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
+        return
+    with contextlib.suppress(KeyboardInterrupt):
+        if viewer == "native":
+            run_native(simulation, speed=options.speed, seconds=options.seconds)
+        else:
+            run_browser(
+                simulation,
+                num_shown=options.num_envs,
+                speed=options.speed,
+                seconds=options.seconds,
+                host=options.host,
+                port=port,
+                title=title,
+                console=console,
+            )
