@@ -26,8 +26,7 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.reward_config import RewardConfig
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
 CHECKOUT = Path(__file__).resolve().parent.parent

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.physics import PhysicsState, fused, kernel
+from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
+from bounce_mjx.physics.fused import dynamics, kernel
 
 # No multiple of a block.
 BATCH = 70
 NUM_SUBSTEPS = 10
+MODEL = PhysicsParameters()
 # In the interpreter both are compiled from the same operations.
 ROUNDING = 1e-6
 
@@ -27,7 +29,7 @@ Step = Callable[[PhysicsState, jax.Array], PhysicsState]
 @pytest.fixture
 def in_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     """The fused physics of the test runs in the kernel."""
-    monkeypatch.setattr(fused, "elementwise", partial(kernel.elementwise, interpret=True))
+    monkeypatch.setattr(dynamics, "elementwise", partial(kernel.elementwise, interpret=True))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,9 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     keys = jax.random.split(jax.random.PRNGKey(0), batch)
     physics = jax.vmap(env.reset, out_axes=-1)(keys).pipeline_state.physics
     at = env._addresses
-    paddle = jax.vmap(env.engine.paddle_position, in_axes=-1, out_axes=-1)(physics.qpos)
+    paddle = jax.vmap(partial(env.engine.paddle_position, MODEL), in_axes=-1, out_axes=-1)(
+        physics.qpos
+    )
     height = jnp.where(jnp.arange(batch) % 2 == 0, paddle[2] + 0.02, physics.qpos[at.ball_qpos[2]])
     qpos = physics.qpos.at[jnp.array(at.ball_qpos[:2])].set(paddle[:2])
     qpos = qpos.at[at.ball_qpos[2]].set(height)
@@ -49,7 +53,7 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
 
 
 def step(env: BounceBall, physics: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-    return fused.step(fused.read_model(env.mj_model), physics, ctrl, NUM_SUBSTEPS)
+    return fused.step(fused.read_model(env.mj_model), MODEL, physics, ctrl, NUM_SUBSTEPS)
 
 
 def batched(env: BounceBall) -> Step:
@@ -77,16 +81,16 @@ def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
 def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     """Tracing it takes some tenths of a second, and a training has several programs."""
     traced = []
-    substep = fused.substep
-    monkeypatch.setattr(fused, "substep", lambda *args: traced.append(1) or substep(*args))
-    fused._substeps.cache_clear()
+    substep = dynamics.substep
+    monkeypatch.setattr(dynamics, "substep", lambda *args: traced.append(1) or substep(*args))
+    dynamics._substeps.cache_clear()
     jax.make_jaxpr(batched(env))(*moving(env, 3))
     assert traced
     traced.clear()
     jax.make_jaxpr(batched(env))(*moving(env, 4))
     assert not traced
     # What was traced here calls the list above.
-    fused._substeps.cache_clear()
+    dynamics._substeps.cache_clear()
 
 
 def test_several_batches_and_shared_targets(env, in_kernel):
@@ -109,10 +113,10 @@ import functools, re
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx import BounceBall
-from bounce_mjx.physics import fused, kernel
+from bounce_mjx.physics.fused import dynamics, kernel
 from test_kernel import assert_equal, batched, moving
 
-fused.elementwise = functools.partial(kernel.elementwise, interpret=True)
+dynamics.elementwise = functools.partial(kernel.elementwise, interpret=True)
 env = BounceBall()
 args = moving(env, 16 * 8)
 alone = jax.jit(batched(env))(*args)

@@ -174,18 +174,25 @@ def test_there_is_a_panel_for_every_reward_term(runs: list[Path]) -> None:
 def test_an_evaluation_is_drawn_from_its_recording() -> None:
     """4 s at 100 Hz of two made-up episodes, the second of which ends after 3 s."""
     env = BounceBall(EnvConfig(episode_seconds=4.0))
-    observation = np.zeros((400, 29, 2), np.float32)
-    observation[:, 8] = np.linspace(0.1, 0.7, 400)[:, None]
-    observation[:, 28] = 0.5
+    ball = np.zeros((400, 3, 2), np.float32)
+    ball[:, 2] = np.linspace(0.1, 0.7, 400)[:, None]
     bounced, running = np.zeros((400, 2), bool), np.ones((400, 2), bool)
     bounced[[100, 250, 350]] = True
     running[300:, 1] = False
-    recording = Recording(observation, bounced, np.full((400, 2), 0.53, np.float32), running)
+    recording = Recording(
+        joint_angles=np.zeros((400, 6, 2), np.float32),
+        ball=ball,
+        paddle=np.zeros((400, 3, 2), np.float32),
+        target_height=np.full((400, 2), 0.5, np.float32),
+        bounced=bounced,
+        apex=np.full((400, 2), 0.53, np.float32),
+        running=running,
+    )
     heights, errors, hits = evaluation_figure(env, recording).axes
 
-    ball = next(line for line in heights.lines if line.get_label() == "ball")
-    np.testing.assert_allclose(ball.get_xdata(), 0.01 * np.arange(1, 401))
-    np.testing.assert_allclose(ball.get_ydata(), observation[:, 8, 0])
+    line = next(line for line in heights.lines if line.get_label() == "ball")
+    np.testing.assert_allclose(line.get_xdata(), 0.01 * np.arange(1, 401))
+    np.testing.assert_allclose(line.get_ydata(), ball[:, 2, 0])
     # Three bounces after 2 s and before an end, all with the apex 3 cm too high.
     counts = [bar for bar in errors.patches if bar.get_height()]
     (bar,) = counts

@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
-from bounce_mjx.evaluation.results import MAX_APEX_ERROR, SETTLING_SECONDS
+from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
 from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.rewards import TERM_NAMES
@@ -65,19 +65,25 @@ def curves_figure(groups: Sequence[Group]) -> Figure:
 
 
 def rewards_figure(groups: Sequence[Group]) -> Figure:
-    """The fifteen weighted reward terms over the training."""
+    """The weighted reward terms over the training."""
+    columns = 5
+    rows = -(-len(TERM_NAMES) // columns)
+    height = 1.8 * rows
     with _style():
-        figure = Figure(figsize=(10.0, 5.4))
+        figure = Figure(figsize=(10.0, height))
+        # The margins, in inches, do not depend on the number of rows.
+        margins = dict(top=1.0 - 0.7 / height, bottom=0.6 / height)
         grid = figure.subplots(
-            3,
-            5,
-            gridspec_kw=dict(
-                left=0.06, right=0.985, top=0.87, bottom=0.11, wspace=0.42, hspace=0.55
-            ),
+            rows,
+            columns,
+            squeeze=False,
+            gridspec_kw=dict(left=0.06, right=0.985, wspace=0.42, hspace=0.55, **margins),
         )
-        for axes, name in zip(grid.flat, TERM_NAMES, strict=True):
+        for axes, name in zip(grid.flat, TERM_NAMES, strict=False):
             _draw_curve(axes, groups, f"reward/{name}", name.replace("_", " "), 1.0)
             axes.set_xlabel("")
+        for axes in grid.flat[len(TERM_NAMES) :]:
+            axes.remove()
         figure.suptitle(
             "weighted reward terms over environment steps, mean of a control step", fontsize=10
         )
@@ -184,7 +190,7 @@ def _draw_heights(axes: Axes, env: BounceBall, recording: Recording) -> None:
     """The first episode, up to its end."""
     steps = int(np.asarray(recording.running[:, 0]).sum())
     time = env.dt * (1 + np.arange(steps))
-    target = float(recording.target_height[0])
+    target = float(recording.target_height[0, 0])
     axes.axhspan(
         target - MAX_APEX_ERROR, target + MAX_APEX_ERROR, color="#009E73", alpha=0.12, lw=0
     )

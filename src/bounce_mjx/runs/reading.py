@@ -16,13 +16,14 @@ import tensorstore
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, read_json
 from bounce_mjx.runs.folders import Checkpoint
-from bounce_mjx.task.env import OBSERVATION_SIZE
+from bounce_mjx.task.observation import OBSERVATION
 
 RECORD_FILE = "run.json"
 
@@ -44,11 +45,11 @@ class Record(pydantic.BaseModel):
 
 def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
-    networks = make_networks(config.ppo, OBSERVATION_SIZE, len(JOINT_NAMES))
+    networks = make_networks(config.ppo, OBSERVATION.size, len(JOINT_NAMES))
 
     def initial_policy() -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))
-        return Policy(init_normalizer(OBSERVATION_SIZE), params)
+        return Policy(init_normalizer(OBSERVATION.size), params)
 
     read_record(checkpoint)
     # A policy acts in single and in double precision, whichever it was trained in.
