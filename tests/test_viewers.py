@@ -544,7 +544,7 @@ MISTAKES = {
     "small size": ("--video a.mp4 --size 2 2", "--size is 2", "64"),
     "rate of a gif": ("--video a.gif --fps 60", "--fps 60", "GIF", "25 or 50"),
     "too many robots": ("--num-envs 17", "--num-envs is 17", "16"),
-    "two ways": ("--viewer browser --video a.mp4", "--viewer browser", "leave one out"),
+    "two ways": ("--viewer browser --video a.mp4", "--viewer browser", "give only one"),
     "no screen": ("--viewer native", "--viewer native", "display", "--viewer browser"),
     "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
