@@ -80,7 +80,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the adapter."""
-    from bounce_mjx.commands.train_torch import make_learner
+    from bounce_mjx.adapters.torch.trainer import make_learner
 
     learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)

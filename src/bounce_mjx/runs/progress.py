@@ -30,6 +30,8 @@ class Evaluation(_Figures):
 
     steps: _Steps
     passed: bool
+    screening: bool = False
+    """Whether the policy failed in the few episodes of the screening, and had no others."""
 
 
 class _Details(_Figures):
@@ -51,6 +53,7 @@ class _Result(pydantic.BaseModel):
 class _StoredReport(pydantic.BaseModel):
     results: Annotated[list[_Result], Field(min_length=1)]
     details: _Details
+    screening: bool = False
 
 
 class _Results(_StoredReport):
@@ -62,6 +65,8 @@ class _Results(_StoredReport):
     trained_steps: _Steps = 0
     seconds: dict[str, _Finite] = {}
     evaluations: list[Evaluation] = []
+    fresh_resets: bool = False
+    """Whether the five results are of resets that did not select the best checkpoint."""
 
     @pydantic.model_validator(mode="after")
     def _check_names(self) -> "_Results":
@@ -97,6 +102,8 @@ class Progress(pydantic.BaseModel):
     best_steps: _Steps = 0
     solved_steps: _Steps | None = None
     evaluations: list[Evaluation] = []
+    fault: str | None = None
+    """The first quantity that was not finite, and when, once the training diverged."""
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any], checkpoint: Path) -> "Progress":
@@ -120,7 +127,7 @@ class Progress(pydantic.BaseModel):
         if self.best is None:
             return None
         run = {"trained_steps": trained_steps, "seconds": seconds, "device": device}
-        return self.best.to_dict() | self.model_dump(exclude={"best"}) | run
+        return self.best.to_dict() | self.model_dump(exclude={"best", "fault"}) | run
 
     def has(self, steps: int) -> bool:
         """Whether the state after so many steps was evaluated."""
@@ -129,8 +136,9 @@ class Progress(pydantic.BaseModel):
     def improves(self, report: Report, steps: int) -> bool:
         """Adds an evaluation; whether it is the best so far."""
         values = {result.name: result.value for result in report.results}
+        kind = {"screening": report.screening}
         # Not validated: a figure that is not finite is stored as null.
-        new = Evaluation.model_construct(steps=steps, passed=report.passed, **values)
+        new = Evaluation.model_construct(steps=steps, passed=report.passed, **kind, **values)
         self.evaluations.append(new)
         if report.passed and self.solved_steps is None:
             self.solved_steps = steps
