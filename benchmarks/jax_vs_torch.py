@@ -38,7 +38,8 @@ from trainers import TRAINERS, Method
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.results import Statistics, judge
+from bounce_mjx.evaluation.results import judge
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer

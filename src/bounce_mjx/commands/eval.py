@@ -12,7 +12,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
@@ -60,7 +60,7 @@ def main(args: Sequence[str] | None = None) -> None:
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
-        report, engine = run_interruptible(
+        report, engine, warnings = run_interruptible(
             evaluate_policy,
             policy,
             config.env,
@@ -74,6 +74,8 @@ def main(args: Sequence[str] | None = None) -> None:
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
             highlight=False,
         )
+        for warning in warnings:
+            console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
         console.print(results_table(report, "the five results"))
         console.print(details_line(report), highlight=False)
         if command.json_file is not None:

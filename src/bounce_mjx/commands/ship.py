@@ -16,7 +16,7 @@ from rich.markup import escape
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_SEED
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
@@ -66,7 +66,9 @@ def ship(run: Path, out: Path, console: Console) -> None:
             "part of the package; give a run of the package's own arm"
         )
     policy = load_policy(checkpoint, trained_with)
-    report, physics = run_interruptible(evaluate_policy, policy, trained_with.env, trained_with.ppo)
+    report, physics, _ = run_interruptible(
+        evaluate_policy, policy, trained_with.env, trained_with.ppo
+    )
     console.print(results_table(report, escape(f"{checkpoint.folder}, {physics}")))
     console.print(details_line(report), highlight=False)
     if not report.passed:

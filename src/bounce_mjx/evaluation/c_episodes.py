@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model
 from bounce_mjx.robot.model import load_model

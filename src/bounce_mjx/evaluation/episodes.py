@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
 

@@ -1,93 +1,54 @@
-"""The five expected results: how they are measured, judged and shown."""
+"""The five expected results: their bounds, and the report that judges an evaluation by them."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from bounce_mjx.evaluation.recording import Recording
+from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, MAX_X_ERROR, Statistics
 from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.state import State
 
 DEFAULT_EPISODES = 1024
-
-
 DEFAULT_SEED = 20_000
-
-
-SETTLING_SECONDS = 2.0
-
+"""Seed of the resets; trainings evaluate with another one."""
 
 MIN_CONSECUTIVE_BOUNCES = 3
-
-
-MAX_X_ERROR = 0.05
-
-
-MAX_APEX_ERROR = 0.1
-
-
 MIN_EPISODE_SHARE = 0.99
-
+"""Least share of the episodes with enough consecutive bounces, and of the stable episodes."""
 
 MIN_STEP_SHARE = 0.95
-
+"""Least share of the centred steps, and of the accurate bounces."""
 
 UPWARD_SPEED_RANGE = (0.1, 1.5)
-
+"""Bounds of the mean upward speed, m/s."""
 
 UPWARD_SPEED_TARGETS = (0.4, 0.6)
-
-
-class Statistics(NamedTuple):
-    """Sums over the steps of E episodes, each up to its end."""
-
-    running: jax.Array
-    """Whether the episode has not ended [E], bool."""
-    steps: jax.Array
-    """Steps of the episode [E]."""
-    episode_return: jax.Array
-    """[E]."""
-    max_bounces: jax.Array
-    """Largest bounce count of the episode [E]."""
-    settled_steps: jax.Array
-    """Steps after the settling time [E]."""
-    centred_steps: jax.Array
-    """Those of them with the ball's x near the target point [E]."""
-    settled_bounces: jax.Array
-    """Bounces after the settling time [E]."""
-    accurate_bounces: jax.Array
-    """Those of them whose apex was near the target height [E]."""
-    apex_error: jax.Array
-    """Sum of |apex - target height| over the settled bounces [E], m."""
-    rising_steps: jax.Array
-    """Steps on which the ball rose [E]."""
-    rising_speed: jax.Array
-    """Sum of the vertical velocity over them [E], m/s."""
+"""Target heights at which the upward speed is judged, m."""
 
 
 class Result(NamedTuple):
-    """One expected result."""
+    """One expected result, as measured."""
 
     name: str
     measured: str
-    """What was measured, with its unit."""
+    """Description of the measured quantity, with its unit."""
     value: float | None
     """None where there was nothing to measure, such as the height without a bounce."""
     bound: str
+    """The bound in words."""
     passed: bool | None
-    """None where the bound does not apply."""
+    """Whether the value meets the bound; None where the bound does not apply."""
 
 
 class Report(NamedTuple):
-    """An evaluation."""
+    """An evaluation of a policy over many episodes."""
 
     results: tuple[Result, ...]
     details: dict[str, float | None]
     """Further figures: episodes, mean_consecutive_bounces, mean_apex_error_m, mean_return and
     mean_length_s; None where there was nothing to measure."""
     recording: Recording | None = None
-    """Some of the episodes, where they were recorded."""
+    """The first episodes, if they were recorded; not part of `to_dict`."""
     screening: bool = False
     """Whether these are the few episodes of a screening, which did not pass."""
 
@@ -104,13 +65,13 @@ class Report(NamedTuple):
         return not self.screening, met, self.details["mean_return"]
 
     @classmethod
-    def from_dict(cls, plain: dict) -> "Report":
-        """The report of `to_dict`."""
+    def from_dict(cls, plain: dict[str, Any]) -> "Report":
+        """The inverse of `to_dict`."""
         results = tuple(Result(**result) for result in plain["results"])
         return cls(results, plain["details"], screening=bool(plain.get("screening", False)))
 
-    def to_dict(self) -> dict:
-        """The report as plain data, for JSON."""
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain data for JSON, with null for a missing figure."""
         return {
             "passed": self.passed,
             "screening": self.screening,
@@ -119,49 +80,8 @@ class Report(NamedTuple):
         }
 
 
-def empty_statistics(episodes: int) -> Statistics:
-    """Statistics before the first step."""
-    zeros = jnp.zeros(episodes)
-    return Statistics(jnp.ones(episodes, bool), *[zeros] * (len(Statistics._fields) - 1))
-
-
-def accumulate(
-    env: BounceBall, statistics: Statistics, states: State, step: jax.Array
-) -> Statistics:
-    """Adds one control step of E environments (batch last) to their statistics.
-
-    It reads the true state and not the observation, which may be noisy.
-
-    Args:
-      states: after the step.
-      step: its index [], from 0.
-    """
-    s, metrics = statistics, states.metrics
-    running = s.running
-    settled = running & (step >= round(SETTLING_SECONDS / env.dt))
-    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
-    x, vz = kinematics.ball_position[0], kinematics.ball_velocity[2]
-    centred = jnp.abs(x - env.config.reward.target_x) <= MAX_X_ERROR
-    bounced = settled & (metrics["bounced"] > 0)
-    accurate = metrics["apex_error"] <= MAX_APEX_ERROR
-    rising = running & (vz > 0.0)
-    return Statistics(
-        running=running & (states.done == 0),
-        steps=s.steps + running,
-        episode_return=s.episode_return + jnp.where(running, states.reward, 0.0),
-        max_bounces=jnp.maximum(s.max_bounces, jnp.where(running, metrics["n_bounces"], 0.0)),
-        settled_steps=s.settled_steps + settled,
-        centred_steps=s.centred_steps + (settled & centred),
-        settled_bounces=s.settled_bounces + bounced,
-        accurate_bounces=s.accurate_bounces + (bounced & accurate),
-        apex_error=s.apex_error + jnp.where(bounced, metrics["apex_error"], 0.0),
-        rising_steps=s.rising_steps + rising,
-        rising_speed=s.rising_speed + jnp.where(rising, vz, 0.0),
-    )
-
-
 def judge(env: BounceBall, statistics: Statistics) -> Report:
-    """The five expected results of SPEC.md from the statistics of the episodes."""
+    """The report of an evaluation: the five expected results, from the statistics of E episodes."""
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     episodes = len(s.running)
     enough_bounces = float((s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).mean())

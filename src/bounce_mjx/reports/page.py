@@ -1,6 +1,6 @@
-"""The report of a run, one self-contained page: `python -m bounce_mjx.report [RUN]`.
+"""The report of a run: one self-contained HTML page.
 
-The main job writes it too, once it has printed its results.
+A training writes it after its results; `bounce-mjx report [RUN]` writes it again.
 """
 
 import base64
@@ -36,7 +36,7 @@ REPORT_FILE = "report.html"
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
-    """Runs the policy of a checkpoint for some episodes, on the physics engine of its config."""
+    """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     env = BounceBall(config.env)
@@ -52,7 +52,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
       recording: episodes of the run's best checkpoint.
 
     Returns:
-      The page, and its picture of the evaluation.
+      The page's path, and its figure of the evaluation.
 
     Raises:
       UserError: the run has no results or no log yet, or the page cannot be written.
@@ -131,7 +131,7 @@ def _results(report: Report) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; a cell is coloured where it is a verdict."""
+    """A table in HTML, with coloured verdicts."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
         inner = "".join(f'<{tag} class="{_class(c)}">{html.escape(c)}</{tag}>' for c in cells)

@@ -7,9 +7,9 @@ from rich.table import Table
 from bounce_mjx.evaluation.results import Report, Result
 
 
-def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0) -> str:
+def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit: str = "") -> str:
     """A measured figure, times `scale`, as text; "none" where there was nothing to measure."""
-    return "none" if value is None else format(scale * value, spec)
+    return "none" if value is None else f"{scale * value:{spec}}{unit}"
 
 
 def results_table(report: Report, title: str) -> Table:
@@ -98,10 +98,10 @@ def verdict(result: Result) -> str:
 def details_line(report: Report) -> str:
     """The further figures of an evaluation, in one line."""
     details = report.details
-    apex_error = figure_text(details["mean_apex_error_m"], ".1f", 100.0)
+    apex_error = figure_text(details["mean_apex_error_m"], ".1f", 100.0, " cm")
     return (
         f"{details['episodes']:.0f} episodes: "
         f"{details['mean_consecutive_bounces']:.1f} consecutive bounces, "
-        f"|apex error| {apex_error} cm, return {details['mean_return']:.0f}, "
+        f"|apex error| {apex_error}, return {details['mean_return']:.0f}, "
         f"length {details['mean_length_s']:.2f} s (means)"
     )

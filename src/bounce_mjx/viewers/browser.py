@@ -110,7 +110,7 @@ class _Page:
         self._server.flush()
 
     def _obey_controls(self) -> bool:
-        """Does what the controls ask for; whether they asked for anything."""
+        """Applies the controls' settings and requests; whether there was any change."""
         before, now = self._settings, self._controls.read()
         self._settings = now
         if now.target_height != before.target_height:

@@ -26,15 +26,15 @@ _DIRECTIONS = {
 
 
 class Settings(NamedTuple):
-    """What the controls are set to, within what the simulation can do."""
+    """The settings of the controls, within the bounds of the simulation."""
 
     paused: bool
     speed: float
     """As a factor of real time."""
     num_shown: int
-    """Environments in the picture."""
+    """Number of environments in the scene."""
     target_height: float | None
-    """One target height for all environments, m; None for the drawn ones."""
+    """Target height of all environments, m; None for the height drawn at each reset."""
 
 
 class Controls:

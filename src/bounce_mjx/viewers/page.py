@@ -1,4 +1,4 @@
-"""An episode as one HTML file that replays offline in any browser."""
+"""The replay page: episodes in one HTML file, for any browser, offline."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from bounce_mjx.viewers.simulation import Frame, Simulation, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
-# A page that is stopped in a debugger, or a stalled network, keeps viser's `stop` waiting for 6 s.
+# viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
 _STOP_SECONDS = 1.0
 
 
@@ -48,9 +48,9 @@ def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | 
 
 @contextlib.contextmanager
 def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
-    """A viser server that prints nothing; port 0 takes any free one.
+    """A viser server that prints nothing; port 0 takes any free port.
 
-    Its end takes a second at most: clients that do not answer are left to a background thread.
+    Closing it takes a second at most: a background thread waits for clients that do not answer.
     """
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
