@@ -167,12 +167,10 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
         nested = traverse_util.unflatten_dict(arrays, sep=".")
         path = os.path.abspath(folder / name)
         checkpointer.save(path, args=ocp.args.PyTreeSave(nested))
-        # orbax moves its files out of this folder, but does not find it in a path with brackets.
-        own = Path(path, f"ocdbt.process_{jax.process_index()}")
-        if own.exists():
-            for file in own.iterdir():
+        # orbax looks for its own files by a pattern, and finds none in a path with brackets.
+        if not Path(path, "manifest.ocdbt").exists():
+            for file in Path(path, f"ocdbt.process_{jax.process_index()}").iterdir():
                 file.rename(Path(path, file.name))
-            own.rmdir()
 
 
 def _remove_leftovers(folder: Path) -> None:
