@@ -1,4 +1,4 @@
-"""The simulated robot: the MJCF file, the names it must have, and where their data lie."""
+"""The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
 import os
