@@ -5,7 +5,8 @@
 A trial's value is the share of results met, over all evaluations and seeds: it rewards learning
 early as well as staying good. The storage file holds the study. The same command continues an
 interrupted search and repeats an interrupted trial, so run only one process at a time. Needs optuna
-(the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of `bounce-mjx eval`.
+(the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of
+`bounce-mjx eval`.
 """
 
 import sys

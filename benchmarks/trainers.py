@@ -4,7 +4,8 @@ Each trains on the config's environment until `on_block` returns True. `on_block
 number of environment steps so far, the block's time in seconds, and the policy.
 
 For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of
-`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the fused and on the mjx physics:
+`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the fused
+and on the mjx physics:
 
 | PPOConfig                         | brax                                             |
 |-----------------------------------|--------------------------------------------------|
