@@ -26,7 +26,9 @@ from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.reports.tables import figure_text
-from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 # Share of the environments that must keep the ball up throughout.
 MIN_SHARE = 0.99

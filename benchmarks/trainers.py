@@ -4,8 +4,8 @@ Each trains on the config's environment until `on_block` returns True. `on_block
 number of environment steps so far, the block's time in seconds, and the policy.
 
 For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of
-`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the fused
-and on the mjx physics:
+`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the
+fused and on the mjx physics:
 
 | PPOConfig                         | brax                                             |
 |-----------------------------------|--------------------------------------------------|
@@ -81,7 +81,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the adapter."""
-    from bounce_mjx.commands.train_torch import make_learner
+    from bounce_mjx.adapters.torch.trainer import make_learner
 
     learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)

@@ -15,6 +15,7 @@ import pytest
 from bounce_mjx import BounceBall
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics, kernel
+from test_parameters import random_parameters
 
 # No multiple of a block.
 BATCH = 70
@@ -52,12 +53,26 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     return PhysicsState(qpos, qvel), qpos[jnp.array(at.arm_qpos)] + 0.05
 
 
-def step(env: BounceBall, physics: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-    return fused.step(fused.read_model(env.mj_model), MODEL, physics, ctrl, NUM_SUBSTEPS)
+def step(
+    env: BounceBall, physics: PhysicsState, ctrl: jax.Array, parameters: PhysicsParameters = MODEL
+) -> PhysicsState:
+    return fused.step(fused.read_model(env.mj_model), parameters, physics, ctrl, NUM_SUBSTEPS)
 
 
 def batched(env: BounceBall) -> Step:
     return jax.vmap(partial(step, env), in_axes=-1, out_axes=-1)
+
+
+def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
+    """Every number of the world given, the batch last, but for a gravity that all share."""
+    drawn = random_parameters(env.mj_model, batch, seed=0)
+    drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
+    return drawn._replace(gravity=jnp.array([0.5, -0.5, -9.0]))
+
+
+def in_worlds(env: BounceBall) -> Callable[..., PhysicsState]:
+    axes = PhysicsParameters(*(-1 for _ in MODEL))._replace(gravity=None)
+    return jax.vmap(partial(step, env), in_axes=(-1, -1, axes), out_axes=-1)
 
 
 def assert_equal(ours: PhysicsState, theirs: PhysicsState) -> None:
@@ -91,6 +106,18 @@ def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     assert not traced
     # What was traced here calls the list above.
     dynamics._substeps.cache_clear()
+
+
+def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
+    """More inputs than the coordinates and targets: all the world's numbers, of each
+    environment."""
+    args = (*moving(env, BATCH), random_worlds(env, BATCH))
+    program = jax.jit(in_worlds(env)).trace(*args)
+    assert "pallas_call" in str(program.jaxpr)
+    after = program.lower().compile()(*args)
+    monkeypatch.setattr(dynamics, "elementwise", kernel.elementwise)
+    assert_equal(after, jax.jit(in_worlds(env))(*args))
+    assert np.all(np.abs(after.qvel - by_xla.qvel).max(axis=0) > 1e-3)
 
 
 def test_several_batches_and_shared_targets(env, in_kernel):
@@ -167,6 +194,13 @@ def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert len(re.findall(r"custom_call @__gpu\$xla.gpu.triton|triton_kernel_call", on_gpu)) == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
+
+
+def test_the_kernel_with_parameters_is_lowered_for_a_gpu(env, monkeypatch):
+    monkeypatch.setattr(kernel, "has_kernels", lambda: True)
+    traced = jax.jit(in_worlds(env)).trace(*moving(env, BATCH), random_worlds(env, BATCH))
+    on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert len(re.findall(r"custom_call @__gpu\$xla.gpu.triton|triton_kernel_call", on_gpu)) == 1
 
 
 def test_there_is_no_kernel_here(monkeypatch):

@@ -20,6 +20,7 @@ from bounce_mjx.evaluation.c_episodes import (
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.learning import policy as policies
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
 from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import SHAPES, direct_solref
@@ -119,7 +120,12 @@ def c_steps(mj_model, parameters: PhysicsParameters, states: States) -> tuple[Ph
         state, touching = c_step(edited_model(mj_model, world(parameters, i)), one)
         after.append(state)
         contacts += int(touching[0])
-    return PhysicsState(*(np.concatenate(x) for x in zip(*(s[:2] for s in after)))), contacts
+    return joined(after), contacts
+
+
+def joined(states: list[PhysicsState]) -> PhysicsState:
+    """Batches of states as one."""
+    return PhysicsState(*(np.concatenate(x) for x in zip(*(s[:2] for s in states), strict=True)))
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
@@ -197,8 +203,7 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
         state = step(parameters, state, ctrl)
         for j, c in enumerate(reference):
             contacts += c.step(c_ctrl[j : j + 1], 1)
-        expected = [np.concatenate(x) for x in zip(*(c.state[:2] for c in reference))]
-        error = max(error, *difference(state, PhysicsState(*expected)))
+        error = max(error, *difference(state, joined([c.state for c in reference])))
     record_property("largest_difference", error)
     print(f"500 steps x {NUM_WORLDS} worlds: {contacts} contact steps, difference {error:.1e}")
     assert contacts >= 200
@@ -241,8 +246,7 @@ def test_paddle_position_follows_its_parameter(mj_model):
     expected, _ = paddle_frame(edited_model(mj_model, world(parameters, 0)), qpos[:6])
     for choice in ("fused", "mjx"):
         engine = make_engine(mj_model, choice)
-        with jax.disable_jit():
-            position = engine.paddle_position(world(parameters, 0), jnp.asarray(qpos))
+        position = jax.jit(engine.paddle_position)(world(parameters, 0), qpos)
         np.testing.assert_allclose(position, expected, atol=1e-12)
 
 
@@ -308,7 +312,7 @@ def test_each_environment_of_a_batch_has_its_own_ball():
         parameters = state.pipeline_state.parameters
         assert abs(np.log(parameters.ball_mass[0] / parameters.ball_mass[1])) > 0.5
         at = find_addresses(env.mj_model)
-        action = 0.5 * jnp.ones((2, 6))
+        action = jnp.zeros((2, 6))
         start = state.pipeline_state.physics
         reference = [
             CEngine(edited_model(env.mj_model, world(parameters, i)), world(start, slice(i, i + 1)))
@@ -322,9 +326,7 @@ def test_each_environment_of_a_batch_has_its_own_ball():
             contacts += [c.step(ctrl[i : i + 1], 10) for i, c in enumerate(reference)]
         assert np.all(contacts > 0)
         assert not np.any(state.done)
-        expected = PhysicsState(
-            *(np.concatenate(x) for x in zip(*(c.state[:2] for c in reference)))
-        )
+        expected = joined([c.state for c in reference])
         assert max(difference(state.pipeline_state.physics, expected)) < 1e-9
         np.testing.assert_array_equal(
             state.pipeline_state.parameters.ball_mass, parameters.ball_mass
@@ -336,14 +338,16 @@ def test_each_environment_of_a_batch_has_its_own_ball():
 @pytest.fixture(scope="module")
 def networks():
     env = BounceBall()
-    return policies.make_networks(PPOConfig(), env.observation_size, env.action_size)
+    return policies.make_networks(
+        PPOConfig(hidden_layers=(16,)), env.observation_size, env.action_size
+    )
 
 
 @pytest.fixture(scope="module")
 def untrained(networks):
     """A policy before any training."""
     params = networks.policy_network.init(jax.random.PRNGKey(5))
-    return policies.Policy(policies.init_normalizer(BounceBall().observation_size), params)
+    return policies.Policy(init_normalizer(BounceBall().observation_size), params)
 
 
 def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):

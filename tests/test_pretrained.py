@@ -14,9 +14,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.choice import choose_checkpoint, pretrained_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import best_checkpoint, load_policy, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128

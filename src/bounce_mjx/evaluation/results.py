@@ -49,6 +49,8 @@ class Report(NamedTuple):
     mean_length_s; None where there was nothing to measure."""
     recording: Recording | None = None
     """The first episodes, if they were recorded; not part of `to_dict`."""
+    screening: bool = False
+    """Whether these are the few episodes of a screening, which did not pass."""
 
     @property
     def passed(self) -> bool:
@@ -56,20 +58,23 @@ class Report(NamedTuple):
         return all(result.passed is not False for result in self.results)
 
     @property
-    def score(self) -> tuple[int, float]:
-        """Order of quality: the number of results met, then the mean return."""
+    def score(self) -> tuple[bool, int, float]:
+        """Order of quality: a full evaluation before a screening, then the number of results met,
+        then the mean return."""
         met = sum(result.passed is not False for result in self.results)
-        return met, self.details["mean_return"]
+        return not self.screening, met, self.details["mean_return"]
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> "Report":
         """The inverse of `to_dict`."""
-        return cls(tuple(Result(**result) for result in plain["results"]), plain["details"])
+        results = tuple(Result(**result) for result in plain["results"])
+        return cls(results, plain["details"], screening=bool(plain.get("screening", False)))
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain data for JSON, with null for a missing figure."""
         return {
             "passed": self.passed,
+            "screening": self.screening,
             "results": [result._asdict() for result in self.results],
             "details": self.details,
         }

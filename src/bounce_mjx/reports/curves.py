@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import load_results, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.progress import load_results
 
 # Settings that may differ within a group: the seed, the place of the run, its end, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))

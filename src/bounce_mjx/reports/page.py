@@ -26,13 +26,10 @@ from bounce_mjx.reports.figures import (
     rewards_figure,
 )
 from bounce_mjx.reports.tables import details_line, figure_text, verdict
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    Checkpoint,
-    load_policy,
-    load_results,
-    load_run_config,
-)
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.env import BounceBall
 
 REPORT_FILE = "report.html"

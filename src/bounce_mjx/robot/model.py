@@ -18,11 +18,12 @@ JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
 
-# Numbers that MuJoCo's compiler computes from others.
+# Numbers that MuJoCo's compiler can compute from others.
 _DERIVED_FIELDS = frozenset(
     (
         "actuator_acc0",
         "actuator_length0",
+        "body_inertia",
         "body_invweight0",
         "body_subtreemass",
         "dof_M0",
