@@ -1,9 +1,9 @@
-"""Ten minutes on end: how many environments keep the ball up, and whether the memory stays flat.
+"""Ten minutes without a reset: the share of environments that keep the ball up, and the memory.
 
     python benchmarks/endurance.py RUN --num-envs 1024 --minutes 10
 
-The policy acts without a time limit and without resets; an environment has failed at its first end
-(the ball fell, flew off, ...). A row is one minute of simulated time.
+The policy acts without a time limit and without resets. An environment fails at its first end: the
+ball falls, flies off, ... Each row is one minute of simulated time.
 """
 
 import resource
@@ -22,9 +22,13 @@ from bounce_mjx import BounceBall
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.evaluation.results import DEFAULT_SEED, accumulate, empty_statistics, judge
+from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
+from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.policy import act, make_networks
-from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 # Share of the environments that must keep the ball up throughout.
 MIN_SHARE = 0.99
@@ -34,15 +38,15 @@ class Command(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder or a checkpoint in it; without it the newest run."""
+    """A run's folder or a checkpoint in it. The default is the newest run."""
     num_envs: Annotated[int, Field(ge=1)] = 1024
-    """Environments."""
+    """Number of environments."""
     minutes: Annotated[int, Field(ge=1)] = 10
-    """Simulated minutes of each."""
+    """Simulated minutes of each environment."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
     """Seed of the resets."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
     out: Path = Path("benchmarks/results")
     """Folder for endurance.json and endurance.md."""
 
@@ -98,9 +102,9 @@ def table(records: list[dict]) -> str:
         [
             str(r["minute"]),
             f"{100 * r['up_share']:.2f}",
-            f"{r['results']['horizontal position']:.2f}",
-            f"{r['results']['height']:.2f}",
-            f"{100 * r['mean_apex_error_m']:.1f}",
+            figure_text(r["results"]["horizontal position"]),
+            figure_text(r["results"]["height"]),
+            figure_text(r["mean_apex_error_m"], ".1f", 100.0),
             f"{r['seconds']:.1f}",
             f"{r['peak_process_mib']:.0f}",
             f"{r['device_mib']:.0f}",

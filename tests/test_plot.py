@@ -17,6 +17,7 @@ from tensorboardX import SummaryWriter
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.recording import Recording
@@ -32,9 +33,10 @@ from bounce_mjx.reports.figures import (
 )
 from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import load_results, save_config
+from bounce_mjx.runs.folders import save_config
+from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.rewards import TERM_NAMES
-from bounce_mjx.training import report as report_command
+from bounce_mjx.training import report as training_report
 
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
@@ -261,7 +263,7 @@ def check_report(run: Path) -> str:
     results = load_results(run)
     for result in results["results"]:
         assert f">{result['name']}</td>" in page
-        assert f">{result['value']:.2f}</td>" in page
+        assert f">{as_shown(result['value'])}</td>" in page
     for phase, seconds in results["seconds"].items():
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     assert len(re.findall(r">128</td>|>256</td>", page)) == 2
@@ -270,8 +272,22 @@ def check_report(run: Path) -> str:
     return page
 
 
+def as_shown(value: float | None) -> str:
+    """A figure as tables show it."""
+    return "none" if value is None else f"{value:.2f}"
+
+
 def test_training_leaves_a_report(trained: Path) -> None:
+    """Its episodes of 0.5 s end before the height is measured."""
     page = check_report(trained)
+    height = load_results(trained)["results"][2]
+    assert (height["value"], height["passed"]) == (None, False)
+    assert "none" in re.search(r"<td[^>]*>height</td>.*", page)[0]
+    assert "|apex error| none, " in page
+    # Nor has the log a point that a curve would show as the best there is.
+    log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
+    assert "results/stable" in log and "results/mean_return" in log
+    assert not {"results/height", "results/mean_apex_error_m"} & set(log)
     met = sum(r["passed"] is not False for r in load_results(trained)["results"])
     assert f"<h1>{met} of 5 results met</h1>" in page
 
@@ -295,7 +311,7 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
     def fail(*_):
         raise RuntimeError("no\nfonts")
 
-    monkeypatch.setattr(report_command, "write_report", fail)
+    monkeypatch.setattr(training_report, "write_report", fail)
     train_command.main([*TINY, "--total-steps", "128", "--log-dir", str(tmp_path)])
     (run,) = tmp_path.iterdir()
     assert json.loads((run / "results.json").read_text())["trained_steps"] == 128
@@ -329,7 +345,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
         result["name"] for result in results["results"]
     ]
     assert [row.split(" | ")[2] for row in rows[2:]] == [
-        f"{result['value']:.2f}" for result in results["results"]
+        as_shown(result["value"]) for result in results["results"]
     ]
 
     assert tags["images"] == ["evaluation"]

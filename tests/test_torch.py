@@ -26,7 +26,7 @@ from bounce_mjx.adapters.torch.networks import (
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
 from bounce_mjx.adapters.torch.skrl_ppo import SkrlEnv
-from bounce_mjx.commands.train_torch import make_learner, summarize
+from bounce_mjx.adapters.torch.trainer import make_learner, summarize
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import act, make_networks

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
 
@@ -16,8 +16,12 @@ def make_evaluator(
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
     from its own reset; it stops when all have ended or the time is over."""
-    evaluate = make_recording_evaluator(env, networks, episodes, recorded=0)
-    return jax.jit(lambda policy, key: evaluate(policy, key)[0])
+    recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
+
+    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
+        return recording_evaluator(policy, key)[0]
+
+    return jax.jit(evaluate)
 
 
 def make_recording_evaluator(

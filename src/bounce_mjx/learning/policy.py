@@ -10,11 +10,6 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.networks import MLP, PolicyNetwork
 from bounce_mjx.learning.statistics import Normalizer, normalize
 
-# Arrays of older policy files that acting does not need.
-OBSOLETE_ARRAYS = frozenset(
-    f"normalizer.{name}" for name in ("count.hi", "count.lo", "std_eps", "summed_variance")
-)
-
 
 class Policy(NamedTuple):
     """Everything that acting needs: a pytree of arrays."""

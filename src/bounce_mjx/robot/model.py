@@ -1,4 +1,4 @@
-"""The simulated robot: the MJCF file, the names it must have, and where their data lie."""
+"""The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
 import os
@@ -18,9 +18,25 @@ JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
 
+# Numbers that MuJoCo's compiler can compute from others.
+_DERIVED_FIELDS = frozenset(
+    (
+        "actuator_acc0",
+        "actuator_length0",
+        "body_inertia",
+        "body_invweight0",
+        "body_subtreemass",
+        "dof_M0",
+        "dof_invweight0",
+        "dof_length",
+        "geom_aabb",
+        "geom_rbound",
+    )
+)
+
 
 class Addresses(NamedTuple):
-    """Where the named parts lie in the model's arrays."""
+    """Indices of the named parts in the model's arrays."""
 
     arm_joints: tuple[int, ...]
     """Ids of Joint1..Joint6."""
@@ -39,30 +55,73 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float) -> mujoco.MjModel:
+def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
       mjcf: the file; None for the project's own robot.
       physics_dt: physics time step, s.
+      visual: False drops the textures and geoms that only pictures need; they take most of a
+        model's memory.
 
     Raises:
-      UserError: the file is missing, is no MJCF, or lacks a name that the task needs.
+      UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
+        without a position servo, or has a number that cannot be simulated.
     """
     path = mjcf or resource_path("mjcf/bounce_ball.xml")
     if not os.path.isfile(path):
         raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
     try:
-        mj_model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+        mj_model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); mend it") from error
-    mj_model.opt.timestep = physics_dt
+        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
     try:
-        find_addresses(mj_model)
+        _check_numbers(mj_model)
+        _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
         raise UserError(f"the MJCF file {path} has {error}") from error
+    mj_model.opt.timestep = physics_dt
     return mj_model
+
+
+def _check_numbers(mj_model: mujoco.MjModel) -> None:
+    """Refuses a time step that is not positive, and numbers that are not finite."""
+    step = mj_model.opt.timestep
+    if not 0.0 < step < np.inf:
+        raise UserError(f"the timestep {step}; give a positive number of seconds")
+    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
+    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
+    # Derived numbers come last: the message must name the number in the file.
+    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
+        values = np.asarray(getattr(owner, name))
+        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
+            value = values[~np.isfinite(values)][0]
+            raise UserError(f"the number {value} in {name}; give finite numbers")
+
+
+def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
+    """Refuses actuators whose control is not the position that they drive their joint to."""
+    plain_or_filtered = (
+        mujoco.mjtDyn.mjDYN_NONE,
+        mujoco.mjtDyn.mjDYN_FILTER,
+        mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    )
+    for name, actuator in zip(JOINT_NAMES, addresses.actuators, strict=True):
+        is_position_servo = (
+            mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+            and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+            and mujoco.mjtDyn(mj_model.actuator_dyntype[actuator]) in plain_or_filtered
+            and mj_model.actuator_gainprm[actuator, 0] > 0.0
+            and mj_model.actuator_biasprm[actuator, 1] < 0.0
+        )
+        if not is_position_servo:
+            raise UserError(
+                f"an actuator on {name} that is no position servo; drive it by "
+                f'<position joint="{name}"/>'
+            )
 
 
 def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
@@ -124,8 +183,7 @@ def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> 
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
-    """A hash of the numbers that a simulation depends on; pictures' colours and markers are not
-    among them."""
+    """A hash of the numbers that a simulation depends on; colours and markers do not enter it."""
     digest = hashlib.blake2b()
     for owner, names in (
         (mj_model, _physical_fields(mj_model)),
@@ -137,15 +195,15 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
 
 
 def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
-    """Checks that a model still is the one whose `fingerprint` is given.
+    """Checks a model against its `fingerprint` from before.
 
     Raises:
-      UserError: the model was edited, which no engine that was built from it would notice.
+      UserError: the model was edited, and the engines built from it would ignore the edit.
     """
     if fingerprint(mj_model) != built_from:
         raise UserError(
-            "env.mj_model was edited after the environment had been built, which does not reach "
-            "its physics; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
+            "env.mj_model was edited after the environment had been built, and the physics would "
+            "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
         )
 
 
@@ -156,7 +214,7 @@ def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
-    """The ball's geom that the contact pair names, or else its first one."""
+    """The ball's geom in the contact pair; without a pair, its first geom."""
     of_ball = {
         int(geom)
         for pair in range(mj_model.npair)

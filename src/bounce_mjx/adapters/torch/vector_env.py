@@ -5,11 +5,13 @@ for the device, as DLPack makes each library's stream wait for the other's. The 
 the next step, so a step returns no view of it.
 """
 
+import copy
 import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
@@ -167,6 +169,27 @@ class TorchVectorEnv:
         shared = jax.dlpack.from_dlpack(action.detach().contiguous())
         self._block, result = self._jit_step(self._block, shared)
         return StepResult(result, self._result_layout)
+
+    def sibling(self, seed: int) -> "TorchVectorEnv":
+        """As many other environments on the same compiled programs.
+
+        Args:
+          seed: of their resets.
+        """
+        other = copy.copy(self)
+        other._key, other._block = jax.random.PRNGKey(seed), None
+        return other
+
+    @property
+    def state(self) -> np.ndarray:
+        """Everything that the next step needs, one block [W], int32; a copy, which may be set."""
+        if self._block is None:
+            self.reset()
+        return np.array(self._block)
+
+    @state.setter
+    def state(self, value: np.ndarray) -> None:
+        self._block = jnp.array(value)
 
     @property
     def clock(self) -> torch.Tensor:
