@@ -1,11 +1,11 @@
 """A long elementwise function as one GPU kernel.
 
-XLA makes a loop of physics steps into a kernel a step, with a copy of every coordinate before the
-first, and takes seconds to fuse one of them. Here the whole function, its loops included, becomes
-one Triton kernel (through Pallas) in which a thread keeps one environment in its registers.
+XLA turns a loop of physics steps into one kernel per step, copies every coordinate before the first
+one, and takes seconds to fuse each kernel. This module compiles the whole function, loops included,
+into one Triton kernel (through Pallas) in which a thread keeps one environment in its registers.
 
-Everywhere else the function is left to XLA: on a processor, on GPUs before NVIDIA's Ampere, where
-Pallas has no Triton, for other types than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
+XLA still compiles the function on a CPU, on GPUs older than NVIDIA's Ampere, where Pallas has no
+Triton, for types other than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
 """
 
 import math
@@ -34,8 +34,8 @@ def elementwise(
     Args:
       function: K arrays of one shape and type -> a tuple of arrays of that shape and type, by
         elementwise operations alone.
-      num_results: how many; to find out would mean to trace the function once more.
-      interpret: runs the kernel in Pallas' interpreter on any device, for tests.
+      num_results: number of results; counting them would take another trace of the function.
+      interpret: run the kernel in Pallas' interpreter on any device, for tests.
     """
 
     @jax.custom_batching.custom_vmap
@@ -72,7 +72,7 @@ def has_kernels() -> bool:
         from jax.experimental.pallas import triton  # noqa: F401
     except ImportError:
         return False
-    # Of AMD's GPUs it is a name, and their kernels are untried.
+    # AMD's GPUs report a name instead of a number; the kernels are untested there.
     capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
     return all(
         c.replace(".", "").isdigit() and float(c) >= _MIN_COMPUTE_CAPABILITY for c in capabilities
@@ -82,7 +82,7 @@ def has_kernels() -> bool:
 def in_kernel(
     function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
 ) -> Arrays:
-    """Runs `function` on arrays [...] in one kernel; on several devices each does its own part."""
+    """Runs `function` on arrays [...] in one kernel; each device computes its own shard."""
     shape = args[0].shape
 
     @custom_partitioning
@@ -107,7 +107,7 @@ def in_kernel(
         need_replication_factors=("rows", "results"),
     )
 
-    # A block that a kernel loads has a power of two as its number of rows.
+    # Triton loads only blocks with a power of two of rows.
     unused = [jnp.zeros_like(args[0])] * (_power_of_two(len(args)) - len(args))
     packed = run(jnp.stack([*args, *unused]))
     return tuple(packed[i] for i in range(num_results))
@@ -120,7 +120,7 @@ def _run_packed(
     num_results: int,
     interpret: bool,
 ) -> jax.Array:
-    """Arguments [rows, N] -> results [rows, N], rows being powers of two."""
+    """Arguments [rows, N] -> results [rows, N]; both numbers of rows are powers of two."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -128,7 +128,7 @@ def _run_packed(
     num_result_rows = _power_of_two(num_results)
 
     def kernel(args_ref, results_ref):
-        # One load and one store: Triton takes time for each that grows with the kernel's length.
+        # One load and one store: Triton's time for each grows with the length of the kernel.
         args = _unstack(args_ref[...])[:num_args]
         results = function(*args)
         unused = [jnp.zeros_like(args[0])] * (num_result_rows - num_results)
@@ -148,12 +148,12 @@ def _run_packed(
 
 
 def _unstack(x: jax.Array) -> list[jax.Array]:
-    """Rows [N] of an array [rows, N], by the operations that Triton has."""
+    """Rows [N] of an array [rows, N], by operations that Triton supports."""
     return [row.reshape(row.shape[1]) for row in jnp.split(x, x.shape[0])]
 
 
 def _stack(rows: list[jax.Array]) -> jax.Array:
-    """An array [rows, N] of a power of two of rows [N], by the operations that Triton has."""
+    """An array [rows, N] of a power of two of rows [N], by operations that Triton supports."""
 
     def joined(rows: list[jax.Array]) -> jax.Array:
         if len(rows) == 1:
@@ -165,5 +165,5 @@ def _stack(rows: list[jax.Array]) -> jax.Array:
 
 
 def _power_of_two(number: int) -> int:
-    """The least power of two that is no smaller."""
+    """The smallest power of two that is not below the number."""
     return 1 << (number - 1).bit_length()
