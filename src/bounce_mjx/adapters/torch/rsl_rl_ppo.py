@@ -46,8 +46,8 @@ except ImportError as error:
 class RslRlVecEnv(VecEnv):
     """B environments with the interface of rsl_rl's runners.
 
-    The observation groups are `policy` [B, N] and `critic` [B, K], the metrics for the value network
-    alone. `extras` holds `time_outs` [B] and `log`, means over the batch.
+    The observation groups are `policy` [B, N] and `critic` [B, K], the metrics for the value
+    network alone. `extras` holds `time_outs` [B] and `log`, means over the batch.
     """
 
     def __init__(self, env: TorchVectorEnv):

@@ -97,8 +97,8 @@ class SkrlEnv(Wrapper):
         return self._states
 
     def terminal_observations(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Observations and states after the last step, before any reset: at an end, the last ones of
-        the old episode."""
+        """Observations and states after the last step, before any reset: at an end, the last ones
+        of the old episode."""
         result = self._result
         states = torch.cat([result.final_observation, result.final_critic_metrics], dim=-1)
         return result.final_observation, states
