@@ -1,13 +1,14 @@
 """A long elementwise function as one GPU kernel.
 
-XLA makes a loop of physics steps into a kernel a step, with a copy of every coordinate before the
+XLA makes a loop of physics steps into one kernel a step, with a copy of every coordinate before the
 first, and takes seconds to fuse one of them. Here the whole function, its loops included, becomes
-one Triton kernel (through Pallas) in which a thread keeps one environment in its registers.
+one kernel of Pallas' Mosaic GPU backend, in which a thread keeps one environment in its registers.
 
-Everywhere else the function is left to XLA: on a processor, on GPUs before NVIDIA's Ampere, where
-Pallas has no Triton, for other types than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
+XLA compiles the function everywhere else: on a CPU, on GPUs before NVIDIA's Hopper, for other types
+than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
 """
 
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -20,10 +21,10 @@ Arrays = tuple[jax.Array, ...]
 ElementwiseFunction = Callable[..., Arrays]
 
 _SWITCH = "BOUNCE_MJX_GPU_KERNEL"
-# Triton needs NVIDIA's Ampere.
-_MIN_COMPUTE_CAPABILITY = 8.0
-# Environments in a block, and warps (of 32 threads) that share them.
-_BLOCK, _NUM_WARPS = 64, 2
+# Mosaic GPU targets NVIDIA's Hopper and later.
+_MIN_COMPUTE_CAPABILITY = 9.0
+# Environments in a block: the 128 threads of a warpgroup, with which Mosaic GPU computes.
+_BLOCK = 128
 
 
 def elementwise(
@@ -34,7 +35,7 @@ def elementwise(
     Args:
       function: K arrays of one shape and type -> a tuple of arrays of that shape and type, by
         elementwise operations alone.
-      num_results: how many; to find out would mean to trace the function once more.
+      num_results: length of that tuple; to count it here would mean another trace.
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
     """
 
@@ -69,10 +70,10 @@ def has_kernels() -> bool:
     if jax.default_backend() != "gpu" or os.environ.get(_SWITCH) == "off":
         return False
     try:
-        from jax.experimental.pallas import triton  # noqa: F401
+        from jax.experimental.pallas import mosaic_gpu  # noqa: F401
     except ImportError:
         return False
-    # Of AMD's GPUs it is a name, and their kernels are untried.
+    # AMD's GPUs have a name here, such as gfx90a.
     capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
     return all(
         c.replace(".", "").isdigit() and float(c) >= _MIN_COMPUTE_CAPABILITY for c in capabilities
@@ -82,88 +83,74 @@ def has_kernels() -> bool:
 def in_kernel(
     function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
 ) -> Arrays:
-    """Runs `function` on arrays [...] in one kernel; on several devices each does its own part."""
-    shape = args[0].shape
+    """Runs `function` on arrays [...] in one kernel; each of several devices computes its shard."""
 
-    @custom_partitioning
     def run(packed: jax.Array) -> jax.Array:
         rows, *batch = packed.shape
         flat = packed.reshape(rows, math.prod(batch))
-        results = _run_packed(function, flat, len(args), num_results, interpret)
-        return results.reshape(-1, *batch)
+        return _run_packed(function, flat, num_results, interpret).reshape(num_results, *batch)
+
+    packed = jnp.stack(args)
+    # On one device a partitioning would only keep the program out of the compilation cache.
+    results = run(packed) if jax.device_count() == 1 else _partitioned(run, packed)
+    return tuple(results[i] for i in range(num_results))
+
+
+def _partitioned(run: Callable[[jax.Array], jax.Array], packed: jax.Array) -> jax.Array:
+    """`run` on an array [rows, ...], the shards of which need nothing of each other."""
+    partitioned = custom_partitioning(run)
 
     def partition(mesh, arg_shapes, result_shape):
         del result_shape
-        sharding = arg_shapes[0].sharding
-        spec = jax.sharding.PartitionSpec(None, *sharding.spec[1:])
+        spec = jax.sharding.PartitionSpec(None, *arg_shapes[0].sharding.spec[1:])
         kept = jax.sharding.NamedSharding(mesh, spec)
-        return mesh, run.fun, kept, (kept,)
+        return mesh, run, kept, (kept,)
 
-    axes = " ".join(f"b{i}" for i in range(len(shape)))
-    run.def_partition(
+    axes = " ".join(f"b{i}" for i in range(packed.ndim - 1))
+    partitioned.def_partition(
         partition=partition,
         infer_sharding_from_operands=lambda mesh, args, _: args[0].sharding,
         sharding_rule=f"rows {axes} -> results {axes}",
         need_replication_factors=("rows", "results"),
     )
-
-    # A block that a kernel loads has a power of two as its number of rows.
-    unused = [jnp.zeros_like(args[0])] * (_power_of_two(len(args)) - len(args))
-    packed = run(jnp.stack([*args, *unused]))
-    return tuple(packed[i] for i in range(num_results))
+    return partitioned(packed)
 
 
 def _run_packed(
-    function: ElementwiseFunction,
-    packed: jax.Array,
-    num_args: int,
-    num_results: int,
-    interpret: bool,
+    function: ElementwiseFunction, packed: jax.Array, num_results: int, interpret: bool
 ) -> jax.Array:
-    """Arguments [rows, N] -> results [rows, N], rows being powers of two."""
+    """Arguments [rows, N] -> results [num_results, N]."""
     from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
+    from jax.experimental.pallas import mosaic_gpu as plgpu
 
     num_rows, size = packed.shape
-    num_result_rows = _power_of_two(num_results)
+    num_blocks = -(-size // _BLOCK)
+    out_type = jax.ShapeDtypeStruct((num_results, num_blocks * _BLOCK), packed.dtype)
 
-    def kernel(args_ref, results_ref):
-        # One load and one store: Triton takes time for each that grows with the kernel's length.
-        args = _unstack(args_ref[...])[:num_args]
-        results = function(*args)
-        unused = [jnp.zeros_like(args[0])] * (num_result_rows - num_results)
-        results_ref[...] = _stack([*results, *unused])
+    def kernel(block: jax.Array, load: Callable, args_ref, results_ref) -> None:
+        columns = pl.ds(block * _BLOCK, _BLOCK)
+        args = [load(args_ref.at[row, columns]) for row in range(num_rows)]
+        for row, result in enumerate(function(*args)):
+            results_ref[row, columns] = result
 
-    whole = -(-size // _BLOCK) * _BLOCK
-    results = pl.pallas_call(
-        kernel,
-        grid=(whole // _BLOCK,),
-        in_specs=[pl.BlockSpec((num_rows, _BLOCK), lambda i: (0, i))],
-        out_specs=pl.BlockSpec((num_result_rows, _BLOCK), lambda i: (0, i)),
-        out_shape=jax.ShapeDtypeStruct((num_result_rows, whole), packed.dtype),
-        compiler_params=triton.CompilerParams(num_warps=_NUM_WARPS, num_stages=1),
-        interpret=interpret,
-    )(jnp.pad(packed, ((0, 0), (0, whole - size))))
-    return results[:, :size]
-
-
-def _unstack(x: jax.Array) -> list[jax.Array]:
-    """Rows [N] of an array [rows, N], by the operations that Triton has."""
-    return [row.reshape(row.shape[1]) for row in jnp.split(x, x.shape[0])]
-
-
-def _stack(rows: list[jax.Array]) -> jax.Array:
-    """An array [rows, N] of a power of two of rows [N], by the operations that Triton has."""
-
-    def joined(rows: list[jax.Array]) -> jax.Array:
-        if len(rows) == 1:
-            return rows[0]
-        even, odd = joined(rows[0::2]), joined(rows[1::2])
-        return jnp.concatenate([even[..., None], odd[..., None]], axis=-1)
-
-    return jnp.transpose(joined(rows).reshape(rows[0].shape[0], len(rows)))
-
-
-def _power_of_two(number: int) -> int:
-    """The least power of two that is no smaller."""
-    return 1 << (number - 1).bit_length()
+    if interpret:
+        run = pl.pallas_call(
+            lambda *refs: kernel(pl.program_id(0), lambda ref: ref[...], *refs),
+            grid=(num_blocks,),
+            out_shape=out_type,
+            interpret=True,
+        )
+    else:
+        load = functools.partial(
+            plgpu.load, idx=(), layout=plgpu.Layout.WG_STRIDED((_BLOCK,), 1), optimized=False
+        )
+        run = plgpu.kernel(
+            lambda *refs: kernel(jax.lax.axis_index("block"), load, *refs),
+            out_type=out_type,
+            grid=(num_blocks,),
+            grid_names=("block",),
+            # Each thread computes environments of its own. With the other semantics, vectors of a
+            # warpgroup, the kernel takes ten times as long to compile and runs as fast.
+            compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
+        )
+    return run(jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size))))[:, :size]
