@@ -1,6 +1,8 @@
 """Trains a policy: `python train_jax.py --num-envs 4096` (see --help)."""
 
-from bounce_mjx.commands.train import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

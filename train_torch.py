@@ -1,6 +1,8 @@
 """Trains with PyTorch: `python train_torch.py --library rsl_rl` (see --help)."""
 
-from bounce_mjx.commands.train_torch import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["train-torch", *sys.argv[1:]])

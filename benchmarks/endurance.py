@@ -22,9 +22,13 @@ from bounce_mjx import BounceBall
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.evaluation.results import DEFAULT_SEED, accumulate, empty_statistics, judge
+from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
+from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.policy import act, make_networks
-from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config
+from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 # Share of the environments that must keep the ball up throughout.
 MIN_SHARE = 0.99
@@ -98,9 +102,9 @@ def table(records: list[dict]) -> str:
         [
             str(r["minute"]),
             f"{100 * r['up_share']:.2f}",
-            f"{r['results']['horizontal position']:.2f}",
-            f"{r['results']['height']:.2f}",
-            f"{100 * r['mean_apex_error_m']:.1f}",
+            figure_text(r["results"]["horizontal position"]),
+            figure_text(r["results"]["height"]),
+            figure_text(r["mean_apex_error_m"], ".1f", 100.0),
             f"{r['seconds']:.1f}",
             f"{r['peak_process_mib']:.0f}",
             f"{r['device_mib']:.0f}",

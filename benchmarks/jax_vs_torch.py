@@ -35,17 +35,19 @@ from pydantic import Field
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
-from bounce_mjx.commands.train import path_flag
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.results import Statistics, judge
+from bounce_mjx.evaluation.results import judge
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, init_normalizer, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.presets import read_preset
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.setup import compiler_options, set_up_gpu
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")

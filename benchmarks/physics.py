@@ -25,6 +25,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.physics import PhysicsParameters
 
 EngineName = Literal["fused", "mjx", "c"]
 
@@ -53,7 +54,10 @@ def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[
         actions = jax.random.uniform(key, (env.action_size, batch), minval=-1.0, maxval=1.0)
         targets = jax.vmap(env.servo_targets, **at_minor)(physics, actions)
         advance = jax.vmap(
-            lambda state, ctrl: env.engine.step(state, ctrl, env.config.num_substeps), **at_minor
+            lambda state, ctrl: env.engine.step(
+                PhysicsParameters(), state, ctrl, env.config.num_substeps
+            ),
+            **at_minor,
         )
         return advance(physics, targets), None
 

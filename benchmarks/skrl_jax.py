@@ -12,15 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import skrl
-from brax.training.acme import running_statistics
 from skrl.agents.jax.ppo import PPO, PPO_CFG
 from skrl.memories.jax import RandomMemory
 from skrl.models.jax import DeterministicMixin, GaussianMixin, Model
 from skrl.resources.schedulers.jax import KLAdaptiveLR
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, init_normalizer, normalize
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
+from bounce_mjx.learning.statistics import init_statistics, normalize, update
 from bounce_mjx.task import vector
 from bounce_mjx.task.env import BounceBall
 
@@ -142,7 +142,7 @@ class SkrlJaxLearner:
         depth = len(self.config.hidden_layers)
         hidden = {f"hidden_{i}": params[f"Dense_{i}"] for i in range(depth)}
         return Policy(
-            self.agent._observation_preprocessor.statistics,
+            self.agent._observation_preprocessor.statistics.normalizer,
             {
                 "params": {
                     "MLP_0": hidden,
@@ -164,8 +164,8 @@ class Normalizer:
     """This project's normalisation as skrl's preprocessor."""
 
     def __init__(self, size: int):
-        self.statistics = init_normalizer(size)
-        self._update = jax.jit(running_statistics.update)
+        self.statistics = init_statistics(size)
+        self._update = jax.jit(update)
         self._normalize = jax.jit(normalize)
 
     def __call__(self, observation: jax.Array | None, train: bool = False) -> jax.Array | None:
@@ -173,7 +173,7 @@ class Normalizer:
             return None
         if train:
             self.statistics = self._update(self.statistics, observation)
-        return self._normalize(observation, self.statistics)
+        return self._normalize(observation, self.statistics.normalizer)
 
 
 def make_models(config: PPOConfig) -> tuple[type[Model], type[Model]]:

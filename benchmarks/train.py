@@ -21,6 +21,7 @@ from tables import device_name, markdown_table, write
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.reports.tables import figure_text
 
 PHASES = ("import", "setup", "compile", "train", "evaluate", "save")
 
@@ -99,10 +100,10 @@ def table(records: list[dict], engines: tuple[str, ...]) -> str:
         [
             str(r["seed"]),
             engine,
-            *[f"{result['value']:.2f}" for result in r["engines"][engine]["results"]],
+            *[figure_text(result["value"]) for result in r["engines"][engine]["results"]],
             "pass" if r["engines"][engine]["passed"] else "FAIL",
             f"{r['engines'][engine]['details']['mean_consecutive_bounces']:.1f}",
-            f"{100 * r['engines'][engine]['details']['mean_apex_error_m']:.1f}",
+            figure_text(r["engines"][engine]["details"]["mean_apex_error_m"], ".1f", 100.0),
         ]
         for r in records
         for engine in engines
@@ -145,7 +146,7 @@ def main() -> None:
                 solved = record["solved_steps"]
                 verdicts = ", ".join(
                     f"{engine} {'pass' if report['passed'] else 'FAIL'} "
-                    + "/".join(f"{result['value']:.2f}" for result in report["results"])
+                    + "/".join(figure_text(result["value"]) for result in report["results"])
                     for engine, report in record["engines"].items()
                 )
                 print(

@@ -25,16 +25,15 @@ from typing import Literal, Protocol
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
+from brax.training.agents.ppo.networks import PPONetworks
+from brax.training.distribution import NormalDistribution
+from brax.training.networks import FeedForwardNetwork
 
-from bounce_mjx.adapters.brax.compatibility import device_put_replicated
-from bounce_mjx.learning.policy import (
-    MIN_VARIANCE,
-    Policy,
-    init_normalizer,
-    make_networks,
-    normalize,
-)
+from bounce_mjx.adapters.brax import device_put_replicated
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Network, Policy, make_networks
 from bounce_mjx.learning.ppo import make_trainer, policy_of
+from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.setup import compiler_options
@@ -81,7 +80,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the adapter."""
-    from bounce_mjx.commands.train_torch import make_learner
+    from bounce_mjx.adapters.torch.trainer import make_learner
 
     learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)
@@ -149,19 +148,14 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
         seconds = time.perf_counter() - started
         if steps:
             statistics = params[0]
-            policy = Policy(
-                init_normalizer(env.observation_size).replace(
-                    mean=statistics.mean["state"], std=statistics.std["state"]
-                ),
-                params[1],
-            )
+            policy = Policy(_normalizer(statistics, "state"), params[1])
             if on_block(steps, seconds, policy):
                 raise _Enough
         started = time.perf_counter()
 
     def networks(_, action_size: int, preprocess_observations_fn):
         del preprocess_observations_fn
-        return make_networks(ppo, env.observation_size, action_size, normalize)
+        return brax_networks(ppo, env.observation_size, action_size)
 
     try:
         with device_put_replicated():
@@ -197,6 +191,30 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
             )
     except _Enough:
         pass
+
+
+def brax_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
+    """This project's networks, with its normalisation, for brax's trainer."""
+    networks = make_networks(config, observation_size, action_size)
+
+    def adapt(network: Network, key: str) -> FeedForwardNetwork:
+        return FeedForwardNetwork(
+            init=network.init,
+            apply=lambda statistics, params, observation: network.apply(
+                params, normalize(observation[key], _normalizer(statistics, key))
+            ),
+        )
+
+    return PPONetworks(
+        policy_network=adapt(networks.policy_network, "state"),
+        value_network=adapt(networks.value_network, "critic"),
+        parametric_action_distribution=NormalDistribution(action_size),
+    )
+
+
+def _normalizer(statistics, key: str) -> Normalizer:
+    """The normaliser of one of brax's observations."""
+    return Normalizer(statistics.mean[key], statistics.std[key])
 
 
 def block_iterations(config: TrainConfig) -> int:

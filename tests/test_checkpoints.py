@@ -1,5 +1,6 @@
 """A checkpoint is data, and is what was written: or it is refused in one sentence."""
 
+import hashlib
 import json
 import os
 import random
@@ -14,23 +15,19 @@ import numpy as np
 import pytest
 import tensorstore
 
+import bounce_mjx
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
-from bounce_mjx.runs import checkpoint as checkpoints
-from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import (
-    CheckpointWriter,
-    create_run,
-    find_checkpoint,
-    load_policy,
-    load_run_config,
-    load_training_state,
-)
+from bounce_mjx.runs import files
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.folders import create_run, find_checkpoint
+from bounce_mjx.runs.reading import load_policy, load_training_state
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
 
-SOURCES = Path(checkpoints.__file__).parent
+SOURCES = Path(bounce_mjx.__file__).parent
 CONFIG = TrainConfig(
     ppo=PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, hidden_layers=(16,))
 )
@@ -241,8 +238,8 @@ def test_code_in_any_file_is_not_run(
         for data in (payload(target), tagged):
             run = shutil.copytree(written, tmp_path / "run")
             (run / name).write_bytes(data)
-            if sealed and name.name != checkpoints.MANIFEST_FILE:
-                checkpoints.seal(step_of(run))
+            if sealed and name.name != files.MANIFEST_FILE:
+                files.seal(step_of(run))
             try:
                 loaded = load_both(run, state)
             except UserError:
@@ -262,8 +259,8 @@ def edit_json(path: Path, change: Callable[[dict], None]) -> None:
 @pytest.mark.parametrize("name", ["../../../../secret", "/etc/passwd", "policy/../../secret"])
 def test_manifest_leads_nowhere(run: Path, state: TrainingState, name: str) -> None:
     (run.parent / "secret").write_text("secret")
-    entry = {"size": 6, "sha256": checkpoints._sha256(run.parent / "secret")}
-    manifest = step_of(run) / checkpoints.MANIFEST_FILE
+    entry = {"size": 6, "sha256": hashlib.sha256(b"secret").hexdigest()}
+    manifest = step_of(run) / files.MANIFEST_FILE
     edit_json(manifest, lambda plain: plain["files"].update({name: entry}))
     assert_refused(run, state, "damaged", "is missing")
 
@@ -292,7 +289,7 @@ def write_array(run: Path, name: str, **metadata) -> None:
     key = f"{name}/.zarray"
     plain = json.loads(store.read(key).result().value) | metadata
     store.write(key, json.dumps(plain).encode()).result()
-    checkpoints.seal(step_of(run))
+    files.seal(step_of(run))
 
 
 HUGE = 2**40

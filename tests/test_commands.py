@@ -19,8 +19,9 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import find_checkpoint, load_policy, load_run_config, newest_run
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.folders import find_checkpoint, newest_run
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.rewards import TERM_NAMES
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents
 
@@ -214,8 +215,8 @@ BAD_EVAL_FLAGS = {
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
     "checkpoint missing": ("nowhere", "nowhere", "give a run's folder"),
-    "no runs": ("--log-dir mine", "no run", "in mine", "train_jax.py"),
-    "no run": (".", "config.yaml", "give a folder that train_jax.py made"),
+    "no runs": ("--log-dir mine", "no run", "in mine", "bounce-mjx train"),
+    "no run": (".", "config.yaml", "give a folder that bounce-mjx train made"),
 }
 
 

@@ -15,8 +15,10 @@ import pytest
 import yaml
 
 import bounce_mjx
+from bounce_mjx import commands as commands_package
 from bounce_mjx.commands import config_reference
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config import command_line as cli
@@ -24,8 +26,7 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.reward_config import RewardConfig
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -68,11 +69,16 @@ def commands(page: Path) -> list[tuple[str, list[str]]]:
     """The page's own commands: a script or a module, and its arguments."""
     found = []
     for line in code(page):
-        if line.startswith("$ "):  # shown with its error
+        if line.startswith(("$ ", "error: ")):  # a command that is refused
             continue
         plain = re.sub(r"<[^>]*>", "x", line.replace("$seed", "1"))
-        for match in re.finditer(r"(?:uv run|python3?) [^;#>&|()]+", plain):
+        for match in re.finditer(r"(?:uv run|python3?|bounce-mjx) [^;#>&|()]+", plain):
             words = shlex.split(match[0])
+            if "bounce-mjx" in words:
+                name, *args = words[words.index("bounce-mjx") + 1 :]
+                if name != "--help":
+                    found.append((f"bounce-mjx {name}", args))
+                continue
             script = next((i for i, word in enumerate(words) if word.endswith(".py")), None)
             if "-m" in words and words[words.index("-m") + 1].startswith("bounce_mjx"):
                 at = words.index("-m") + 1
@@ -91,8 +97,9 @@ COMMANDS = sorted({(name, *args) for page in PAGES for name, args in commands(pa
 
 def test_the_documentation_shows_the_commands() -> None:
     shown = {name for name, *_ in COMMANDS}
-    modules = {f"bounce_mjx.{name}" for name in ("eval", "plot", "report", "config_reference")}
-    assert shown >= modules | {"train_jax.py", "benchmarks/physics.py"}
+    script = {f"bounce-mjx {name}" for name in ("eval", "play", "plot", "report")}
+    scripts = {"train_jax.py", "benchmarks/physics.py", "bounce_mjx.commands.config_reference"}
+    assert shown >= script | scripts
 
 
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
@@ -101,7 +108,10 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     """By the command's own parser; nothing else of it runs."""
     name, *args = command
     path = CHECKOUT / name
-    assert path.is_file() if name.endswith(".py") else importlib.util.find_spec(name)
+    if name.startswith("bounce-mjx "):
+        assert name.split()[1] in console_script.COMMANDS
+    else:
+        assert path.is_file() if name.endswith(".py") else importlib.util.find_spec(name)
     if not args or args == ["--help"]:
         return
     if "--resume" in args:  # its run would have to exist
@@ -121,7 +131,9 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.syspath_prepend(str(path.parent))
     monkeypatch.chdir(CHECKOUT)
     with pytest.raises(Parsed):
-        if name.endswith(".py"):
+        if name.startswith("bounce-mjx "):
+            console_script.main([name.split()[1], *args])
+        elif name.endswith(".py"):
             runpy.run_path(str(path), run_name="__main__")
         else:
             runpy.run_module(name, run_name="__main__")
@@ -130,8 +142,8 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package."""
     flags = {"--help"}
-    for info in pkgutil.iter_modules(bounce_mjx.__path__):
-        module = importlib.import_module(f"bounce_mjx.{info.name}")
+    for info in pkgutil.iter_modules(commands_package.__path__):
+        module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
@@ -148,7 +160,7 @@ def test_flags_in_sentences_exist(page: Path) -> None:
 def test_config_reference_is_fresh() -> None:
     page = (CHECKOUT / "docs/config.md").read_text(encoding="utf-8")
     assert page == config_reference.reference(), (
-        "docs/config.md is stale; run python -m bounce_mjx.config_reference > docs/config.md"
+        "docs/config.md is stale; it names the command that prints it"
     )
 
 
@@ -211,6 +223,23 @@ def test_config_reference_has_the_true_ranges() -> None:
     assert checked > 50
 
 
+PACKAGE = Path(bounce_mjx.__file__).parent
+
+
+def test_map_has_every_folder_of_the_package() -> None:
+    """README's map: one row for each folder, and every path in it exists."""
+    section = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("## Where things are\n")[1]
+    rows = re.findall(r"^\| `([^|]+)` \| (.+) \|$", section.split("\n## ")[0], re.MULTILINE)
+    described = [name for cell, _ in rows for name in cell.split("`, `")]
+    folders = {f"{init.parent.relative_to(CHECKOUT)}/" for init in PACKAGE.glob("*/__init__.py")}
+    assert folders and folders <= set(described)
+    assert len(described) == len(set(described))
+    for cell, content in rows:
+        for name in [*cell.split("`, `"), *re.findall(r"`([\w/]+(?:\.\w+|/))`", content)]:
+            above = [CHECKOUT, *(CHECKOUT / first for first in cell.split("`, `"))]
+            assert any((folder / name).exists() for folder in above), name
+
+
 def test_task_page_has_the_weights() -> None:
     page = (CHECKOUT / "docs/task.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| `", page, re.MULTILINE)
@@ -221,12 +250,12 @@ def test_task_page_has_the_weights() -> None:
 
 
 MAINS = {
-    "train_jax.py": train_command.main,
-    "-m bounce_mjx.eval": eval_command.main,
-    "-m bounce_mjx.plot": plot_command.main,
+    "python train_jax.py": train_command.main,
+    "bounce-mjx eval": eval_command.main,
+    "bounce-mjx plot": plot_command.main,
 }
 TROUBLES = re.findall(
-    r"^ {4}\$ python (train_jax\.py|-m [\w.]+)(.*)\n {4}(error: .+)$",
+    r"^ {4}\$ (python train_jax\.py|bounce-mjx \w+)(.*)\n {4}(error: .+)$",
     (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8"),
     re.MULTILINE,
 )

@@ -14,7 +14,7 @@ from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.adapters.brax import compatibility as brax_interop
+from bounce_mjx.adapters.brax import pmap_support
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task.env import TaskState, update_task
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
@@ -645,7 +645,7 @@ def test_brax_vmap_wrapper_equals_single_steps(brax_episode, step):
 
 def test_brax_ppo_trains(env):
     params_at = {}
-    with brax_interop.device_put_replicated():
+    with pmap_support.device_put_replicated():
         make_policy, trained, metrics = brax_ppo.train(
             env,
             num_timesteps=2000,
@@ -681,8 +681,8 @@ def test_brax_ppo_trains(env):
 def test_device_put_replicated_is_there_only_within(monkeypatch):
     # Where jax still had the function it would be left alone: the next test.
     monkeypatch.delattr(jax, "device_put_replicated", raising=False)
-    with pytest.raises(KeyError), brax_interop.device_put_replicated():
-        assert jax.device_put_replicated is brax_interop.replicate
+    with pytest.raises(KeyError), pmap_support.device_put_replicated():
+        assert jax.device_put_replicated is pmap_support.replicate
         raise KeyError
     assert not hasattr(jax, "device_put_replicated")
 
@@ -690,14 +690,14 @@ def test_device_put_replicated_is_there_only_within(monkeypatch):
 def test_device_put_replicated_of_jax_is_left_alone(monkeypatch):
     own = object()
     monkeypatch.setattr(jax, "device_put_replicated", own, raising=False)
-    with brax_interop.device_put_replicated():
+    with pmap_support.device_put_replicated():
         assert jax.device_put_replicated is own
     assert jax.device_put_replicated is own
 
 
 def test_replicate_copies_arrays_numbers_and_keys():
     tree = {"a": np.arange(3, dtype=np.int8), "b": 2.5, "key": jax.random.key(3)}
-    copies = brax_interop.replicate(tree, jax.local_devices()[:1])
+    copies = pmap_support.replicate(tree, jax.local_devices()[:1])
     assert copies["a"].dtype == jnp.int8
     np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
     np.testing.assert_array_equal(copies["b"], [2.5])
@@ -710,7 +710,7 @@ def test_replicate_copies_arrays_numbers_and_keys():
 
 def test_replicate_asks_for_a_device():
     with pytest.raises(ValueError, match="at least one"):
-        brax_interop.replicate(jnp.zeros(2), [])
+        pmap_support.replicate(jnp.zeros(2), [])
 
 
 def test_replicate_puts_one_copy_on_each_device():
@@ -719,8 +719,8 @@ def test_replicate_puts_one_copy_on_each_device():
 import jax, numpy as np
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
-from bounce_mjx.adapters.brax import compatibility as brax_interop
-copies = brax_interop.replicate(np.arange(3.0), jax.devices())
+from bounce_mjx.adapters.brax import pmap_support
+copies = pmap_support.replicate(np.arange(3.0), jax.devices())
 assert copies.shape == (2, 3), copies.shape
 for i, shard in enumerate(sorted(copies.addressable_shards, key=lambda s: s.index[0].start)):
     assert shard.device == jax.devices()[i], shard

@@ -1,27 +1,30 @@
 """The five expected results: what is counted, how it is judged, and by which engine."""
 
+import functools
+import io
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import State
-from brax.training.networks import FeedForwardNetwork
+from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.results import (
-    Report,
-    Result,
-    Statistics,
-    accumulate,
-    empty_statistics,
-    judge,
-)
+from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
+from bounce_mjx.evaluation.results import Report, Result, judge
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
+from bounce_mjx.resources import resource_path
+from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.task.state import State
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
@@ -45,10 +48,23 @@ def states(rows) -> State:
         name: jnp.array([row.get(name, default) for row in rows], jnp.float32)
         for name, default in defaults.items()
     }
-    obs = jnp.zeros((29, len(rows)))
-    obs = obs.at[6].set(columns["x"]).at[7].set(columns["y"]).at[21].set(columns["vz"])
-    metrics = {name: columns[name] for name in ("bounced", "n_bounces", "apex_error")}
-    return State(None, obs, columns["reward"], columns["done"], metrics)
+    batch = jax.tree.map(lambda x: jnp.stack([x] * len(rows), axis=-1), resting_state())
+    physics = batch.pipeline_state.physics
+    physics = physics._replace(
+        qpos=physics.qpos.at[6].set(columns["x"]).at[7].set(columns["y"]),
+        qvel=physics.qvel.at[8].set(columns["vz"]),
+    )
+    return batch.replace(
+        pipeline_state=batch.pipeline_state._replace(physics=physics),
+        reward=columns["reward"],
+        done=columns["done"],
+        metrics={name: columns[name] for name in ("bounced", "n_bounces", "apex_error")},
+    )
+
+
+@functools.cache
+def resting_state() -> State:
+    return BounceBall().reset(jax.random.key(0))
 
 
 def count(env, steps, first_step=0) -> Statistics:
@@ -238,11 +254,44 @@ def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
     ],
 )
 def test_nothing_to_measure_fails(result, changes, env):
+    """It has no figure, as a number would be a good one for some quantities."""
     report = judge(env, statistics(**changes))
     assert report.results[result].passed is False
-    assert report.results[result].value == 0
+    assert report.results[result].value is None
     assert not report.passed
-    assert np.all(np.isfinite(list(report.details.values())))
+    apex_error = report.details["mean_apex_error_m"]
+    assert (apex_error is None) == (result == HEIGHT)
+    plain = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    assert plain["results"][result]["value"] is None
+    assert Report.from_dict(plain) == report
+
+
+def test_nothing_to_measure_is_shown_as_none(env):
+    """In the table, in Markdown, in the line of further figures and in the table of seeds."""
+    report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
+    rows = show(results_table(report, "exp[lr]")).splitlines()
+    assert "exp[lr]" in rows[0]
+    (row,) = [row for row in rows if " height " in row]
+    assert "none" in row and "FAIL" in row
+    (row,) = [row for row in results_markdown(report).splitlines() if "| height |" in row]
+    assert row.split(" | ")[2:] == ["none", ">= 95", "FAIL |"]
+    assert "|apex error| none, " in details_line(report)
+
+    good = judge(env, statistics())
+    rows = show(seeds_table({0: report, 1: good, 2: None})).splitlines()
+    cells = {row.split("│")[1].strip(): row for row in rows if row.count("│") == 10}
+    assert cells["0"].count("none") == 2
+    assert cells["1"].count("none") == 0
+    # The seeds that have a figure do not speak for the one that has none.
+    assert cells["mean"].count("none") == cells["std"].count("none") == 2
+    assert "1/3" in cells["mean"]
+
+
+def show(table) -> str:
+    """A table as rich prints it."""
+    console = Console(width=150, file=io.StringIO())
+    console.print(table)
+    return console.file.getvalue()
 
 
 def test_fresh_statistics_fail_without_a_crash(env):
@@ -308,7 +357,7 @@ def networks():
 def random_policy(networks):
     """A policy before any training."""
     params = networks.policy_network.init(jax.random.key(5))
-    return policy.Policy(policy.init_normalizer(29), params)
+    return policy.Policy(init_normalizer(29), params)
 
 
 def holding_policy(networks):
@@ -317,14 +366,14 @@ def holding_policy(networks):
     home = jnp.array(EnvConfig().default_joint_angles)
     tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
 
-    def apply(_, params, obs):
-        wanted = home + tilt * (obs[..., 28:] > 0.5)
-        mean = params["gain"] * (wanted - obs[..., :6])
-        return mean, jnp.ones_like(mean)
+    def apply(params, obs):
+        wanted = home + tilt * (obs[..., OBSERVATION["target_height"]] > 0.5)
+        mean = params["gain"] * (wanted - obs[..., OBSERVATION["joint_angles"]])
+        return Gaussian(mean, jnp.ones_like(mean))
 
-    network = FeedForwardNetwork(init=None, apply=apply)
-    holding = policy.Policy(policy.init_normalizer(29), {"gain": jnp.float32(50.0)})
-    return networks.replace(policy_network=network), holding
+    network = policy.Network(init=None, apply=apply)
+    holding = policy.Policy(init_normalizer(29), {"gain": jnp.float32(50.0)})
+    return networks._replace(policy_network=network), holding
 
 
 def test_evaluator_equals_a_python_loop(networks):
@@ -340,20 +389,21 @@ def test_evaluator_equals_a_python_loop(networks):
         state, sums = reset(episode_key), dict.fromkeys(Statistics._fields, 0.0)
         for t in range(260):
             state = step(state, act(state.obs))
+            physics = state.pipeline_state.physics
             sums["steps"] += 1
             sums["episode_return"] += float(state.reward)
             sums["max_bounces"] = max(sums["max_bounces"], float(state.metrics["n_bounces"]))
             if t >= 200:
                 sums["settled_steps"] += 1
-                sums["centred_steps"] += abs(state.obs[6] - TARGET_X) <= 0.05
+                sums["centred_steps"] += abs(physics.qpos[6] - TARGET_X) <= 0.05
                 if state.metrics["bounced"]:
                     error = float(state.metrics["apex_error"])
                     sums["settled_bounces"] += 1
                     sums["accurate_bounces"] += error <= 0.1
                     sums["apex_error"] += error
-            if state.obs[21] > 0:
+            if physics.qvel[8] > 0:
                 sums["rising_steps"] += 1
-                sums["rising_speed"] += float(state.obs[21])
+                sums["rising_speed"] += float(physics.qvel[8])
             if state.done:
                 break
         else:
@@ -414,3 +464,33 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
     # One step more or less is worth up to about 15.
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
+
+
+def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path):
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    mjcf = tmp_path / "one_iteration.xml"
+    mjcf.write_text(text.replace(' iterations="4"', ' iterations="1"'), encoding="utf-8")
+    env_config = EnvConfig(mjcf=mjcf, episode_seconds=0.05)
+    ppo_config = PPOConfig(hidden_layers=(16,))
+    evaluate = functools.partial(evaluate_policy, random_policy, env_config, ppo_config, episodes=2)
+    on_c = evaluate(physics="mujoco")
+    (warning,) = on_c.warnings
+    assert on_c.engine == "mujoco" and 'iterations="1"' in warning
+    assert evaluate().warnings == ()
+
+
+def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_path):
+    """Both as they are, with null for a missing figure in the file."""
+    report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
+    evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
+    monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: evaluation)
+    results = tmp_path / "results.json"
+    with pytest.raises(SystemExit) as exit_info:
+        eval_command.main([str(resource_path("pretrained")), "--json", str(results)])
+    assert exit_info.value.code == 1
+    shown = capsys.readouterr().out
+    assert "warning: the solver [CG] stops.\n" in shown
+    assert "|apex error| none" in shown
+    plain = json.loads(results.read_text(), parse_constant=pytest.fail)
+    assert plain["results"][HEIGHT]["value"] is None
+    assert plain["details"]["mean_apex_error_m"] is None

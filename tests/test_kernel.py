@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.physics import PhysicsState, fused, kernel
+from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
+from bounce_mjx.physics.fused import dynamics, kernel
+from test_parameters import random_parameters
 
 # No multiple of a block.
 BATCH = 70
 NUM_SUBSTEPS = 10
+MODEL = PhysicsParameters()
 # In the interpreter both are compiled from the same operations.
 ROUNDING = 1e-6
 
@@ -27,7 +30,7 @@ Step = Callable[[PhysicsState, jax.Array], PhysicsState]
 @pytest.fixture
 def in_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     """The fused physics of the test runs in the kernel."""
-    monkeypatch.setattr(fused, "elementwise", partial(kernel.elementwise, interpret=True))
+    monkeypatch.setattr(dynamics, "elementwise", partial(kernel.elementwise, interpret=True))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,9 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     keys = jax.random.split(jax.random.PRNGKey(0), batch)
     physics = jax.vmap(env.reset, out_axes=-1)(keys).pipeline_state.physics
     at = env._addresses
-    paddle = jax.vmap(env.engine.paddle_position, in_axes=-1, out_axes=-1)(physics.qpos)
+    paddle = jax.vmap(partial(env.engine.paddle_position, MODEL), in_axes=-1, out_axes=-1)(
+        physics.qpos
+    )
     height = jnp.where(jnp.arange(batch) % 2 == 0, paddle[2] + 0.02, physics.qpos[at.ball_qpos[2]])
     qpos = physics.qpos.at[jnp.array(at.ball_qpos[:2])].set(paddle[:2])
     qpos = qpos.at[at.ball_qpos[2]].set(height)
@@ -48,12 +53,26 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     return PhysicsState(qpos, qvel), qpos[jnp.array(at.arm_qpos)] + 0.05
 
 
-def step(env: BounceBall, physics: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-    return fused.step(fused.read_model(env.mj_model), physics, ctrl, NUM_SUBSTEPS)
+def step(
+    env: BounceBall, physics: PhysicsState, ctrl: jax.Array, parameters: PhysicsParameters = MODEL
+) -> PhysicsState:
+    return fused.step(fused.read_model(env.mj_model), parameters, physics, ctrl, NUM_SUBSTEPS)
 
 
 def batched(env: BounceBall) -> Step:
     return jax.vmap(partial(step, env), in_axes=-1, out_axes=-1)
+
+
+def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
+    """Every number of the world given, the batch last, but for a gravity that all share."""
+    drawn = random_parameters(env.mj_model, batch, seed=0)
+    drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
+    return drawn._replace(gravity=jnp.array([0.5, -0.5, -9.0]))
+
+
+def in_worlds(env: BounceBall) -> Callable[..., PhysicsState]:
+    axes = PhysicsParameters(*(-1 for _ in MODEL))._replace(gravity=None)
+    return jax.vmap(partial(step, env), in_axes=(-1, -1, axes), out_axes=-1)
 
 
 def assert_equal(ours: PhysicsState, theirs: PhysicsState) -> None:
@@ -77,16 +96,28 @@ def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
 def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     """Tracing it takes some tenths of a second, and a training has several programs."""
     traced = []
-    substep = fused.substep
-    monkeypatch.setattr(fused, "substep", lambda *args: traced.append(1) or substep(*args))
-    fused._substeps.cache_clear()
+    substep = dynamics.substep
+    monkeypatch.setattr(dynamics, "substep", lambda *args: traced.append(1) or substep(*args))
+    dynamics._substeps.cache_clear()
     jax.make_jaxpr(batched(env))(*moving(env, 3))
     assert traced
     traced.clear()
     jax.make_jaxpr(batched(env))(*moving(env, 4))
     assert not traced
     # What was traced here calls the list above.
-    fused._substeps.cache_clear()
+    dynamics._substeps.cache_clear()
+
+
+def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
+    """More inputs than the coordinates and targets: all the world's numbers, of each
+    environment."""
+    args = (*moving(env, BATCH), random_worlds(env, BATCH))
+    program = jax.jit(in_worlds(env)).trace(*args)
+    assert "pallas_call" in str(program.jaxpr)
+    after = program.lower().compile()(*args)
+    monkeypatch.setattr(dynamics, "elementwise", kernel.elementwise)
+    assert_equal(after, jax.jit(in_worlds(env))(*args))
+    assert np.all(np.abs(after.qvel - by_xla.qvel).max(axis=0) > 1e-3)
 
 
 def test_several_batches_and_shared_targets(env, in_kernel):
@@ -109,10 +140,10 @@ import functools, re
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx import BounceBall
-from bounce_mjx.physics import fused, kernel
+from bounce_mjx.physics.fused import dynamics, kernel
 from test_kernel import assert_equal, batched, moving
 
-fused.elementwise = functools.partial(kernel.elementwise, interpret=True)
+dynamics.elementwise = functools.partial(kernel.elementwise, interpret=True)
 env = BounceBall()
 args = moving(env, 16 * 8)
 alone = jax.jit(batched(env))(*args)
@@ -163,6 +194,13 @@ def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert len(re.findall(r"custom_call @__gpu\$xla.gpu.triton|triton_kernel_call", on_gpu)) == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
+
+
+def test_the_kernel_with_parameters_is_lowered_for_a_gpu(env, monkeypatch):
+    monkeypatch.setattr(kernel, "has_kernels", lambda: True)
+    traced = jax.jit(in_worlds(env)).trace(*moving(env, BATCH), random_worlds(env, BATCH))
+    on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert len(re.findall(r"custom_call @__gpu\$xla.gpu.triton|triton_kernel_call", on_gpu)) == 1
 
 
 def test_there_is_no_kernel_here(monkeypatch):

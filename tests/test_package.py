@@ -89,7 +89,9 @@ print(*bounce_mjx.__all__)
 
 def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
     script = """
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.commands.train import read_command
 import jax
@@ -107,10 +109,7 @@ def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
 import jax
 from rich.console import Console
 from bounce_mjx import BounceBall
-from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.learning.policy import act, make_networks
-from bounce_mjx.runs.choice import choose_checkpoint
-from bounce_mjx.runs.folder import load_policy, load_run_config
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import PhysicsState, chain, fused, make_engine, mjx_engine, scalars
+from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused, make_engine, mjx_engine
+from bounce_mjx.physics.fused import chain, scalars
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import Addresses, find_addresses, load_model
 from bounce_mjx.task.config import EnvConfig
@@ -21,6 +22,7 @@ HALF_SIZE = np.array([0.05, 0.065, 0.0035])
 RADIUS = 0.019
 DT = 1e-3
 BATCH = 32
+MODEL = PhysicsParameters()
 XML = Path(resource_path("mjcf/bounce_ball.xml")).read_text()
 # Largest difference of one step, as a part of the largest speed in the batch: room for the rounding
 # of some thousand operations. (The worst is the ball's spin: MuJoCo's contact turns the ball by the
@@ -62,14 +64,14 @@ def batched(step):
     """(state, ctrl, number of steps) -> state, compiled over a leading batch axis."""
 
     def steps(state: PhysicsState, ctrl: np.ndarray, num_substeps: int) -> PhysicsState:
-        return jax.vmap(lambda s, u: step(s, u, num_substeps))(state, ctrl)
+        return jax.vmap(lambda s, u: step(MODEL, s, u, num_substeps))(state, ctrl)
 
     return jax.jit(steps, static_argnums=2)
 
 
 def uncompiled_step(mj_model: mujoco.MjModel, states: States) -> PhysicsState:
     """One fused step from each state, operation by operation: no time goes into compiling."""
-    step = partial(fused.step, fused.read_model(mj_model), num_substeps=1)
+    step = partial(fused.step, fused.read_model(mj_model), MODEL, num_substeps=1)
     with jax.disable_jit():
         return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), jnp.asarray(states.ctrl))
 
@@ -176,7 +178,7 @@ class CEngine:
     def __init__(self, mj_model: mujoco.MjModel, start: PhysicsState):
         self.model = mj_model
         self.data = [mujoco.MjData(mj_model) for _ in start.qpos]
-        for data, qpos, qvel in zip(self.data, *start, strict=True):
+        for data, qpos, qvel in zip(self.data, *start[:2], strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel
 
     def step(self, ctrl: np.ndarray, num_substeps: int) -> int:
@@ -199,7 +201,9 @@ class CEngine:
 
 def difference(a: PhysicsState, b: PhysicsState) -> tuple[float, float]:
     """Largest differences of qpos and of qvel."""
-    return tuple(float(np.max(np.abs(np.asarray(x) - y))) for x, y in zip(a, b, strict=True))
+    return tuple(
+        float(np.max(np.abs(np.asarray(x) - y))) for x, y in zip(a[:2], b[:2], strict=True)
+    )
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
@@ -241,8 +245,8 @@ def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, record_prope
     for i in range(2000):
         if i % 10 == 0:
             action = rng.uniform(-0.03, 0.03, (BATCH, 6))
-            state = PhysicsState(*(np.array(x) for x in state))
-            for data, qpos, qvel in zip(reference.data, *state, strict=True):
+            state = PhysicsState(*(np.array(x) for x in state[:2]))
+            for data, qpos, qvel in zip(reference.data, *state[:2], strict=True):
                 if data.qpos[8] < paddle_frame(mj_model, data.qpos[:6])[0][2] - 0.1:
                     drop_ball(mj_model, data.qpos, data.qvel, rng)
                     qpos[6:9], qvel[6:] = data.qpos[6:9], data.qvel[6:]
@@ -278,16 +282,16 @@ def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):
     rng = np.random.default_rng(0)
     state = bouncing_states(mj_model, rng)
     few = 4
-    mjx_state = PhysicsState(*(x[:few] for x in state))
+    mjx_state = PhysicsState(*(x[:few] for x in state[:2]))
     contacts, error = 0, 0.0
     for i in range(200):
         if i % 10 == 0:
             ctrl = np.asarray(state.qpos[:, :6]) + rng.uniform(-0.03, 0.03, (BATCH, 6))
-        here = PhysicsState(*(np.asarray(x[:few]) for x in state))
-        contacts += np.sum(c_step(mj_model, States(*here, ctrl[:few]))[1])
+        here = PhysicsState(*(np.asarray(x[:few]) for x in state[:2]))
+        contacts += np.sum(c_step(mj_model, States(*here[:2], ctrl[:few]))[1])
         state = fused_step(state, ctrl, 1)
         mjx_state = mjx_step(mjx_state, ctrl[:few], 1)
-        error = max(error, *difference(PhysicsState(*(x[:few] for x in state)), mjx_state))
+        error = max(error, *difference(PhysicsState(*(x[:few] for x in state[:2])), mjx_state))
     record_property("largest_difference", error)
     print(f"200 steps x {few} against MJX: {contacts} contact steps, difference {error:.1e}")
     assert contacts >= 20
@@ -300,8 +304,8 @@ def test_mjx_multiplies_in_full_precision(mj_model):
     state = PhysicsState(jnp.array(mj_model.qpos0), jnp.zeros(mj_model.nv))
 
     def step_and_look(state, ctrl):
-        state = mjx_engine.step(constants, state, ctrl)
-        return state, mjx_engine.paddle_position(constants, state.qpos)
+        state = mjx_engine.step(constants, MODEL, state, ctrl)
+        return state, mjx_engine.paddle_position(constants, MODEL, state.qpos)
 
     program = jax.jit(step_and_look).lower(state, jnp.zeros(mj_model.nu)).as_text()
     products = [line for line in program.splitlines() if "dot_general" in line]
@@ -317,7 +321,7 @@ def test_float32_drift(mj_model, fused_step, record_property, ball):
     if ball == "falling":
         start.qpos[:, 6] += 1.0
     reference = CEngine(mj_model, start)
-    state = PhysicsState(*(x.astype(np.float32) for x in start))
+    state = PhysicsState(*(x.astype(np.float32) for x in start[:2]))
     contacts = 0
     for second in (1, 2):
         for _ in range(100):
@@ -414,6 +418,13 @@ UNSUPPORTED = {
     "Euler": ('integrator="implicitfast"', 'integrator="Euler"', "integrator mjINT_EULER"),
     "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator mjINT_RK4"),
     "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator mjINT_IMPLICIT"),
+    "discrete": ('integrator="implicitfast"', 'integrator="discrete"', "mjINT_DISCRETE"),
+    "flex": (
+        "</worldbody>",
+        '</worldbody><deformable><flex name="f" dim="1" body="Link5 Link6" element="0 1"/>'
+        "</deformable>",
+        "flex",
+    ),
     "density": ("<option ", '<option density="1.2" ', "density"),
     "viscosity": ("<option ", '<option viscosity="1e-5" ', "viscosity"),
     "wind": ("<option ", '<option wind="1 0 0" ', "wind"),
@@ -497,29 +508,65 @@ UNSUPPORTED = {
 }
 
 
+# Features that MJX ignores or refuses too.
+UNSUPPORTED_BY_BOTH = (
+    *("implicit", "discrete", "density", "viscosity", "wind", "actuator group"),
+    *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solimp width", "flex"),
+    *("stiffness polynomial", "damping polynomial", "ellipsoid ball"),
+    *("actuator delay", "actuator damping", "actuator armature"),
+)
+
+
 @pytest.mark.parametrize("name", UNSUPPORTED)
 def test_unsupported_models_are_refused(name):
-    """The error names the feature and what to do; the engine's user sees it."""
+    """The error names the feature and what to do; no engine advises another that lacks it too."""
     old, new, feature = UNSUPPORTED[name]
     model = edited(old, new)
     with pytest.raises(fused.UnsupportedModelError) as refusal:
         fused.read_model(model)
-    text = str(refusal.value)
-    assert text.startswith("the fused physics does not support ")
-    assert feature in text
-    assert text.endswith("; use --physics mjx")
+    assert feature in str(refusal.value)
     with pytest.raises(UserError) as error:
         make_engine(model, "fused")
-    assert str(error.value) == text
+    text = str(error.value)
+    assert feature in text
+    if name in UNSUPPORTED_BY_BOTH:
+        assert text.endswith("; change the MJCF")
+        for choice in ("auto", "mjx"):
+            with pytest.raises(UserError, match="; change the MJCF$"):
+                make_engine(model, choice)
+    else:
+        assert text == f"the fused physics does not support {refusal.value}; use --physics mjx"
 
 
-@pytest.mark.parametrize("name", ["Euler", "stiffness"])
+@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 3"])
 def test_auto_takes_mjx_for_unsupported_models(name):
-    """And says why."""
+    """And says why, in a whole sentence."""
     old, new, feature = UNSUPPORTED[name]
     engine = make_engine(edited(old, new), "auto")
     assert engine.name == "mjx"
     assert feature in engine.reason
+    assert engine.reason.count("(") == engine.reason.count(")")
+
+
+MJX_ONLY = {
+    # Features that MJX ignores, in models that the fused engine refuses for another reason or not.
+    "early activations": (
+        '<position name="act2" joint="Joint2"/>',
+        '<general name="act2" joint="Joint2" dyntype="filterexact" dynprm="0.1" gainprm="9" '
+        'biastype="affine" biasprm="0 -9 0" actearly="true"/>',
+        "actearly",
+    ),
+    "noslip": ("<option ", '<option noslip_iterations="3" ', "noslip_iterations"),
+    "surface velocity": ("<geom contype", '<geom surfacevel="1 0 0 0 0 0" contype', "surfacevel"),
+}
+
+
+@pytest.mark.parametrize("name", MJX_ONLY)
+def test_mjx_refuses_features_that_it_ignores(name):
+    """By name."""
+    old, new, feature = MJX_ONLY[name]
+    with pytest.raises(UserError, match=feature):
+        make_engine(edited(old, new), "mjx")
 
 
 def test_auto_takes_fused_for_the_shipped_model(mj_model):
@@ -539,7 +586,7 @@ def test_restitution(mj_model, fused_step, record_property, speed):
     state.qpos[:, 6], state.qpos[:, 9] = 2.0, 1.0
     for _ in range(50):  # the servos settle
         state = fused_step(state, ctrl, 10)
-    state = PhysicsState(*(np.array(x) for x in state))
+    state = PhysicsState(*(np.array(x) for x in state[:2]))
     centre, axes = paddle_frame(mj_model, state.qpos[0, :6])
     normal = axes[:, 2]
     fall = 5e-4 + np.arange(BATCH) / BATCH * speed * DT
@@ -580,7 +627,7 @@ def test_restitution(mj_model, fused_step, record_property, speed):
 def test_the_home_pose_holds_the_paddle_level(mj_model):
     """SPEC's home position, by the engine's own kinematics."""
     model = fused.read_model(mj_model)
-    position = fused.paddle_position(model, jnp.concatenate([HOME, jnp.zeros(7)]))
+    position = fused.paddle_position(model, MODEL, jnp.concatenate([HOME, jnp.zeros(7)]))
     np.testing.assert_allclose(position, [0.59356, 0.0, 0.04980], atol=1e-4)
     pose = chain.forward_kinematics(model.links, jnp.asarray(HOME))
     last = np.array(pose.world_rotation[-1])
@@ -616,7 +663,7 @@ def arm(mj_model, float64) -> Arm:
 def test_paddle_position_is_mujocos(mj_model, arm):
     """At random joint angles."""
     qpos = jnp.asarray([d.qpos for d in arm.data])
-    position = jax.vmap(partial(fused.paddle_position, fused.read_model(mj_model)))(qpos)
+    position = jax.vmap(partial(fused.paddle_position, fused.read_model(mj_model), MODEL))(qpos)
     expected = [d.geom("blocker").xpos for d in arm.data]
     np.testing.assert_allclose(position, expected, atol=1e-13)
 

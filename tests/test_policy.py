@@ -1,54 +1,150 @@
-"""What the policy sees of an observation."""
+"""Networks, distribution and normalisation: against brax's own implementations, and by claim."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training.acme import running_statistics
+from brax.training.agents.ppo.networks import make_ppo_networks
+from brax.training.distribution import NormalDistribution
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, act, init_normalizer, make_networks, normalize
+from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.statistics import (
+    MAX_NORMALIZED,
+    MIN_VARIANCE,
+    init_normalizer,
+    init_statistics,
+    normalize,
+    update,
+)
+from bounce_mjx.task.observation import OBSERVATION
 
-CONSTANT = slice(9, 13)
+CONSTANT = OBSERVATION["ball_quaternion"]
+N = OBSERVATION.size
 
 
 @pytest.fixture(scope="module")
 def seen() -> np.ndarray:
     """Observations [5000, 29] of a training in which the ball's quaternion never changed."""
     rng = np.random.default_rng(0)
-    scale = rng.uniform(0.01, 2.0, 29)
-    observations = rng.normal(rng.uniform(-1.0, 1.0, 29), scale, (5000, 29))
+    scale = rng.uniform(0.01, 2.0, N)
+    observations = rng.normal(rng.uniform(-1.0, 1.0, N), scale, (5000, N))
     observations[:, CONSTANT] = [1.0, 0.0, 0.0, 0.0]
     return observations.astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def normalizer(seen):
-    return running_statistics.update(init_normalizer(29), jnp.asarray(seen))
+    return update(init_statistics(N), jnp.asarray(seen)).normalizer
+
+
+# Normalisation
 
 
 def test_varying_observations_are_standardized(seen, normalizer):
     exact = seen.astype(np.float64)
     expected = (exact - exact.mean(0)) / np.sqrt(exact.var(0) + 1e-6)
-    varying = np.delete(np.arange(29), CONSTANT)
+    varying = np.delete(np.arange(N), CONSTANT)
     actual = normalize(jnp.asarray(seen), normalizer)
     np.testing.assert_allclose(actual[:, varying], expected[:, varying], rtol=2e-3, atol=2e-3)
 
 
 def test_far_observations_are_clipped(normalizer):
-    far = normalize(jnp.full(29, 1e6), normalizer)
+    far = normalize(jnp.full(N, 1e6), normalizer)
     np.testing.assert_array_equal(np.delete(far, CONSTANT), 10.0)
 
 
 def test_before_any_data_observations_pass_as_they_are():
-    observation = jnp.linspace(-3.0, 3.0, 29)
-    np.testing.assert_array_equal(normalize(observation, init_normalizer(29)), observation)
+    observation = jnp.linspace(-3.0, 3.0, N)
+    for normalizer in (init_normalizer(N), init_statistics(N).normalizer):
+        np.testing.assert_array_equal(normalize(observation, normalizer), observation)
+
+
+def test_statistics_follow_braxs(seen):
+    """Over batches of [T, B, N], as the trainer adds them: the same update and normalisation."""
+    ours = init_statistics(N)
+    theirs = running_statistics.init_state(
+        jax.ShapeDtypeStruct((N,), jnp.float32), std_eps=MIN_VARIANCE
+    )
+    for batch in np.split(seen[:4800].reshape(60, 80, N), [20, 25]):
+        batch = jnp.asarray(batch)
+        ours, theirs = update(ours, batch), running_statistics.update(theirs, batch)
+        np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(ours.std, theirs.std, rtol=1e-6)
+        np.testing.assert_allclose(ours.summed_variance, theirs.summed_variance, rtol=1e-6)
+        expected = running_statistics.normalize(batch, theirs, max_abs_value=MAX_NORMALIZED)
+        expected = expected.at[..., CONSTANT].set(0.0)
+        np.testing.assert_allclose(
+            normalize(batch, ours.normalizer), expected, rtol=1e-5, atol=1e-5
+        )
+    assert int(ours.count) == int(theirs.count) == 4800
+
+
+# Networks
+
+
+@pytest.fixture(scope="module")
+def config() -> PPOConfig:
+    return PPOConfig(hidden_layers=(16, 12), critic_metrics=("n_bounces", "bounced"))
+
+
+@pytest.fixture(scope="module")
+def brax_networks(config):
+    """The same networks by brax."""
+    orthogonal = jax.nn.initializers.orthogonal
+    return make_ppo_networks(
+        {"state": (N,), "critic": (N + 2,)},
+        6,
+        policy_obs_key="state",
+        value_obs_key="critic",
+        policy_hidden_layer_sizes=config.hidden_layers,
+        value_hidden_layer_sizes=config.hidden_layers,
+        activation=jax.nn.silu,
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=config.init_noise_std,
+        policy_network_kernel_init_fn=orthogonal,
+        policy_network_kernel_init_kwargs={"scale": 2**0.5},
+        value_network_kernel_init_fn=orthogonal,
+        value_network_kernel_init_kwargs={"scale": 2**0.5},
+        mean_kernel_init_fn=orthogonal,
+        mean_kernel_init_kwargs={"scale": 0.01},
+    )
+
+
+@pytest.mark.parametrize("which", ["policy_network", "value_network"])
+def test_networks_are_braxs(which, config, brax_networks, seen):
+    """The same parameters, by name and value, from the same key; and the same outputs."""
+    ours, theirs = getattr(make_networks(config, N, 6), which), getattr(brax_networks, which)
+    key = jax.random.PRNGKey(3)
+    params, expected = ours.init(key), theirs.init(key)
+    assert jax.tree.structure(params) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, params, expected)
+    # Other parameters than the first ones, of which the biases are 0.
+    params = jax.tree.map(lambda x: x + 0.1, params)
+    inputs = seen[:50] if which == "policy_network" else np.tile(seen[:50, :1], N + 2)
+    outputs = (ours.apply(params, inputs), theirs.apply(None, params, inputs))
+    for a, b in zip(*map(jax.tree.leaves, outputs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_gaussian_is_braxs(seen):
+    rng = np.random.default_rng(1)
+    mean, std = rng.normal(size=(50, 6)), np.exp(rng.normal(size=(50, 6)))
+    ours, theirs = Gaussian(mean, std), NormalDistribution(6)
+    value = mean + 3.0 * std * rng.normal(size=(50, 6))
+    expected = theirs.log_prob((mean, std), jnp.asarray(value))
+    np.testing.assert_allclose(ours.log_prob(value), expected, rtol=1e-4)
+    expected = theirs.entropy((mean, std), jax.random.PRNGKey(0))
+    np.testing.assert_allclose(ours.entropy(), expected, rtol=1e-4)
 
 
 def test_drift_of_what_never_varied_does_not_move_the_policy(seen, normalizer):
     """As the ball's orientation drifts by rounding in MJX: policies that bounced elsewhere failed
     there before."""
-    networks = make_networks(PPOConfig(hidden_layers=(16,)), 29, 6)
+    networks = make_networks(PPOConfig(hidden_layers=(16,)), N, 6)
     params = networks.policy_network.init(jax.random.PRNGKey(0))
     policy = Policy(normalizer, params)
     observation = jnp.asarray(seen[0])

@@ -4,14 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import Env, State
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import results as evaluation
 from bounce_mjx.learning import policy, ppo
+from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.task import vector
+from bounce_mjx.task.state import State
 
 
 def all_finite(tree) -> bool:
@@ -65,7 +67,7 @@ def random_rollout(seed=0, steps=30, envs=40):
 @pytest.mark.parametrize(("discount", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.9, 1.0), (1.0, 1.0)])
 def test_advantages_equal_their_definition(discount, lam):
     rollout = random_rollout()
-    actual = ppo.generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
+    actual = generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
     expected = advantages_by_definition(*rollout.values(), discount, lam)
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
 
@@ -86,7 +88,7 @@ def test_advantages_equal_their_definition(discount, lam):
 )
 def test_advantages_by_hand(terminated_at, truncated_at, expected):
     steps = np.arange(4)
-    actual = ppo.generalized_advantages(
+    actual = generalized_advantages(
         reward=jnp.array([[1.0], [2.0], [3.0], [4.0]]),
         value=jnp.ones((4, 1)),
         next_value=jnp.array([[1.0], [10.0], [1.0], [2.0]]),
@@ -107,7 +109,7 @@ def test_nothing_flows_back_over_an_end(end):
     for name in ("reward", "value", "next_value"):
         later[name][11:] += 5.0
     first, second = (
-        np.asarray(ppo.generalized_advantages(**r, discount=0.99, gae_lambda=0.95))
+        np.asarray(generalized_advantages(**r, discount=0.99, gae_lambda=0.95))
         for r in (rollout, later)
     )
     np.testing.assert_array_equal(first[:11], second[:11])
@@ -118,7 +120,7 @@ def test_only_a_time_out_uses_the_value_that_follows():
     rollout = random_rollout(seed=2)
     changed = rollout | {"next_value": rollout["next_value"] + 1.0}
     first, second = (
-        np.asarray(ppo.generalized_advantages(**r, discount=0.5, gae_lambda=0.0))
+        np.asarray(generalized_advantages(**r, discount=0.5, gae_lambda=0.0))
         for r in (rollout, changed)
     )
     expected = np.where(rollout["terminated"], 0.0, 0.5)
@@ -179,7 +181,7 @@ def test_learning_rate_is_fixed_without_a_target(rate_config):
 # Bootstrapping, end to end
 
 
-class TwoStates(Env):
+class TwoStates:
     """An episode starts in the first state; every step leads to the second one."""
 
     observation_size = 2
@@ -238,7 +240,7 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
     networks = policy.make_networks(config, env.observation_size, env.action_size)
     seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]) if env.hidden else jnp.eye(2)
     values = networks.value_network.apply(
-        None, state.params.value, policy.normalize(seen, state.normalizer)
+        state.params.value, normalize(seen, state.statistics.normalizer)
     )
     np.testing.assert_allclose(values, expected, atol=0.03)
     np.testing.assert_allclose(metrics["episode/return"][-1], 1.0 + env.first_reward, rtol=1e-6)
@@ -257,7 +259,7 @@ def test_update_learns_on_what_the_next_rollout_will_see():
     networks = policy.make_networks(config, 2, 1)
     (old, deviation), (new, _) = (
         networks.policy_network.apply(
-            None, before.params.policy, policy.normalize(jnp.eye(2), state.normalizer)
+            before.params.policy, normalize(jnp.eye(2), state.statistics.normalizer)
         )
         for state in (before, after)
     )
@@ -339,7 +341,7 @@ def test_training_changes_every_parameter(init, after_two):
     for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
         assert np.any(np.asarray(a) != np.asarray(b))
     assert np.any(jax.random.key_data(before.key) != jax.random.key_data(after.key))
-    assert all_finite((after.params, after.optimizer, after.normalizer))
+    assert all_finite((after.params, after.optimizer, after.statistics))
 
 
 def test_counters(tiny, init, after_two):
@@ -349,17 +351,17 @@ def test_counters(tiny, init, after_two):
     assert all(value.shape == (2,) for value in metrics.values())
     samples = 2 * tiny.num_envs * tiny.rollout_length
     # The normaliser counts the observations that it has seen.
-    assert int(state.normalizer.count) == samples
+    assert int(state.statistics.count) == samples
     np.testing.assert_array_equal(metrics["task/non_finite"], 0)
 
 
 def test_policy_sees_only_the_observation(tiny, after_two):
     state, _ = after_two
-    assert state.normalizer.mean.shape == (29 + len(tiny.critic_metrics),)
+    assert state.statistics.mean.shape == (29 + len(tiny.critic_metrics),)
     acting = ppo.policy_of(state)
-    np.testing.assert_array_equal(acting.normalizer.mean, state.normalizer.mean[:29])
+    np.testing.assert_array_equal(acting.normalizer.mean, state.statistics.mean[:29])
     networks = policy.make_networks(tiny, 29, 6)
-    observation = state.normalizer.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
+    observation = state.statistics.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
     actions = policy.act(networks, acting, observation)
     assert actions.shape == (3, 6)
     assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
@@ -446,9 +448,9 @@ class FaultyBall(BounceBall):
         super().__init__()
         healthy = self.engine.step
 
-        def step(state, ctrl, num_substeps):
+        def step(parameters, state, ctrl, num_substeps):
             fails = (state.qpos[0] > 0.0) & (state.qvel[8] < -0.05)
-            after = healthy(state, ctrl, num_substeps)
+            after = healthy(parameters, state, ctrl, num_substeps)
             return after._replace(qpos=jnp.where(fails, jnp.nan, after.qpos))
 
         self.engine = self.engine._replace(step=step)

@@ -11,12 +11,12 @@ from rich.console import Console
 from bounce_mjx.commands import ship as ship_command
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.choice import choose_checkpoint, pretrained_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_config
-from bounce_mjx.runs.folder import best_checkpoint, load_policy, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128
@@ -36,7 +36,7 @@ def measured() -> Report:
     config = load_run_config(checkpoint.run)
     return evaluate_policy(
         load_policy(checkpoint, config), config.env, config.ppo, episodes=EPISODES
-    )[0]
+    ).report
 
 
 @pytest.fixture
@@ -101,7 +101,8 @@ def measure(monkeypatch, measured: Report):
     """A function (report) that makes `ship` measure that report."""
 
     def replace(report: Report) -> None:
-        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_: (report, "fused"))
+        evaluation = Evaluation(report, "fused", ())
+        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_: evaluation)
 
     replace(measured)
     return replace

@@ -9,8 +9,12 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, act, init_normalizer, make_networks
+from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.task.env import TaskState
+from bounce_mjx.task.observation import OBSERVATION, Kinematics
 
 EPISODES, RECORDED = 6, 4
 
@@ -61,10 +65,18 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
     steps = int(statistics.steps.max())
     np.testing.assert_array_equal(recording.running[:steps], running[:steps])
     assert not recording.running[steps:].any()
-    up_to_end = np.broadcast_to(running[:, None], recording.observation.shape)
-    np.testing.assert_allclose(
-        recording.observation[up_to_end], stepped.obs[up_to_end], rtol=1e-3, atol=1e-3
-    )
+    parts = {
+        "joint_angles": recording.joint_angles,
+        "ball_position": recording.ball,
+        "paddle_position": recording.paddle,
+        "target_height": recording.target_height[:, None],
+    }
+    for name, recorded in parts.items():
+        expected = stepped.obs[:, OBSERVATION[name]]
+        up_to_end = np.broadcast_to(running[:, None], expected.shape)
+        np.testing.assert_allclose(
+            recorded[up_to_end], expected[up_to_end], rtol=1e-3, atol=1e-3, err_msg=name
+        )
     bounces = (stepped.metrics["bounced"] > 0) & running
     assert bounces.sum() >= RECORDED
     np.testing.assert_array_equal(settled_bounces(recording, 0), bounces)
@@ -82,7 +94,10 @@ def test_apex_errors_are_those_of_the_environment(evaluated, stepped) -> None:
 def made_up(steps: int, episodes: int) -> Recording:
     """A recording of nothing, in which a test writes."""
     return Recording(
-        observation=np.zeros((steps, 29, episodes), np.float32),
+        joint_angles=np.zeros((steps, 6, episodes), np.float32),
+        ball=np.zeros((steps, 3, episodes), np.float32),
+        paddle=np.zeros((steps, 3, episodes), np.float32),
+        target_height=np.zeros((steps, episodes), np.float32),
         bounced=np.zeros((steps, episodes), bool),
         apex=np.zeros((steps, episodes), np.float32),
         running=np.ones((steps, episodes), bool),
@@ -101,7 +116,7 @@ def test_settled_bounces_are_late_and_before_the_end() -> None:
 
 def test_apex_errors_have_a_sign() -> None:
     recording = made_up(4, 1)
-    recording.observation[:, 28] = 0.5
+    recording.target_height[:] = 0.5
     recording.apex[:, 0] = (0.3, 0.62, 0.1, 0.45)
     bounces = np.array([[False], [True], [True], [False]])
     np.testing.assert_allclose(apex_errors(recording, bounces), [-0.2, 0.12], atol=1e-6)
@@ -118,8 +133,9 @@ def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
         mujoco.mj_forward(env.mj_model, data)
         paddle = data.geom("blocker")
         local = [*points[step, episode], 0.0225]
-        recording.observation[step, :6, episode] = data.qpos[:6]
-        recording.observation[step, 6:9, episode] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+        recording.joint_angles[step, :, episode] = data.qpos[:6]
+        recording.paddle[step, :, episode] = paddle.xpos
+        recording.ball[step, :, episode] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
     bounces = rng.random((5, 3)) < 0.5
     assert 0 < bounces.sum() < bounces.size
     np.testing.assert_allclose(hit_points(env, recording, bounces), points[bounces], atol=1e-6)
@@ -133,5 +149,36 @@ def test_only_so_many_episodes_are_recorded(env: BounceBall, networks) -> None:
     for recorded, kept in ((2, 2), (9, EPISODES)):
         evaluate = make_recording_evaluator(env, networks, EPISODES, recorded)
         _, recording = jax.eval_shape(evaluate, policy, jax.random.PRNGKey(0))
-        assert recording.observation.shape == (150, 29, kept)
+        assert recording.ball.shape == (150, 3, kept)
         assert recording.running.dtype == jnp.bool
+
+
+class NoisyBall(BounceBall):
+    """Its sensors see nothing but noise."""
+
+    def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
+        return jnp.sin(1e4 * super().observe(kinematics, task))
+
+
+def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
+    """The results and the recording are of the true state, under a policy that is blind to it."""
+    layers = policy.params["params"] | {
+        "Dense_0": {"kernel": jnp.zeros((8, 6)), "bias": jnp.array([0, 0.3, -0.4, 0, 0.1, 0.2])}
+    }
+    blind = policy._replace(params={"params": layers})
+    (statistics, recording), (noisy, of_noisy) = (
+        make_recording_evaluator(ball, networks, EPISODES, RECORDED)(blind, jax.random.PRNGKey(2))
+        for ball in (env, NoisyBall(env.config))
+    )
+    assert statistics.rising_steps.sum() > 0 and recording.bounced.any()
+    for name in Statistics._fields:
+        np.testing.assert_allclose(
+            getattr(noisy, name), getattr(statistics, name), rtol=1e-3, err_msg=name
+        )
+    running = recording.running
+    np.testing.assert_array_equal(of_noisy.running, running)
+    for name in ("ball", "paddle", "joint_angles"):
+        kept, seen = (
+            np.moveaxis(np.asarray(getattr(r, name)), 1, 2)[running] for r in (recording, of_noisy)
+        )
+        np.testing.assert_allclose(seen, kept, atol=1e-3, err_msg=name)

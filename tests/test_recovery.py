@@ -30,15 +30,11 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.ppo import CHECKED, first_fault
-from bounce_mjx.runs import checkpoint as checkpoints
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    RESUMABLE_KEYS,
-    CheckpointWriter,
-    best_checkpoint,
-    latest_checkpoint,
-    load_run_config,
-)
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.files import seal
+from bounce_mjx.runs.folders import best_checkpoint, latest_checkpoint
+from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_record
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.signals import StopRequest
@@ -127,10 +123,10 @@ def test_checkpoint_holds_all_that_training_goes_on_from(straight: Path) -> None
     ):
         assert any(name.startswith(group) for name in names), group
     assert {"key", "iteration", "learning_rate"} <= names
-    record = checkpoints.read_record(checkpoint.folder)
-    assert record["steps"] == STEPS
-    assert record["config"] == load_run_config(straight).model_dump(mode="json")
-    assert record["progress"]["evaluations"] == evaluations(straight)
+    record = read_record(checkpoint)
+    assert record.steps == STEPS
+    assert record.config == load_run_config(straight).model_dump(mode="json")
+    assert record.progress["evaluations"] == evaluations(straight)
 
 
 def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
@@ -175,7 +171,7 @@ def test_lost_evaluation_is_made_up_for(tmp_path: Path, straight: Path) -> None:
         record = json.loads(path.read_text())
         record["progress"] |= {"best": None, "best_steps": 0, "evaluations": []}
         path.write_text(json.dumps(record))
-        checkpoints.seal(path.parent)
+        seal(path.parent)
     shutil.rmtree(run / "checkpoints/best")
     resume(run, "--total-steps", str(STEPS), "--eval-every", str(STEPS // 2))
     assert_same_training(run, straight)
@@ -261,14 +257,14 @@ def test_signal_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
     assert "evaluation at" not in training.said
     (run,) = (tmp_path / "runs").iterdir()
     assert latest_checkpoint(run).steps == 128
-    assert checkpoints.read_record(latest_checkpoint(run).folder)["progress"]["evaluations"] == []
+    assert read_record(latest_checkpoint(run)).progress["evaluations"] == []
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.8], ids=["told twice", "second Ctrl-C"])
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
         "import time\n"
-        "from bounce_mjx.signals import StopRequest\n"
+        "from bounce_mjx.training.signals import StopRequest\n"
         "with StopRequest() as stop:\n"
         "    print('ready', flush=True)\n"
         "    while not stop.requested: time.sleep(0.01)\n"
@@ -298,7 +294,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     """kill -9 at 20 random moments of one training: while it starts, trains, writes, renames and
     removes. Each process goes on from the checkpoint that the one before left."""
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["bounce_mjx.train"])
+    processes.set_forkserver_preload(["bounce_mjx.commands.train"])
     moments = random.Random(0)
     log_dir = tmp_path / "runs"
     args = [*TINY, "--eval-every", "64", "--total-steps", str(10**6), "--log-dir", str(log_dir)]

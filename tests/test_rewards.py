@@ -1,4 +1,4 @@
-"""The fifteen reward terms: against the seed's transcription, and against values by hand."""
+"""Reward terms: against a transcription of the specification, by hand, and their gradients."""
 
 import math
 from functools import partial
@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.reward_config import RewardConfig
-from bounce_mjx.task.rewards import TERM_NAMES, RewardInputs, weighted_terms
+from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig, RewardInputs, weighted_terms
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = (
@@ -391,3 +390,71 @@ def test_weight_scales_only_its_term(name, default_terms):
     for other in SPEC_NAMES:
         factor = -3.0 if other == name else 1.0
         np.testing.assert_allclose(terms[other], factor * default_terms[other], rtol=1e-12)
+
+
+# Gradients
+
+
+def reward(config: RewardConfig, inputs: RewardInputs):
+    return sum(weighted_terms(config, inputs).values())
+
+
+VARIED = ("ball_position", "ball_velocity", "paddle_position", "action", "joint_velocity")
+
+
+def directional_derivatives(inputs: RewardInputs, direction: RewardInputs):
+    """Derivatives [N] of the reward along a direction: by JAX, and by central differences of the
+    fourth order."""
+    step = 3e-6
+    evaluate = jax.jit(jax.vmap(partial(reward, RewardConfig())))
+
+    def reward_after(steps: float):
+        moved = {n: getattr(inputs, n) + steps * step * getattr(direction, n) for n in VARIED}
+        return evaluate(inputs._replace(**moved))
+
+    by_difference = (
+        8.0 * (reward_after(1.0) - reward_after(-1.0)) - (reward_after(2.0) - reward_after(-2.0))
+    ) / (12.0 * step)
+
+    def along(inputs, direction):
+        gradient = jax.grad(lambda varied: reward(RewardConfig(), inputs._replace(**varied)))(
+            {name: getattr(inputs, name) for name in VARIED}
+        )
+        return sum(jax.numpy.vdot(gradient[name], getattr(direction, name)) for name in VARIED)
+
+    return jax.jit(jax.vmap(along))(inputs, direction), by_difference
+
+
+def test_gradient_equals_finite_differences():
+    """At states on both sides of every condition, up to the few that a step carries over one."""
+    states = random_states(11)
+    rng = np.random.default_rng(12)
+    states = states | {"n_bounces": states["n_bounces"].astype(np.float64)}
+    direction = {name: rng.normal(size=states[name].shape) for name in VARIED}
+    with jax.enable_x64(True):
+        inputs = RewardInputs(**{name: jax.numpy.asarray(x) for name, x in states.items()})
+        actual, expected = directional_derivatives(inputs, inputs._replace(**direction))
+        actual, expected = np.asarray(actual), np.asarray(expected)
+    assert np.isfinite(actual).all()
+    error = np.abs(actual - expected) / (1.0 + np.abs(expected))
+    assert np.quantile(error, 0.999) < 1e-7
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        pytest.param(state(vz=1.0), id="at the target height"),
+        pytest.param(state(vz=0.0), id="at the apex"),
+        pytest.param(state(z=0.4, vz=1.0), id="too slow to reach the target"),
+        pytest.param(state(z=0.6, vz=-1.0), id="falling from above the target"),
+        pytest.param(state(z=0.6, vz=1.0), id="above the target"),
+        pytest.param(state(dx=0.0, dy=0.0, z=0.3, vz=-1.0), id="over the paddle's centre"),
+        pytest.param(state(z=0.05, paddle_z=0.05), id="in the paddle's centre"),
+    ],
+)
+def test_gradient_is_finite_everywhere(at):
+    with jax.enable_x64(True):
+        inputs = RewardInputs(**{name: jax.numpy.asarray(x[0], float) for name, x in at.items()})
+        gradient = jax.grad(lambda inputs: reward(RewardConfig(), inputs))(inputs)
+    for name, value in gradient._asdict().items():
+        assert np.isfinite(value).all(), name

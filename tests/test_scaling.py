@@ -23,11 +23,11 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.runs.folder import (
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
     latest_checkpoint,
-    load_run_config,
     runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts

@@ -26,10 +26,11 @@ from bounce_mjx.adapters.torch.networks import (
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
 from bounce_mjx.adapters.torch.skrl_ppo import SkrlEnv
-from bounce_mjx.commands.train_torch import make_learner, summarize
+from bounce_mjx.adapters.torch.trainer import make_learner, summarize
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.statistics import init_statistics, normalize, update
 from bounce_mjx.task import vector
 
 NUM_ENVS = 4
@@ -381,22 +382,22 @@ def test_gymnasium_vector_env_stays_on_the_device(env):
 
 def test_normalizer_is_that_of_jax():
     """Over batches: the statistics and what they make of an observation, a constant one too."""
-    from brax.training.acme import running_statistics
-
-    from bounce_mjx.learning.policy import init_normalizer, normalize
-
     rng = np.random.default_rng(0)
-    normalizer, statistics = Normalizer(3), init_normalizer(3)
+    normalizer, statistics = Normalizer(3), init_statistics(3)
     for count in (5, 40, 7):
         batch = rng.normal([2.0, -300.0, 0.0], [1.0, 20.0, 0.0], (count, 3)).astype(np.float32)
         seen = normalizer(torch.tensor(batch), train=True)
-        statistics = running_statistics.update(statistics, jnp.asarray(batch))
-        np.testing.assert_allclose(seen, normalize(batch, statistics), rtol=1e-3, atol=1e-4)
+        statistics = update(statistics, jnp.asarray(batch))
+        np.testing.assert_allclose(
+            seen, normalize(batch, statistics.normalizer), rtol=1e-3, atol=1e-4
+        )
     assert int(normalizer.count) == 52
     np.testing.assert_allclose(normalizer.mean, statistics.mean, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(normalizer.std, statistics.std, rtol=1e-4)
     far = torch.tensor([[1e6, 0.0, 1e6]])
-    np.testing.assert_allclose(normalizer(far), normalize(far.numpy(), statistics), rtol=1e-4)
+    np.testing.assert_allclose(
+        normalizer(far), normalize(far.numpy(), statistics.normalizer), rtol=1e-4
+    )
     assert normalizer(far)[0, [0, 2]].tolist() == [10.0, 0.0]
 
 

@@ -11,7 +11,8 @@ import torch
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train_torch as torch_train
 from bounce_mjx.runs.config import load_config
-from bounce_mjx.runs.folder import find_checkpoint, load_policy
+from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.reading import load_policy
 
 SCRIPT = Path(__file__).parent.parent / "train_torch.py"
 TINY = (

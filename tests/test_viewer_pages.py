@@ -17,7 +17,6 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from bounce_mjx.commands import view
-from bounce_mjx.viewers.browser import reward_bars
 
 pytestmark = [
     pytest.mark.slow,
@@ -108,13 +107,14 @@ def watch(browser: Browser) -> Iterator[Callable[[str], Watched]]:
         page.close()
 
 
-def test_replay_page_moves_and_asks_for_nothing(watch, tmp_path: Path, monkeypatch) -> None:
+def test_replay_page_moves_and_asks_for_nothing(watch, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    view.main("--actions scripted --num-envs 2 --seconds 3 --html replay.html".split())
-    assert os.listdir(tmp_path) == ["replay.html"]
-    watched = watch((tmp_path / "replay.html").as_uri())
+    view.main("--actions scripted --num-envs 2 --seconds 3 --html replay[lr].html".split())
+    assert "written: replay[lr].html\n" in capsys.readouterr().out
+    assert os.listdir(tmp_path) == ["replay[lr].html"]
+    own = (tmp_path / "replay[lr].html").as_uri()
+    watched = watch(own)
     watched.wait_for_motion(watched.wait_for_arm())
-    own = (tmp_path / "replay.html").as_uri()
     assert own in watched.requests
     strangers = [url for url in watched.requests if url != own and not url.startswith("blob:null")]
     assert not strangers
@@ -200,10 +200,3 @@ def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=30)
     assert (process.returncode, "Traceback" in said) == (0, False), said
-
-
-def test_reward_bars_tell_every_term() -> None:
-    text = reward_bars(np.array([2.0, -1.25, *[0.0] * 13]))
-    assert text.count("consecutive bounces") == 1
-    assert ">2.00<" in text and ">-1.25<" in text and "sum 0.75" in text
-    assert "-0.00" not in text

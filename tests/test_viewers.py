@@ -1,22 +1,36 @@
 """What the viewers show: the simulated frames, the model's geometry, the clock, the recordings."""
 
+import contextlib
+import io
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import imageio_ffmpeg
 import jax
+import msgspec
 import mujoco
 import numpy as np
 import pytest
+import viser
+import zstandard
+from rich.console import Console
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, view
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers import offscreen, pace
+from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
     make_random_controller,
     make_scripted_controller,
@@ -25,10 +39,13 @@ from bounce_mjx.viewers.controllers import (
 from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, _primitive, body_scenes
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.pace import Pace
+from bounce_mjx.viewers.page import open_server
+from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, Simulation, resample
 
 GRAVITY = 9.81
 SECONDS = 3.0
+PATIENCE = 60.0
 
 
 @pytest.fixture(autouse=True)
@@ -242,6 +259,183 @@ def test_steps_are_due_as_the_clock_goes(monkeypatch) -> None:
     assert clock.due(1.0) == 0
 
 
+# The page's server, which any client may send anything to
+
+
+class Client:
+    """A client of the page that speaks viser's protocol, and no browser."""
+
+    def __init__(self, address: str):
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        self._socket = connect(
+            address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None
+        )
+        self.look(position=[1.0, 0.0, 0.0])
+        self._controls: dict[str, str] = {}
+        self.texts: list[str] = []
+
+    def control(self, label: str) -> str:
+        """The identifier of a control, by its label."""
+        while label not in self._controls:
+            window = self._socket.recv(timeout=PATIENCE)
+            length = int.from_bytes(window[8:16], "little")
+            text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
+            for message in msgspec.msgpack.decode(text)["messages"]:
+                props = message.get("props", {})
+                if "label" in props:
+                    self._controls[props["label"]] = message["uuid"]
+                if "content" in props:
+                    self.texts.append(props["content"])
+        return self._controls[label]
+
+    def set(self, label: str, value: object, name: str = "value") -> None:
+        """Sets a control, and gives the page the time to look at it."""
+        self.send({"type": "GuiUpdateMessage", "uuid": label, "updates": {name: value}})
+
+    def look(self, position: list[float]) -> None:
+        """Reports the client's camera."""
+        vectors = {"look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
+        numbers = {"fov": 1.0, "near": 0.01, "far": 9.0, "image_height": 9, "image_width": 9}
+        pose = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": position}
+        self.send({"type": "ViewerCameraMessage", **pose, **vectors, **numbers})
+
+    def send(self, message: object) -> None:
+        self._socket.send(msgspec.msgpack.encode(message))
+        time.sleep(0.1)
+
+
+@pytest.fixture
+def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
+    """A client of the served simulation of two environments, and what the page did: the numbers of
+    environments shown, the speeds, the target heights and the pushes."""
+    did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
+
+    def watch(owner: type, method: str, record: Callable[..., None]) -> None:
+        original = getattr(owner, method)
+
+        def watched(self, *args):
+            record(self, *args)
+            return original(self, *args)
+
+        monkeypatch.setattr(owner, method, watched)
+
+    watch(Scene, "show", lambda _, number: did["shown"].append(number))
+    watch(Pace, "due", lambda _, speed: did["speed"].append(speed))
+    watch(Simulation, "step", lambda simulation: did["target"].append(simulation.target_height))
+    watch(Simulation, "push", lambda _, velocity: did["push"].append(velocity))
+    scripted.target_height = None
+    failures, printed, ended = [], io.StringIO(), threading.Event()
+
+    def step(simulation) -> None:
+        if ended.is_set():
+            raise KeyboardInterrupt
+
+    watch(Simulation, "step", step)
+
+    def serve() -> None:
+        try:
+            run_browser(
+                scripted, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
+                host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
+            )  # fmt: skip
+        except BaseException as error:
+            failures.append(error)
+
+    server = threading.Thread(target=serve)
+    server.start()
+    while "viewer" not in printed.getvalue():
+        assert server.is_alive(), failures
+        time.sleep(0.05)
+    yield Client(re.search(r"http://\S+", printed.getvalue())[0]), did
+    assert server.is_alive(), failures
+    ended.set()
+    server.join(PATIENCE)
+    assert [type(failure) for failure in failures] == [KeyboardInterrupt], failures
+    scripted.target_height = None
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
+HOSTILE = {
+    "robots": (0, 40, HUGE, -HUGE, NAN, "many", [1], None),
+    "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", {}),
+    "height, m": (1e9, -1.0, NAN, -INFINITY, "high"),
+    "speed, m/s": (1e9, NAN, INFINITY),
+}
+
+
+def test_no_client_can_end_or_stall_the_server(page) -> None:
+    client, did = page
+    for label, values in HOSTILE.items():
+        control = client.control(label)
+        for value in values:
+            client.set(control, value)
+            client.set(client.control("towards"), "up")
+        client.set(control, [], name="update_cb")
+    for value in ("sideways", "", 3, None):
+        client.set(client.control("towards"), value)
+    client.set(client.control("pause"), "no", name="nonsense")
+    client.set(client.control("robots"), 1)
+    wait_until(lambda: did["shown"][-1] == 1)
+    client.send([1, 2, 3])
+    assert set(did["shown"]) == {1, 2}
+    assert set(did["speed"]) == {0.1, 1.0, 2.0}
+    assert {height for height in did["target"] if height is not None} == {0.3, 0.8}
+    speeds = {float(np.linalg.norm(push)) for push in did["push"]}
+    assert speeds == {0.2, 1.0}
+
+
+def test_a_title_is_no_markup(page) -> None:
+    client, _ = page
+    client.control("robots")
+    assert any("exp[lr] &lt;b&gt;" in text for text in client.texts)
+
+
+def test_an_invalid_camera_is_left_alone(page) -> None:
+    """One that is no number, and one at the point that it looks at."""
+    client, did = page
+    for position, number in ((NAN, 2), (0.0, 1)):
+        client.look(position=[position, 0.0, 0.0])
+        client.set(client.control("robots"), number)
+        wait_until(lambda number=number: did["shown"][-1] == number)
+
+
+def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
+    """A page stopped in a debugger never answers the goodbye of the server."""
+    with contextlib.ExitStack() as servers, contextlib.ExitStack() as stack:
+        server = servers.enter_context(open_server("127.0.0.1", 0))
+        client = stack.enter_context(
+            socket.create_connection((server.get_host(), server.get_port()))
+        )
+        client.sendall(
+            b"GET / HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+            + f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+        )
+        assert client.recv(12) == b"HTTP/1.1 101"
+        ending = threading.Thread(target=servers.close)
+        ending.start()
+        ending.join(4.0)
+        assert not ending.is_alive()
+
+
+def test_reward_bars_tell_every_term() -> None:
+    """As many as there are."""
+    terms = dict.fromkeys(TERM_NAMES, 0.0) | {"position": 2.0, "alignment": -1.25}
+    terms["sixteenth_term"] = 0.5
+    text = reward_bars(terms)
+    for name in terms:
+        assert text.count(f">{name.replace('_', ' ')}<") == 1
+    assert ">2.00<" in text and ">-1.25<" in text and "sum 1.25" in text
+    assert "-0.00" not in reward_bars({"a": -0.001})
+
+
 # The command lines
 
 
@@ -350,7 +544,7 @@ MISTAKES = {
     "small size": ("--video a.mp4 --size 2 2", "--size is 2", "64"),
     "rate of a gif": ("--video a.gif --fps 60", "--fps 60", "GIF", "25 or 50"),
     "too many robots": ("--num-envs 17", "--num-envs is 17", "16"),
-    "two ways": ("--viewer browser --video a.mp4", "--viewer browser", "leave one out"),
+    "two ways": ("--viewer browser --video a.mp4", "--viewer browser", "give only one"),
     "no screen": ("--viewer native", "--viewer native", "display", "--viewer browser"),
     "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),

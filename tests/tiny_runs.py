@@ -8,10 +8,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
+import orbax.checkpoint as ocp
+from flax import traverse_util
 
-from bounce_mjx.runs import checkpoint as checkpoints
-from bounce_mjx.runs.folder import Checkpoint
+from bounce_mjx.runs.files import check_integrity
+from bounce_mjx.runs.folders import Checkpoint
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
 STEPS = 256
@@ -25,8 +28,10 @@ TIMEOUT = 120.0
 
 def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """Every array of the training state in a checkpoint."""
-    checkpoints.check_integrity(checkpoint.folder)
-    return checkpoints.read_arrays(checkpoints.open_item(checkpoint.folder, "training"))
+    check_integrity(checkpoint.folder)
+    with ocp.StandardCheckpointer() as checkpointer:
+        tree = checkpointer.restore((checkpoint.folder / "training").absolute())
+    return jax.tree.map(np.asarray, traverse_util.flatten_dict(tree, sep="."))
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

@@ -1,16 +1,30 @@
 """A robot arm that learns to bounce a ball: an environment on JAX and MuJoCo, with PPO."""
 
-import contextlib
-import io
+from typing import TYPE_CHECKING, Any
 
-# MJX prints a line to stdout for each of its optional parts that is not installed.
-with contextlib.redirect_stdout(io.StringIO()):
-    import mujoco.mjx  # noqa: F401
+from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
-from bounce_mjx.adapters.registration import register as _register
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
+if TYPE_CHECKING:
+    from bounce_mjx.task.config import EnvConfig
+    from bounce_mjx.task.env import BounceBall
 
 __all__ = ["BounceBall", "EnvConfig"]
 
-_register()
+register_when_imported()
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the public classes on first use, as JAX takes two seconds to import (PEP 562)."""
+    if name == "BounceBall":
+        from bounce_mjx.task.env import BounceBall
+
+        return BounceBall
+    if name == "EnvConfig":
+        from bounce_mjx.task.config import EnvConfig
+
+        return EnvConfig
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

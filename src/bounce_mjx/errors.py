@@ -4,6 +4,8 @@ import contextlib
 import sys
 from collections.abc import Iterator
 
+from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
+
 
 class UserError(Exception):
     """A mistake that the user can mend; its text is one sentence: what was given, what was
@@ -19,8 +21,10 @@ def exit_on_user_error() -> Iterator[None]:
     except UserError as error:
         print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
         sys.exit(2)
+    except Interrupted:
+        leave()
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
 
 
 def _on_one_line(text: str) -> str:

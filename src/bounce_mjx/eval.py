@@ -1,6 +1,8 @@
 """Measures the five results of a trained policy: `python -m bounce_mjx.eval [CHECKPOINT]`."""
 
-from bounce_mjx.commands.eval import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["eval", *sys.argv[1:]])

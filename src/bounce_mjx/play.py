@@ -1,6 +1,8 @@
 """Shows a trained policy: `python -m bounce_mjx.play [CHECKPOINT]`."""
 
-from bounce_mjx.commands.play import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["play", *sys.argv[1:]])

@@ -1,6 +1,8 @@
 """Draws learning curves and an evaluation: `python -m bounce_mjx.plot [RUN ...]`."""
 
-from bounce_mjx.commands.plot import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["plot", *sys.argv[1:]])

@@ -1,6 +1,8 @@
 """Writes the report of a run: `python -m bounce_mjx.report [RUN]`."""
 
-from bounce_mjx.commands.report import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["report", *sys.argv[1:]])

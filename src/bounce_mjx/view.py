@@ -1,6 +1,8 @@
 """Shows the environment without a policy: `python -m bounce_mjx.view`."""
 
-from bounce_mjx.commands.view import main
+import sys
+
+from bounce_mjx.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["view", *sys.argv[1:]])

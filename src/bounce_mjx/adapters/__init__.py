@@ -1,1 +1,1 @@
-"""The environment in the form that other libraries expect."""
+"""The environment with the interfaces of other libraries, a folder for each library."""

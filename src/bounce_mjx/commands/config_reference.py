@@ -1,6 +1,6 @@
-"""Prints the reference of every config key, taken from the types in `config.py`:
+"""Prints the reference of every config key, generated from the types of the settings:
 
-python -m bounce_mjx.config_reference > docs/config.md
+python -m bounce_mjx.commands.config_reference > docs/config.md
 """
 
 import re
@@ -12,17 +12,22 @@ from bounce_mjx.runs.config import TrainConfig
 
 _HEAD = """# Config reference
 
-Every setting of a training. A key is written in a YAML file as nested groups (`--config FILE`, see
-[training](training.md)); the flag beside it is the same setting on the command line of
-`train_jax.py`, and wins over the file. An unknown key and a value out of range are refused.
+Every setting of a training run. A YAML file (`--config FILE`, see [training](training.md)) holds
+the keys as nested groups. Each key is also a flag of `train_jax.py`, and the flag wins over the
+file. Unknown keys and values out of range are refused.
 
-This page is generated from the types in `src/bounce_mjx/config.py`:
+A whole number may have an exponent (`1e6`). On the command line, the items of a list are separated
+by spaces or commas (`256 256` or `256,256`), and a switch has three forms, such as
+`--stop-when-solved`, `--no-stop-when-solved` and `--stop-when-solved=false`.
 
-    python -m bounce_mjx.config_reference > docs/config.md
+This page is generated from the types of the settings (`TrainConfig` in
+`src/bounce_mjx/runs/config.py`, and the groups in it):
 
-Some rules concern several keys, and their errors say what to change:
+    python -m bounce_mjx.commands.config_reference > docs/config.md
 
-- `env.control_dt` is a whole number of `env.physics_dt`, and `env.episode_seconds` no shorter;
+These rules concern several keys:
+
+- `env.control_dt` is a multiple of `env.physics_dt`, and `env.episode_seconds` is at least as long;
 - `env.target_height_range` is 0 < low ≤ high;
 - `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is no longer
   than an episode;
@@ -30,7 +35,7 @@ Some rules concern several keys, and their errors say what to change:
 - `ppo.critic_metrics` names metrics of the environment.
 """
 
-# A unit stands behind a comma in a key's description, at its end or before an addition.
+# A unit follows a comma in the description of a key, at its end or before an addition.
 _UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces)(?=[.;]| \()")
 
 
@@ -45,12 +50,12 @@ def reference() -> str:
 
 
 def flag(key: str) -> str:
-    """The flag of a key, such as --num-envs of ppo.num_envs."""
+    """The flag of a key: --num-envs for ppo.num_envs."""
     return "--" + key.removeprefix("env.").removeprefix("ppo.").replace("_", "-")
 
 
 def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[StrictModel], str]]:
-    """A group of settings and the groups in it, each with the prefix of its keys."""
+    """A group of settings and the groups nested in it, each with the prefix of its keys."""
     yield model, prefix
     for name, field in model.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
@@ -86,7 +91,7 @@ def _section(model: type[StrictModel], prefix: str) -> str:
 
 
 def _type(plain: dict[str, Any]) -> str:
-    """A JSON schema's type in a word or two."""
+    """The type of a JSON schema in a word or two."""
     if "anyOf" in plain:
         return " or ".join(_type(option) for option in plain["anyOf"])
     if "enum" in plain:
@@ -102,7 +107,7 @@ def _type(plain: dict[str, Any]) -> str:
 
 
 def _default(value: Any) -> str:
-    """A default as YAML writes it, six digits of a number."""
+    """A default value as YAML; numbers have six digits."""
     if isinstance(value, list):
         return f"[{', '.join(_default(item) for item in value)}]"
     if value is None or isinstance(value, bool):
@@ -110,7 +115,7 @@ def _default(value: Any) -> str:
     if isinstance(value, int):
         return f"{value:_}" if value >= 10_000 else str(value)
     if isinstance(value, float):
-        # YAML takes a number with an exponent but no point for a word.
+        # YAML reads a number with an exponent but no point as a word.
         digits, exponent, power = f"{value:.6g}".partition("e")
         return (
             f"{digits}.0e{power}" if exponent and "." not in digits else digits + exponent + power
@@ -119,7 +124,7 @@ def _default(value: Any) -> str:
 
 
 def _range(plain: dict[str, Any]) -> str:
-    """The bounds of a JSON schema's value, or of the items of its list."""
+    """The bounds of the value in a JSON schema, or of the items of its list."""
     if "enum" in plain:
         return ", ".join(plain["enum"])
     if "anyOf" in plain:

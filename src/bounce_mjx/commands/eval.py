@@ -1,6 +1,5 @@
-"""Measures the five results of a trained policy: `python -m bounce_mjx.eval [CHECKPOINT]`."""
+"""Measures the five results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
 
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -8,17 +7,19 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from pydantic import Field
 from rich.console import Console
 
 from bounce_mjx.config.command_line import parse
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.choice import choose_checkpoint
-from bounce_mjx.runs.folder import load_policy, load_run_config
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.files import to_json
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -26,20 +27,20 @@ class EvalCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), or a checkpoint in it; left out: the newest run, or
-    the policy that comes with the package where there is none."""
-    episodes: Annotated[int, Field(ge=1)] = DEFAULT_EPISODES
+    """A run's folder (its best checkpoint), or a checkpoint in it. The default is the newest run,
+    or the policy that comes with the package if there is no run."""
+    episodes: Count = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
+    seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
-    target_height: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
-    """One target height for all episodes, m; left out: the range of the run's config."""
+    target_height: Positive | None = None
+    """One target height for all episodes, m. The default is the range of the run's config."""
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
-    """Engine: mujoco is the C engine itself; config is the one that the run was trained on."""
+    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -49,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             EvalCommand,
             args,
-            prog="python -m bounce_mjx.eval",
+            prog="bounce-mjx eval",
             description="Measures the five results of a trained policy.",
         )
         if command.json_file is not None:
@@ -59,7 +60,8 @@ def main(args: Sequence[str] | None = None) -> None:
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
-        report, engine = evaluate_policy(
+        report, engine, warnings = run_interruptible(
+            evaluate_policy,
             policy,
             config.env,
             config.ppo,
@@ -68,18 +70,19 @@ def main(args: Sequence[str] | None = None) -> None:
             target_height=command.target_height,
             physics=command.physics,
         )
-        console.print(
+        console.out(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
             highlight=False,
-            soft_wrap=True,
         )
+        for warning in warnings:
+            console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
         console.print(results_table(report, "the five results"))
         console.print(details_line(report), highlight=False)
         if command.json_file is not None:
             plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
             plain |= {"seed": command.seed, "target_height": command.target_height}
             try:
-                command.json_file.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+                command.json_file.write_text(to_json(plain), encoding="utf-8")
             except OSError as error:
                 raise UserError(
                     f"--json {command.json_file} cannot be written ({error.strerror}); give "

@@ -1,4 +1,4 @@
-"""Draws learning curves and an evaluation: `python -m bounce_mjx.plot [RUN ...]`."""
+"""Draws learning curves and an evaluation: `bounce-mjx plot [RUN ...]`."""
 
 import sys
 from collections.abc import Sequence
@@ -11,10 +11,12 @@ from pydantic import Field
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.page import record_checkpoint
-from bounce_mjx.runs.folder import find_checkpoint, load_run_config, newest_run, runs_of_seeds
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import find_checkpoint, newest_run, runs_of_seeds
 from bounce_mjx.task.env import BounceBall
 
 
@@ -22,15 +24,15 @@ class PlotCommand(StrictModel):
     """The command line."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs; those that differ only in the seed become one curve with a band, as do the
-    seeds of one run. Left out: the newest run. Of one seed, or one checkpoint in it, the evaluation
-    is drawn too."""
+    """Folders of runs. Runs that differ only in the seed become one curve with a band, as do the
+    seeds of one run. The default is the newest run. For a run of one seed, or one checkpoint in it,
+    the evaluation is drawn too."""
     out: Path = Path("plots")
-    """Folder for the pictures: curves, rewards and, of one run, evaluation."""
+    """Folder for the pictures: curves, rewards and, for one run, evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
-    """Formats of each picture."""
+    """File formats of each picture."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -39,7 +41,7 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             PlotCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.plot",
+            prog="bounce-mjx plot",
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
         runs = command.runs or (newest_run(command.log_dir),)
@@ -49,7 +51,9 @@ def main(args: Sequence[str] | None = None) -> None:
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:
             env = BounceBall(load_run_config(checkpoints[0].run).env)
-            figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
+            figures["evaluation"] = evaluation_figure(
+                env, run_interruptible(record_checkpoint, checkpoints[0])
+            )
         for name, figure in figures.items():
             for suffix in command.formats:
                 path = command.out / f"{name}.{suffix}"

@@ -10,17 +10,18 @@ import tyro
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.page import record_checkpoint, write_report
-from bounce_mjx.runs.folder import find_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 
 
 class ReportCommand(StrictModel):
     """The command line."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder; left out: the newest run."""
+    """A run's folder. The default is the newest run."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -29,9 +30,10 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             ReportCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.report",
+            prog="bounce-mjx report",
             description="Writes the report of a run, report.html in its folder.",
         )
         checkpoint = find_checkpoint(command.run, command.log_dir)
-        path, _ = write_report(checkpoint.run, record_checkpoint(checkpoint))
+        recording = run_interruptible(record_checkpoint, checkpoint)
+        path, _ = write_report(checkpoint.run, recording)
         print(path)

@@ -1,4 +1,5 @@
-"""Makes the policy that comes with the package out of a run: `python -m bounce_mjx.ship RUN`."""
+"""Makes the policy that comes with the package from a run, for maintainers:
+`python -m bounce_mjx.commands.ship RUN`."""
 
 import shutil
 import sys
@@ -10,24 +11,20 @@ from typing import Annotated
 import jax
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.policies import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_SEED
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.choice import PRETRAINED
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    CONFIG_FILE,
-    CheckpointWriter,
-    find_checkpoint,
-    load_policy,
-    load_results,
-    load_run_config,
-    save_config,
-)
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.folders import PRETRAINED, find_checkpoint, save_config
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -37,7 +34,7 @@ class ShipCommand(StrictModel):
     run: Annotated[Path, tyro.conf.Positional]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
     out: Path = Path(PRETRAINED)
-    """Folder to write, in place of what is there."""
+    """Folder to write; an earlier one is replaced."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -46,36 +43,38 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             ShipCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.ship",
-            description="Makes the policy that comes with the package out of a run.",
+            prog="python -m bounce_mjx.commands.ship",
+            description="Makes the policy that comes with the package from a run.",
         )
         set_up_jax()
         ship(command.run, command.out, Console())
 
 
 def ship(run: Path, out: Path, console: Console) -> None:
-    """Measures the policy of a run, and writes it with its config and results to `out`.
+    """Evaluates the policy of a run, and writes it with its config and results to `out`.
 
     Raises:
-      UserError: there is no such policy, it misses a result, or the folder cannot be written.
+      UserError: there is no policy, it misses a result, or the folder cannot be written.
     """
     if out.exists() and not (out / CONFIG_FILE).is_file():
-        raise UserError(f"--out {out} is no folder that this command made; give another")
+        raise UserError(f"--out {out} is not a folder that this command made; give another")
     checkpoint = find_checkpoint(run, run)
     trained_with = load_run_config(checkpoint.run)
     if trained_with.env.mjcf is not None:
         raise UserError(
-            f"{checkpoint.run} was trained with --mjcf {trained_with.env.mjcf}, which is no part "
-            "of the package; give a run of the package's own arm"
+            f"{checkpoint.run} was trained with --mjcf {trained_with.env.mjcf}, which is not "
+            "part of the package; give a run of the package's own arm"
         )
     policy = load_policy(checkpoint, trained_with)
-    report, physics = evaluate_policy(policy, trained_with.env, trained_with.ppo)
-    console.print(results_table(report, f"{checkpoint.folder}, {physics}"))
+    report, physics, _ = run_interruptible(
+        evaluate_policy, policy, trained_with.env, trained_with.ppo
+    )
+    console.print(results_table(report, escape(f"{checkpoint.folder}, {physics}")))
     console.print(details_line(report), highlight=False)
     if not report.passed:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")
 
-    # Where a run's folder was is no part of how it came about.
+    # The place of the run's folder has no part in the result.
     config = trained_with.model_copy(update={"log_dir": TrainConfig().log_dir})
     results = {
         "command": f"python train_jax.py --config {PRETRAINED}/{CONFIG_FILE}",
@@ -83,7 +82,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
         "device": (load_results(checkpoint.run) or {}).get("device", "unknown"),
         "best_steps": checkpoint.steps,
         "evaluation": {
-            "command": f"python -m bounce_mjx.eval {PRETRAINED}",
+            "command": f"bounce-mjx eval {PRETRAINED}",
             "seed": DEFAULT_SEED,
             "physics": physics,
             "device": jax.devices()[0].device_kind,
@@ -108,7 +107,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
             f"--out {out} cannot be written ({error.strerror}); give another folder"
         ) from error
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    console.print(f"written: {out} ({size / 1000:.0f} kB)", highlight=False, soft_wrap=True)
+    console.out(f"written: {out} ({size / 1000:.0f} kB)", highlight=False)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
-"""Shows the environment without a policy: `python -m bounce_mjx.view` (see --help)."""
+"""Shows the environment without a policy: `bounce-mjx view`."""
 
-import contextlib
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -32,18 +31,18 @@ class ViewCommand(StrictModel):
     """The command line."""
 
     actions: Literal["random", "zero", "scripted"] = "random"
-    """random: uniform; zero: the servos hold; scripted: a hand-written juggler."""
+    """random: uniform; zero: the servos hold their angles; scripted: a hand-written juggler."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error(), contextlib.suppress(KeyboardInterrupt):
+    with exit_on_user_error():
         command = parse(
             ViewCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.view",
+            prog="bounce-mjx view",
             description="Shows the environment under random, zero or scripted actions.",
         )
         set_up_jax()

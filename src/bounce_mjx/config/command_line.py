@@ -3,15 +3,18 @@
 import difflib
 import itertools
 import sys
+import typing
 from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pydantic
 import tyro
+from pydantic.fields import FieldInfo
 
 # tyro's own hook for replacing its error boxes; unstable, so pyproject.toml bounds the version.
 from tyro import _errors as tyro_errors
 
+from bounce_mjx.config.settings import whole_number
 from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError
 
@@ -35,6 +38,8 @@ def parse(
       UserError: a flag is unknown or has a bad value.
     """
 
+    words = _usual_spelling(args, _flags(command_class))
+
     def raise_user_error(event: tyro_errors.ParseErrorEvent) -> None:
         raise UserError(f"{_mistake(event, command_class, args)} (see {prog} --help)")
 
@@ -42,7 +47,7 @@ def parse(
         try:
             return tyro.cli(
                 command_class,
-                args=list(args),
+                args=words,
                 prog=prog,
                 description=description,
                 **({} if default is None else {"default": default}),
@@ -52,12 +57,55 @@ def parse(
             raise UserError(f"{_bad_value(error, command_class)} (see {prog} --help)") from error
 
 
+def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> list[str]:
+    """A command line in tyro's spelling.
+
+    The rest is common in other programs: `--flag=false` for `--no-flag`, `1e6` for a whole number,
+    `256,256` for a list of two.
+    """
+    words: list[str] = []
+    field = None
+    for word in args:
+        flag, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        if flag:
+            field = flags.get(flag.replace("_", "-"))
+        kind = None if field is None else field.annotation
+        if kind is bool and value.lower() in ("true", "false"):
+            if flag or words[-1].startswith("--"):
+                flag = flag or words.pop()
+                words.append(flag if value.lower() == "true" else _negated(flag))
+                continue
+        types = set(_types(kind))
+        parts = value.split(",") if tuple in types else [value]
+        if int in types:
+            parts = [str(whole_number(part)) for part in parts]
+        if len(parts) > 1 and flag:
+            words.append(flag)
+        elif flag:
+            parts = [flag + equals + parts[0]]
+        words.extend(parts)
+    return words
+
+
+def _types(kind: Any) -> Iterator[Any]:
+    """The types that a type consists of, such as tuple and int of tuple[int, ...]."""
+    yield typing.get_origin(kind) or kind
+    for inner in typing.get_args(kind):
+        yield from _types(inner)
+
+
+def _negated(flag: str) -> str:
+    """The flag that sets a switch to false."""
+    group, dot, name = flag.removeprefix("--").rpartition(".")
+    return f"--{group}{dot}no-{name}"
+
+
 def _mistake(
     event: tyro_errors.ParseErrorEvent, command_class: type[pydantic.BaseModel], args: Sequence[str]
 ) -> str:
     if isinstance(event, tyro_errors.UnrecognizedArgs):
         given = event.tokens[0].split("=")[0].replace("_", "-")
-        near = difflib.get_close_matches(given, list(_flags(command_class)), n=1)
+        near = difflib.get_close_matches(given, _flags(command_class), n=1)
         return f"unknown argument {event.tokens[0]}" + (
             f"; did you mean {near[0]}?" if near else ""
         )
@@ -96,15 +144,18 @@ def _given(args: Sequence[str], flag: str) -> str:
     return ""
 
 
-def _flags(command_class: type[pydantic.BaseModel]) -> Iterator[str]:
-    """The flags of a command, as tyro names them."""
+def _flags(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | None]:
+    """The settings of a command by the flags as tyro names them; None by a switch's negation."""
+    flags: dict[str, FieldInfo | None] = {}
     for group, prefix in _groups(command_class):
         for name, field in group.model_fields.items():
             if tyro.conf.Positional in field.metadata or _is_group(field):
                 continue
-            yield _flag(prefix + _argument_name(name, field))
+            flag = _flag(prefix + _argument_name(name, field))
+            flags[flag] = field
             if field.annotation is bool:
-                yield _flag(f"{prefix}no-{name}")
+                flags[_negated(flag)] = None
+    return flags
 
 
 def _groups(
@@ -118,12 +169,12 @@ def _groups(
             yield from _groups(field.annotation, f"{prefix}{inner}." if inner else prefix)
 
 
-def _is_group(field: pydantic.fields.FieldInfo) -> bool:
+def _is_group(field: FieldInfo) -> bool:
     annotation = field.annotation
     return isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel)
 
 
-def _argument_name(name: str, field: pydantic.fields.FieldInfo) -> str:
+def _argument_name(name: str, field: FieldInfo) -> str:
     """The name of a field's flag, which `tyro.conf.arg(name=...)` may replace."""
     given = (getattr(mark, "name", None) for mark in field.metadata)
     return next((new for new in given if isinstance(new, str)), name)

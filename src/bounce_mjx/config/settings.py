@@ -1,40 +1,52 @@
-"""Every number that a user may change: the task, its reward, the trainer, the run.
+"""The types of settings, and the base class of every group of settings.
 
-The models are immutable and reject unknown keys and values out of range. The comments beside a
-field (its docstring) give the unit; they are also the help text of the command line.
+A group is immutable, and rejects unknown keys and values out of range. The docstring below a field
+gives its unit; it is also the help text of the command line.
 """
 
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pydantic
 from pydantic import Field
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
-
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
 
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 def _check_path(path: Path) -> Path:
     if "\0" in str(path):
-        raise ValueError("a path cannot hold the character 0; leave it out")
+        raise ValueError("a path cannot hold the null character; remove it")
     return path
 
 
 PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
 
 
-Count = Annotated[int, Field(ge=1, lt=2**31)]
+def whole_number(value: Any) -> Any:
+    """A whole number in scientific notation, such as "1e6", as an integer; else the value itself.
+
+    YAML reads 1e6 as a word, as its numbers have a point.
+    """
+    if isinstance(value, str) and re.fullmatch(r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+", value):
+        number = float(value)
+        return int(number) if number.is_integer() else value
+    return value
 
 
-Steps = Annotated[int, Field(ge=1, le=10**12)]
+_WholeNumber = pydantic.BeforeValidator(whole_number)
+
+NonNegativeInt = Annotated[int, _WholeNumber, Field(ge=0, lt=2**31)]
+
+Count = Annotated[int, _WholeNumber, Field(ge=1, lt=2**31)]
+
+Steps = Annotated[int, _WholeNumber, Field(ge=1, le=10**12)]
 
 
 class StrictModel(pydantic.BaseModel):

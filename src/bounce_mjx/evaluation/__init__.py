@@ -1,1 +1,1 @@
-"""The five results."""
+"""Evaluation of a policy: its episodes, their statistics and the five expected results."""

@@ -7,25 +7,25 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.training.agents.ppo.networks import PPONetworks
 from mujoco import rollout
 
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Policy, act
-from bounce_mjx.physics import PhysicsState
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model
+from bounce_mjx.robot.model import load_model
 from bounce_mjx.task.env import BounceBall
+
+_FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def make_mujoco_evaluator(
-    env: BounceBall, networks: PPONetworks, episodes: int
+    env: BounceBall, networks: Networks, episodes: int
 ) -> Callable[[Policy, jax.Array], Statistics]:
-    """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine."""
+    """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
+
+    Each episode is simulated in the world that its reset drew.
+    """
     num_threads = os.cpu_count() or 1
-    full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    state_size = mujoco.mj_stateSize(env.mj_model, full_physics)
-    nq, nv = env.mj_model.nq, env.mj_model.nv
-    if state_size != 1 + nq + nv:
-        raise ValueError("the model has activations or plugins, which this evaluation lacks")
 
     @jax.jit
     def start(key):
@@ -46,10 +46,9 @@ def make_mujoco_evaluator(
 
     def evaluate(policy: Policy, key: jax.Array) -> Statistics:
         states = start(key)
-        physics = states.pipeline_state.physics
-        simulated = np.zeros((episodes, state_size))
-        simulated[:, 1:] = np.concatenate([physics.qpos, physics.qvel]).T
-        data = [mujoco.MjData(env.mj_model) for _ in range(num_threads)]
+        simulated = full_states(env.mj_model, states.pipeline_state.physics)
+        models = episode_models(env, states.pipeline_state.parameters)
+        data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
         statistics = empty_statistics(episodes)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
@@ -57,15 +56,47 @@ def make_mujoco_evaluator(
                 control = np.repeat(
                     np.asarray(targets, np.float64)[:, None], env.config.num_substeps, axis=1
                 )
-                trajectory, _ = pool.rollout(env.mj_model, data, simulated, control)
+                trajectory, _ = pool.rollout(models, data, simulated, control)
                 simulated = trajectory[:, -1]
-                physics = PhysicsState(
-                    qpos=jnp.asarray(simulated[:, 1 : 1 + nq].T, jnp.float32),
-                    qvel=jnp.asarray(simulated[:, 1 + nq :].T, jnp.float32),
-                )
+                physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
                 if step % 100 == 99 and not np.any(statistics.running):
                     break
         return statistics
 
     return evaluate
+
+
+def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoco.MjModel]:
+    """One model for all episodes, or one an episode where the parameters [..., N] are given."""
+    parameters = jax.tree.map(np.asarray, parameters)
+    given = jax.tree.leaves(parameters)
+    if not given:
+        return [env.mj_model]
+    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False)
+    return [
+        edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
+        for i in range(given[0].shape[-1])
+    ]
+
+
+def full_states(mj_model: mujoco.MjModel, physics: PhysicsState) -> np.ndarray:
+    """States [N, size] of MuJoCo's mjSTATE_FULLPHYSICS at time 0 from a `PhysicsState` [..., N]."""
+    fresh = np.zeros(mujoco.mj_stateSize(mj_model, _FULL_PHYSICS))
+    mujoco.mj_getState(mj_model, mujoco.MjData(mj_model), fresh, _FULL_PHYSICS)
+    coordinates = np.concatenate(jax.tree.leaves(physics)).T
+    states = np.tile(fresh, (len(coordinates), 1))
+    # Time comes first; then positions, velocities and activations; histories of sensors last.
+    states[:, 1 : 1 + coordinates.shape[1]] = coordinates
+    return states
+
+
+def physics_states(mj_model: mujoco.MjModel, states: np.ndarray) -> PhysicsState:
+    """The `PhysicsState` [..., N], in float32, of states [N, size] of mjSTATE_FULLPHYSICS."""
+    ends = 1 + np.cumsum([mj_model.nq, mj_model.nv, mj_model.na])
+    qpos, qvel, activations = np.split(states[:, 1 : ends[-1]], ends[:-1] - 1, axis=1)
+    return PhysicsState(
+        qpos=jnp.asarray(qpos.T, jnp.float32),
+        qvel=jnp.asarray(qvel.T, jnp.float32),
+        act=jnp.asarray(activations.T, jnp.float32) if mj_model.na else None,
+    )

@@ -4,25 +4,28 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from brax.training.agents.ppo.networks import PPONetworks
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
-from bounce_mjx.evaluation.results import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Policy, act
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
 
 
 def make_evaluator(
-    env: BounceBall, networks: PPONetworks, episodes: int
+    env: BounceBall, networks: Networks, episodes: int
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
     from its own reset; it stops when all have ended or the time is over."""
-    evaluate = make_recording_evaluator(env, networks, episodes, recorded=0)
-    return jax.jit(lambda policy, key: evaluate(policy, key)[0])
+    recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
+
+    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
+        return recording_evaluator(policy, key)[0]
+
+    return jax.jit(evaluate)
 
 
 def make_recording_evaluator(
-    env: BounceBall, networks: PPONetworks, episodes: int, recorded: int
+    env: BounceBall, networks: Networks, episodes: int, recorded: int
 ) -> Callable[[Policy, jax.Array], tuple[Statistics, Recording]]:
     """Like `make_evaluator`, with a recording of the first `recorded` episodes too."""
 
@@ -37,7 +40,7 @@ def make_recording_evaluator(
             states, statistics, recording, step = carry
             actions = act(networks, policy, states.obs.T)
             states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
-            recording = record(recording, states, statistics.running, step)
+            recording = record(env, recording, states, statistics.running, step)
             return states, accumulate(env, statistics, states, step), recording, step + 1
 
         recording = empty_recording(env.config.episode_steps, min(recorded, episodes))

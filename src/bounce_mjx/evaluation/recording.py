@@ -1,4 +1,4 @@
-"""What some episodes of an evaluation went through, kept to be drawn."""
+"""Recordings of an evaluation's episodes, for the figures."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,25 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.envs.base import State
 
-from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import OBSERVATION_SIZE, BounceBall
+from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.state import State
 
 RECORDED_EPISODES = 32
 
 
 class Recording(NamedTuple):
-    """T control steps of K episodes; what follows an episode's end means nothing."""
+    """T control steps of K episodes; entries after an episode's end have no meaning."""
 
-    observation: jax.Array
-    """After the step [T, 29, K]."""
+    joint_angles: jax.Array
+    """Of Joint1..Joint6, after the step [T, 6, K], rad."""
+    ball: jax.Array
+    """Ball positions after the step [T, 3, K], m."""
+    paddle: jax.Array
+    """Positions of the paddle's centre after the step [T, 3, K], m."""
+    target_height: jax.Array
+    """Target heights [T, K], m."""
     bounced: jax.Array
     """Whether the step was a bounce [T, K], bool."""
     apex: jax.Array
@@ -26,53 +32,50 @@ class Recording(NamedTuple):
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
 
-    @property
-    def ball(self) -> jax.Array:
-        """Ball positions [T, 3, K], m."""
-        return self.observation[:, 6:9]
-
-    @property
-    def paddle(self) -> jax.Array:
-        """Positions of the paddle's centre [T, 3, K], m."""
-        return self.observation[:, 25:28]
-
-    @property
-    def target_height(self) -> jax.Array:
-        """Target height of each episode [K], m."""
-        return self.observation[0, 28]
-
 
 def empty_recording(steps: int, episodes: int) -> Recording:
     """A recording before the first step."""
     return Recording(
-        observation=jnp.zeros((steps, OBSERVATION_SIZE, episodes)),
+        joint_angles=jnp.zeros((steps, len(JOINT_NAMES), episodes)),
+        ball=jnp.zeros((steps, 3, episodes)),
+        paddle=jnp.zeros((steps, 3, episodes)),
+        target_height=jnp.zeros((steps, episodes)),
         bounced=jnp.zeros((steps, episodes), bool),
         apex=jnp.zeros((steps, episodes)),
         running=jnp.zeros((steps, episodes), bool),
     )
 
 
-def record(recording: Recording, states: State, running: jax.Array, step: jax.Array) -> Recording:
+def record(
+    env: BounceBall, recording: Recording, states: State, running: jax.Array, step: jax.Array
+) -> Recording:
     """Writes one control step of the first K of E environments (batch last) into the recording.
+
+    It reads the true state and not the observation, which may be noisy.
 
     Args:
       states: after the step.
       running: whether each episode had not ended before it [E], bool.
       step: its index [], from 0.
     """
+    episodes = recording.running.shape[-1]
+    states, running = jax.tree.map(lambda x: x[..., :episodes], (states, running))
+    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
     now = Recording(
-        observation=states.obs,
+        joint_angles=kinematics.joint_angles,
+        ball=kinematics.ball_position,
+        paddle=kinematics.paddle_position,
+        target_height=states.pipeline_state.task.target_height,
         bounced=states.metrics["bounced"] > 0,
         apex=states.pipeline_state.task.apex,
         running=running,
     )
-    episodes = recording.running.shape[-1]
-    return jax.tree.map(lambda kept, new: kept.at[step].set(new[..., :episodes]), recording, now)
+    return jax.tree.map(lambda kept, new: kept.at[step].set(new), recording, now)
 
 
 def settled_bounces(recording: Recording, first_step: int) -> np.ndarray:
-    """Which steps are bounces that count in the result on the height [T, K], bool: those of
-    running episodes from `first_step` on."""
+    """Bounces that count in the result on the height [T, K], bool: bounces of running episodes from
+    `first_step` on."""
     bounces = np.array(recording.bounced & recording.running)
     bounces[: max(1, first_step)] = False
     return bounces
@@ -82,26 +85,29 @@ def apex_errors(recording: Recording, bounces: np.ndarray) -> np.ndarray:
     """Apex before each bounce minus the target height [N], m.
 
     Args:
-      bounces: which steps, [T, K] with N true.
+      bounces: the steps, [T, K] with N true.
     """
     before = np.roll(np.asarray(recording.apex), 1, axis=0)
     return (before - recording.target_height)[bounces]
 
 
 def hit_points(env: BounceBall, recording: Recording, bounces: np.ndarray) -> np.ndarray:
-    """Where the ball was over the paddle at each bounce: x and y in the paddle's own frame, from
-    its centre [N, 2], m.
+    """Ball position over the paddle at each bounce: x and y in the paddle's own frame, from its
+    centre [N, 2], m.
 
     Args:
-      bounces: which steps, [T, K] with N true.
+      bounces: the steps, [T, K] with N true.
     """
-    model, at = env.mj_model, find_addresses(env.mj_model)
+    model, addresses = env.mj_model, find_addresses(env.mj_model)
     data = mujoco.MjData(model)
-    observations = np.moveaxis(np.asarray(recording.observation), 1, 2)[bounces]
-    points = np.zeros((len(observations), 2))
-    for i, observation in enumerate(observations):
-        data.qpos[list(at.arm_qpos)] = observation[:6]
+    joint_angles, offsets = (
+        np.moveaxis(np.asarray(values), 1, 2)[bounces]
+        for values in (recording.joint_angles, recording.ball - recording.paddle)
+    )
+    points = np.zeros((len(offsets), 2))
+    for i, (angles, offset) in enumerate(zip(joint_angles, offsets, strict=True)):
+        data.qpos[list(addresses.arm_qpos)] = angles
         mujoco.mj_kinematics(model, data)
-        rotation = data.geom_xmat[at.paddle_geom].reshape(3, 3)
-        points[i] = (rotation.T @ (observation[6:9] - data.geom_xpos[at.paddle_geom]))[:2]
+        rotation = data.geom_xmat[addresses.paddle_geom].reshape(3, 3)
+        points[i] = (rotation.T @ offset)[:2]
     return points

@@ -1,7 +1,10 @@
 """The interface of a physics engine, and the choice of one for a model."""
 
+import contextlib
 import functools
+import io
 from collections.abc import Callable
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -9,7 +12,8 @@ import mujoco
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import fused
-from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.convergence import solver_warning
+from bounce_mjx.physics.parameters import PhysicsParameters, check_shapes
 from bounce_mjx.physics.state import PhysicsState
 
 
@@ -19,13 +23,13 @@ class Engine(NamedTuple):
     name: str
     """fused or mjx."""
     reason: str
-    """Why this one was chosen, for the user."""
+    """Reason of the choice, for the user."""
     step: Callable[[PhysicsParameters, PhysicsState, jax.Array, int], PhysicsState]
     """(parameters, state, ctrl [nu], number of physics steps) -> state."""
     paddle_position: Callable[[PhysicsParameters, jax.Array], jax.Array]
     """(parameters, qpos [nq]) -> world position [3] of the paddle's centre, m."""
     warnings: tuple[str, ...] = ()
-    """Differences to MuJoCo's C engine that the user should know; one sentence each."""
+    """Known differences to MuJoCo's C engine, one sentence each, for the user."""
 
 
 def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
@@ -34,30 +38,67 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     Raises:
       UserError: the engine does not support the model.
     """
-    if choice == "mjx":
-        return _mjx(mj_model, "chosen by --physics mjx")
-    try:
-        constants = fused.read_model(mj_model)
-    except fused.UnsupportedModelError as error:
-        if choice == "fused":
-            raise UserError(str(error)) from error
-        return _mjx(mj_model, str(error).split(";")[0])
+    beyond_fused = fused.unsupported_feature(mj_model)
+    if choice == "fused" or (choice == "auto" and beyond_fused is None):
+        if beyond_fused is not None:
+            raise UserError(_refusal(beyond_fused, _beyond_mjx(mj_model), "fused"))
+        reason = "the model qualifies" if choice == "auto" else "chosen by --physics fused"
+        warning = solver_warning(mj_model)
+        return _engine("fused", reason, fused, mj_model, () if warning is None else (warning,))
+    beyond_mjx = _beyond_mjx(mj_model)
+    if beyond_mjx is not None:
+        raise UserError(_refusal(beyond_fused, beyond_mjx, "mjx"))
+    reason = "chosen by --physics mjx" if choice == "mjx" else _lacks("fused", beyond_fused)
+    return _engine("mjx", reason, _mjx_engine(), mj_model, ())
+
+
+def _engine(
+    name: str,
+    reason: str,
+    implementation: ModuleType,
+    mj_model: mujoco.MjModel,
+    warnings: tuple[str, ...],
+) -> Engine:
+    constants = implementation.read_model(mj_model)
+
+    def step(
+        parameters: PhysicsParameters, state: PhysicsState, ctrl: jax.Array, num_substeps: int
+    ) -> PhysicsState:
+        check_shapes(parameters)
+        return implementation.step(constants, parameters, state, ctrl, num_substeps)
+
     return Engine(
-        name="fused",
-        reason="chosen by --physics fused" if choice == "fused" else "the model qualifies",
-        step=functools.partial(fused.step, constants),
-        paddle_position=functools.partial(fused.paddle_position, constants),
-    )
-
-
-def _mjx(mj_model: mujoco.MjModel, reason: str) -> Engine:
-    # MJX takes a second to import, which the fused engine saves.
-    from bounce_mjx.physics import mjx_engine
-
-    constants = mjx_engine.read_model(mj_model)
-    return Engine(
-        name="mjx",
+        name=name,
         reason=reason,
-        step=functools.partial(mjx_engine.step, constants),
-        paddle_position=functools.partial(mjx_engine.paddle_position, constants),
+        step=step,
+        paddle_position=functools.partial(implementation.paddle_position, constants),
+        warnings=warnings,
     )
+
+
+def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
+    return _mjx_engine().unsupported_feature(mj_model)
+
+
+def _mjx_engine() -> ModuleType:
+    # MJX takes seconds to import, which the fused engine saves, and prints a line for each of its
+    # optional parts that is not installed.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from bounce_mjx.physics import mjx_engine
+    return mjx_engine
+
+
+def _refusal(beyond_fused: str | None, beyond_mjx: str | None, choice: str) -> str:
+    """The sentence for a model with a feature that the chosen engine lacks."""
+    if beyond_fused is not None and beyond_fused == beyond_mjx:
+        return f"no physics engine here supports {beyond_fused}; change the MJCF"
+    if beyond_fused is not None and beyond_mjx is not None:
+        both = f"{_lacks('fused', beyond_fused)}, and {_lacks('mjx', beyond_mjx)}"
+        return f"{both}; change the MJCF"
+    if choice == "fused":
+        return f"{_lacks('fused', beyond_fused)}; use --physics mjx"
+    return f"{_lacks('mjx', beyond_mjx)}; use --physics fused"
+
+
+def _lacks(engine: str, feature: str | None) -> str:
+    return f"the {engine} physics does not support {feature}"

@@ -7,12 +7,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import find_addresses
+
+_INTEGRATORS = (
+    mujoco.mjtIntegrator.mjINT_EULER,
+    mujoco.mjtIntegrator.mjINT_RK4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
 
 
 class MjxModel(NamedTuple):
@@ -25,18 +31,53 @@ class MjxModel(NamedTuple):
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
-    """Constants of a compiled model.
-
-    Raises:
-      UserError: mjx does not implement a feature of the model.
-    """
-    try:
-        model = mjx.put_model(mj_model)
-    except NotImplementedError as error:
-        raise UserError(
-            f"MJX does not support this model ({error}); change the MJCF, or use --physics fused"
-        ) from error
+    """Constants of a compiled model that has no `unsupported_feature`."""
+    model = mjx.put_model(mj_model)
     return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
+
+
+def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
+    """A feature of the model that MJX does not compute; None if it computes all.
+
+    MJX refuses some features itself, and ignores others, which are named here.
+    """
+    m = mj_model
+    integrator = mujoco.mjtIntegrator(m.opt.integrator)
+    ignored = {
+        f"the integrator {integrator.name} (only Euler, RK4 and implicitfast)": (
+            integrator not in _INTEGRATORS
+        ),
+        "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
+        "plugins": m.nplugin > 0,
+        "flexes (flex, flexcomp)": m.nflex > 0,
+        "delayed actuators (delay)": np.any(m.actuator_delay),
+        "early activations (actearly)": np.any(m.actuator_actearly),
+        "damping or armature given to an actuator": (
+            np.any(m.actuator_damping)
+            or np.any(m.actuator_dampingpoly)
+            or np.any(m.actuator_armature)
+        ),
+        "nonlinear springs (stiffness with several numbers)": (
+            np.any(m.jnt_stiffnesspoly) or np.any(m.tendon_stiffnesspoly)
+        ),
+        "nonlinear damping (damping with several numbers)": (
+            np.any(m.dof_dampingpoly) or np.any(m.tendon_dampingpoly)
+        ),
+        "a solref of mixed signs": np.any(m.pair_solref[:, 0] * m.pair_solref[:, 1] < 0.0),
+        "a solimp without a width": np.any(m.pair_solimp[:, 2] <= mujoco.mjMINVAL),
+        "adhesion": np.any(m.pair_adhesion) or np.any(m.geom_adhesion),
+        "surface velocities (surfacevel)": np.any(m.geom_surfacevel),
+        "sleeping bodies (sleep)": m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
+        "the noslip solver (noslip_iterations)": m.opt.noslip_iterations > 0,
+    }
+    for feature, present in ignored.items():
+        if present:
+            return feature
+    try:
+        mjx.put_model(mj_model)
+    except NotImplementedError as error:
+        return f"a feature of the MJCF ({str(error).rstrip('.')})"
+    return None
 
 
 def step(

@@ -122,6 +122,10 @@ def edited_fields(
         put("geom_aabb", (ball_geom, slice(3, 6)), p.ball_radius)
         put("body_inertia", ball, current("body_inertia")[ball] * ratio)
         put("body_invweight0", (ball, 1), current("body_invweight0")[ball, 1] / ratio)
+    if p.ball_mass is not None or p.ball_radius is not None:
+        # MuJoCo keeps the inertia matrix of a body that moves alone, the ball, in the model.
+        put("dof_M0", np.array(at.ball_qvel[:3]), current("body_mass")[ball])
+        put("dof_M0", np.array(at.ball_qvel[3:]), current("body_inertia")[ball])
     if p.contact_stiffness is not None or p.contact_damping is not None:
         stiffness, damping = direct_solref(m)
         pair = _contact_pair(m)

@@ -1,5 +1,4 @@
-"""The learning curves of runs, read from their TensorBoard logs, and the runs that differ only in
-their seed as one group."""
+"""Learning curves from the TensorBoard logs of runs, grouped by config apart from the seed."""
 
 import json
 from collections.abc import Sequence
@@ -9,20 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import load_results, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.progress import load_results
 
-# What may differ in a group: the seed, where the run lies, and when it ended.
+# Settings that may differ within a group: the seed, the place of the run, its end, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
-# Settings that a label names.
+# Number of settings in a label.
 _MAX_NAMED = 3
 
 
 class Curve(NamedTuple):
-    """One quantity over the training; N points."""
+    """N points of one quantity over the training."""
 
     steps: np.ndarray
-    """Environment steps [N], rising."""
+    """Environment steps [N], in ascending order."""
     values: np.ndarray
     """[N]."""
 
@@ -32,33 +31,33 @@ class RunCurves(NamedTuple):
 
     run: Path
     curves: dict[str, Curve]
-    """By the name of the scalar, such as "episode/return"."""
+    """By the scalar's name, such as "episode/return"."""
     solved_steps: int | None
     """Environment steps at the first evaluation that met all five results."""
 
 
 class Group(NamedTuple):
-    """Runs whose configs differ in nothing but the seed, and how long they went on."""
+    """Runs whose configs differ only in `_FREE_KEYS`."""
 
     label: str
-    """The first settings in which the groups differ, and the number of seeds."""
+    """The first settings that tell this group from the others, and the number of seeds."""
     runs: list[RunCurves]
 
 
 def read_curves(run: Path) -> RunCurves:
-    """Reads the scalars that a run has logged so far.
+    """Reads the scalars in the log of a run.
 
     Raises:
-      UserError: there are none.
+      UserError: the log has no scalars.
     """
-    # As an import at the top it would slow down the start of a training.
+    # At the top of the file, this import would delay the start of a training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     # 0 keeps every point; the default drops points beyond 10,000.
     log = EventAccumulator(str(run), size_guidance={"scalars": 0}).Reload()
     curves = {}
     for name in log.Tags()["scalars"]:
-        # A resumed run may have logged a step twice; the later value is of the state that went on.
+        # A resumed run may have logged a step twice; the later value belongs to the final policy.
         values = {event.step: event.value for event in log.Scalars(name)}
         steps = sorted(values)
         curves[name] = Curve(np.array(steps), np.array([values[step] for step in steps]))
@@ -71,7 +70,7 @@ def read_curves(run: Path) -> RunCurves:
 
 
 def group_runs(runs: Sequence[Path]) -> list[Group]:
-    """Reads the runs' curves and puts those together whose configs differ only in the seed.
+    """Reads the curves of runs, grouped by config apart from the seed.
 
     Raises:
       UserError: a run has no config or no scalars.
@@ -91,7 +90,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
 
 
 def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and standard deviation over runs, at the steps [N] that all of them have.
+    """Mean and standard deviation over runs, at the steps [N] that all runs have.
 
     Returns:
       The steps, the means and the standard deviations, each [N].
@@ -104,7 +103,7 @@ def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _settings(config: TrainConfig) -> dict[str, Any]:
-    """The settings that shape the learning, by dotted name."""
+    """The settings that affect the learning, by dotted name."""
     flat: dict[str, Any] = {}
 
     def flatten(group: dict[str, Any], prefix: str) -> None:
@@ -119,7 +118,7 @@ def _settings(config: TrainConfig) -> dict[str, Any]:
 
 
 def _differences(settings: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each the settings that are not the same in all."""
+    """For each config, the settings that differ between the configs."""
     first = settings[0]
     names = [name for name in first if any(each[name] != first[name] for each in settings)]
     return [{name: each[name] for name in names} for each in settings]

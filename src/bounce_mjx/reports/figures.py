@@ -1,6 +1,6 @@
-"""The pictures of a training and of an evaluation, drawn with matplotlib.
+"""Figures of a training and of an evaluation, drawn with matplotlib.
 
-Nothing here touches pyplot, so that no screen is needed and several threads may draw.
+They do without pyplot, so they need no screen and can be drawn in several threads.
 """
 
 import contextlib
@@ -17,12 +17,12 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
-from bounce_mjx.evaluation.results import MAX_APEX_ERROR, SETTLING_SECONDS
+from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
 from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.rewards import TERM_NAMES
 
-# Tags of the log, what they are called in a picture, and the factor to the unit shown.
+# Tags of the log, their titles in the figure, and the factor to the displayed unit.
 CURVES = (
     ("episode/return", "return of an episode", 1.0),
     ("episode/bounces", "bounces in a row at its end", 1.0),
@@ -40,14 +40,14 @@ _STYLE = {
     "grid.color": "#e3e3e3",
     "axes.axisbelow": True,
     "legend.frameon": False,
-    # The same picture is the same file.
+    # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
 }
 
 
 def curves_figure(groups: Sequence[Group]) -> Figure:
-    """Return, bounces and apex error over the training; a dotted line where a run first met all
-    five results."""
+    """Return, bounces and apex error over the training, with a dotted line where a run first met
+    all five results."""
     with _style():
         figure = Figure(figsize=(10.0, 3.2))
         grid = figure.subplots(
@@ -65,19 +65,25 @@ def curves_figure(groups: Sequence[Group]) -> Figure:
 
 
 def rewards_figure(groups: Sequence[Group]) -> Figure:
-    """The fifteen weighted reward terms over the training."""
+    """The weighted reward terms over the training."""
+    columns = 5
+    rows = -(-len(TERM_NAMES) // columns)
+    height = 1.8 * rows
     with _style():
-        figure = Figure(figsize=(10.0, 5.4))
+        figure = Figure(figsize=(10.0, height))
+        # The margins, in inches, do not depend on the number of rows.
+        margins = dict(top=1.0 - 0.7 / height, bottom=0.6 / height)
         grid = figure.subplots(
-            3,
-            5,
-            gridspec_kw=dict(
-                left=0.06, right=0.985, top=0.87, bottom=0.11, wspace=0.42, hspace=0.55
-            ),
+            rows,
+            columns,
+            squeeze=False,
+            gridspec_kw=dict(left=0.06, right=0.985, wspace=0.42, hspace=0.55, **margins),
         )
-        for axes, name in zip(grid.flat, TERM_NAMES, strict=True):
+        for axes, name in zip(grid.flat, TERM_NAMES, strict=False):
             _draw_curve(axes, groups, f"reward/{name}", name.replace("_", " "), 1.0)
             axes.set_xlabel("")
+        for axes in grid.flat[len(TERM_NAMES) :]:
+            axes.remove()
         figure.suptitle(
             "weighted reward terms over environment steps, mean of a control step", fontsize=10
         )
@@ -86,8 +92,8 @@ def rewards_figure(groups: Sequence[Group]) -> Figure:
 
 
 def evaluation_figure(env: BounceBall, recording: Recording) -> Figure:
-    """One episode's ball height against its target, and of all recorded episodes the apex errors
-    and the hits on the paddle."""
+    """The ball's height and its target over the first recorded episode, and the apex errors and
+    the hits on the paddle of all recorded episodes."""
     recording = jax.device_get(recording)
     bounces = settled_bounces(recording, round(SETTLING_SECONDS / env.dt))
     with _style():
@@ -119,7 +125,7 @@ def image(figure: Figure, suffix: str) -> bytes:
 
 
 def pixels(figure: Figure) -> np.ndarray:
-    """A figure as colours [height, width, 3] from 0 to 255."""
+    """A figure as a picture [height, width, 3] (uint8)."""
     with _style():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
@@ -137,8 +143,8 @@ def _coloured(groups: Sequence[Group]) -> list[tuple[Group, str]]:
 
 
 def _draw_curve(axes: Axes, groups: Sequence[Group], name: str, title: str, factor: float) -> None:
-    """A line a group with one run; else faint lines, their mean, and a standard deviation to each
-    side of it as a band."""
+    """One line for a group of one run; for several runs faint lines, their mean, and a band of one
+    standard deviation to each side."""
     for group, colour in _coloured(groups):
         curves = [run.curves[name] for run in group.runs if name in run.curves]
         if not curves:
@@ -181,10 +187,10 @@ def _add_legend(figure: Figure, groups: Sequence[Group], *, solved: bool) -> Non
 
 
 def _draw_heights(axes: Axes, env: BounceBall, recording: Recording) -> None:
-    """The first episode, up to its end."""
+    """The first recorded episode, up to its end."""
     steps = int(np.asarray(recording.running[:, 0]).sum())
     time = env.dt * (1 + np.arange(steps))
-    target = float(recording.target_height[0])
+    target = float(recording.target_height[0, 0])
     axes.axhspan(
         target - MAX_APEX_ERROR, target + MAX_APEX_ERROR, color="#009E73", alpha=0.12, lw=0
     )
@@ -202,7 +208,7 @@ def _draw_apex_errors(axes: Axes, errors: np.ndarray) -> None:
     axes.set_title(f"apex minus target height, cm ({len(errors):,} bounces after 2 s)")
     axes.set_ylabel("bounces")
     if not len(errors):
-        _say_none(axes)
+        _note_no_bounce(axes)
         return
     half = max(1.25 * MAX_APEX_ERROR, 1.05 * float(np.abs(errors).max()))
     axes.hist(100 * errors, bins=51, range=(-100 * half, 100 * half), color=_COLOURS[0])
@@ -212,7 +218,7 @@ def _draw_apex_errors(axes: Axes, errors: np.ndarray) -> None:
 
 
 def _draw_hits(axes: Axes, env: BounceBall, points: np.ndarray) -> None:
-    """The paddle's outline, and each hit in it."""
+    """The paddle's outline with a dot for each hit."""
     half_x, half_y = env.mj_model.geom("blocker").size[:2]
     axes.set_title(f"hits on the paddle, cm ({len(points):,})")
     axes.add_patch(
@@ -240,10 +246,10 @@ def _draw_hits(axes: Axes, env: BounceBall, points: np.ndarray) -> None:
     axes.set_xlabel("paddle's y")
     axes.set_ylabel("paddle's x")
     if not len(points):
-        _say_none(axes)
+        _note_no_bounce(axes)
 
 
-def _say_none(axes: Axes) -> None:
+def _note_no_bounce(axes: Axes) -> None:
     axes.text(
         0.5,
         0.5,

@@ -1,6 +1,6 @@
-"""The report of a run, one self-contained page: `python -m bounce_mjx.report [RUN]`.
+"""The report of a run: one self-contained HTML page.
 
-The main job writes it too, once it has printed its results.
+A training writes it after its results; `bounce-mjx report [RUN]` writes it again.
 """
 
 import base64
@@ -25,21 +25,18 @@ from bounce_mjx.reports.figures import (
     image,
     rewards_figure,
 )
-from bounce_mjx.reports.tables import details_line, verdict
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
-    Checkpoint,
-    load_policy,
-    load_results,
-    load_run_config,
-)
+from bounce_mjx.reports.tables import details_line, figure_text, verdict
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.env import BounceBall
 
 REPORT_FILE = "report.html"
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
-    """Runs the policy of a checkpoint for some episodes, on the physics engine of its config."""
+    """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     env = BounceBall(config.env)
@@ -55,7 +52,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
       recording: episodes of the run's best checkpoint.
 
     Returns:
-      The page, and its picture of the evaluation.
+      The page's path, and its figure of the evaluation.
 
     Raises:
       UserError: the run has no results or no log yet, or the page cannot be written.
@@ -92,7 +89,11 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [f"{e['steps']:,}", *[f"{e[name]:.2f}" for name in names], "pass" if e["passed"] else "-"]
+        [
+            f"{e['steps']:,}",
+            *[figure_text(e[name]) for name in names],
+            "pass" if e["passed"] else "-",
+        ]
         for e in results["evaluations"]
     ]
     return f"""<!DOCTYPE html>
@@ -123,14 +124,14 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 
 def _results(report: Report) -> str:
     rows = [
-        [result.name, result.measured, f"{result.value:.2f}", result.bound, verdict(result)]
+        [result.name, result.measured, figure_text(result.value), result.bound, verdict(result)]
         for result in report.results
     ]
     return _table(["result", "measured", "value", "bound", ""], rows)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; a cell is coloured where it is a verdict."""
+    """A table in HTML, with coloured verdicts."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
         inner = "".join(f'<{tag} class="{_class(c)}">{html.escape(c)}</{tag}>' for c in cells)

@@ -1,19 +1,20 @@
 """The results of an evaluation as tables and lines of text."""
 
-import typing
-
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from bounce_mjx.evaluation.results import Report, Result
 
-if typing.TYPE_CHECKING:
-    pass
+
+def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit: str = "") -> str:
+    """A measured figure, times `scale`, as text; "none" where there was nothing to measure."""
+    return "none" if value is None else f"{scale * value:{spec}}{unit}"
 
 
 def results_table(report: Report, title: str) -> Table:
     """The five results as a table."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=escape(title), title_justify="left")
     for column, justify in (
         ("result", "left"),
         ("measured", "left"),
@@ -27,7 +28,7 @@ def results_table(report: Report, title: str) -> Table:
         table.add_row(
             result.name,
             result.measured,
-            f"{result.value:.2f}",
+            figure_text(result.value),
             result.bound,
             colour + verdict(result),
         )
@@ -35,11 +36,11 @@ def results_table(report: Report, title: str) -> Table:
 
 
 def seeds_table(reports: dict[int, Report | None]) -> Table:
-    """The five results of several seeds, the mean number of bounces in a row and the mean apex
-    error, with mean and standard deviation over the seeds.
+    """The best checkpoint of each seed, with the mean and the standard deviation over the seeds:
+    the five results, the consecutive bounces and the apex error.
 
     Args:
-      reports: by seed; None for one that diverged before any evaluation.
+      reports: by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
     table = Table(title="best checkpoint of each seed", title_justify="left")
@@ -49,24 +50,33 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     for column in ("bounces", "apex, cm", "all five"):
         table.add_column(column, justify="right")
 
-    def figures(report: Report) -> list[float]:
-        values = [result.value for result in report.results]
-        details = report.details
-        apex_error = 100 * details["mean_apex_error_m"]
-        return [*values, details["mean_consecutive_bounces"], apex_error]
-
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")
             continue
         met = "[green]pass" if report.passed else "[red]FAIL"
-        table.add_row(str(seed), *[f"{value:.2f}" for value in figures(report)], met)
+        table.add_row(str(seed), *map(figure_text, _seed_figures(report)), met)
     table.add_section()
-    values = np.array([figures(report) for report in known])
+    columns = list(zip(*map(_seed_figures, known), strict=True))
     passed = sum(report.passed for report in known)
-    table.add_row("mean", *[f"{v:.2f}" for v in values.mean(axis=0)], f"{passed}/{len(reports)}")
-    table.add_row("std", *[f"{v:.2f}" for v in values.std(axis=0)], "")
+    # Where a seed lacks a figure, a mean of the other seeds would flatter the training.
+    for name, statistic, met in (
+        ("mean", np.mean, f"{passed}/{len(reports)}"),
+        ("std", np.std, ""),
+    ):
+        cells = [figure_text(None if None in c else statistic(c)) for c in columns]
+        table.add_row(name, *cells, met)
     return table
+
+
+def _seed_figures(report: Report) -> list[float | None]:
+    """A seed's row in the table."""
+    apex_error = report.details["mean_apex_error_m"]
+    return [
+        *[result.value for result in report.results],
+        report.details["mean_consecutive_bounces"],
+        None if apex_error is None else 100.0 * apex_error,
+    ]
 
 
 def results_markdown(report: Report) -> str:
@@ -74,21 +84,24 @@ def results_markdown(report: Report) -> str:
     lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
     for result in report.results:
         # A bare | would begin a new cell.
-        cells = (result.name, result.measured.replace("|", "&#124;"), f"{result.value:.2f}")
-        lines.append(f"| {' | '.join(cells)} | {result.bound} | {verdict(result)} |")
+        measured = result.measured.replace("|", "&#124;")
+        cells = (result.name, measured, figure_text(result.value), result.bound, verdict(result))
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def verdict(result: Result) -> str:
-    """What became of a result, in a word or two."""
+    """Whether a result met its bound, in a word or two."""
     return {True: "pass", False: "FAIL", None: "not judged"}[result.passed]
 
 
 def details_line(report: Report) -> str:
-    """The figures beside the five results, in one line."""
-    d = report.details
+    """The further figures of an evaluation, in one line."""
+    details = report.details
+    apex_error = figure_text(details["mean_apex_error_m"], ".1f", 100.0, " cm")
     return (
-        f"{d['episodes']:.0f} episodes: {d['mean_consecutive_bounces']:.1f} consecutive bounces, "
-        f"|apex error| {100 * d['mean_apex_error_m']:.1f} cm, return {d['mean_return']:.0f}, "
-        f"length {d['mean_length_s']:.2f} s (means)"
+        f"{details['episodes']:.0f} episodes: "
+        f"{details['mean_consecutive_bounces']:.1f} consecutive bounces, "
+        f"|apex error| {apex_error}, return {details['mean_return']:.0f}, "
+        f"length {details['mean_length_s']:.2f} s (means)"
     )

@@ -18,6 +18,22 @@ JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
 
+# Numbers that MuJoCo's compiler can compute from others.
+_DERIVED_FIELDS = frozenset(
+    (
+        "actuator_acc0",
+        "actuator_length0",
+        "body_inertia",
+        "body_invweight0",
+        "body_subtreemass",
+        "dof_M0",
+        "dof_invweight0",
+        "dof_length",
+        "geom_aabb",
+        "geom_rbound",
+    )
+)
+
 
 class Addresses(NamedTuple):
     """Where the named parts lie in the model's arrays."""
@@ -39,30 +55,73 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float) -> mujoco.MjModel:
+def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
       mjcf: the file; None for the project's own robot.
       physics_dt: physics time step, s.
+      visual: False leaves out textures and geoms that are only there for pictures, which take most
+        of a model's memory.
 
     Raises:
-      UserError: the file is missing, is no MJCF, or lacks a name that the task needs.
+      UserError: the file is missing, is no MJCF, lacks a name that the task needs, drives a joint
+        by something else than a position servo, or has a number that cannot be simulated.
     """
     path = mjcf or resource_path("mjcf/bounce_ball.xml")
     if not os.path.isfile(path):
         raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
     try:
-        mj_model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+        mj_model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"the MJCF file {path} does not compile ({reason}); mend it") from error
-    mj_model.opt.timestep = physics_dt
     try:
-        find_addresses(mj_model)
+        _check_numbers(mj_model)
+        _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
         raise UserError(f"the MJCF file {path} has {error}") from error
+    mj_model.opt.timestep = physics_dt
     return mj_model
+
+
+def _check_numbers(mj_model: mujoco.MjModel) -> None:
+    """Refuses a time step that is not positive, and numbers that are not finite."""
+    step = mj_model.opt.timestep
+    if not 0.0 < step < np.inf:
+        raise UserError(f"the timestep {step}; give a positive number of seconds")
+    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
+    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
+    # A derived number is not finite because of one in the file, which the message must name.
+    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
+        values = np.asarray(getattr(owner, name))
+        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
+            value = values[~np.isfinite(values)][0]
+            raise UserError(f"the number {value} in {name}; give finite numbers")
+
+
+def _check_servos(mj_model: mujoco.MjModel, at: Addresses) -> None:
+    """Refuses actuators whose control is not the position that they drive their joint to."""
+    plain_or_filtered = (
+        mujoco.mjtDyn.mjDYN_NONE,
+        mujoco.mjtDyn.mjDYN_FILTER,
+        mujoco.mjtDyn.mjDYN_FILTEREXACT,
+    )
+    for name, actuator in zip(JOINT_NAMES, at.actuators, strict=True):
+        is_position_servo = (
+            mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+            and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+            and mujoco.mjtDyn(mj_model.actuator_dyntype[actuator]) in plain_or_filtered
+            and mj_model.actuator_gainprm[actuator, 0] > 0.0
+            and mj_model.actuator_biasprm[actuator, 1] < 0.0
+        )
+        if not is_position_servo:
+            raise UserError(
+                f"an actuator on {name} that is no position servo; drive it by "
+                f'<position joint="{name}"/>'
+            )
 
 
 def find_addresses(mj_model: mujoco.MjModel) -> Addresses:

@@ -1,16 +1,20 @@
 """The settings of a training run, and the files that hold them."""
 
+import stat
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import yaml
-from pydantic import Field
 
-from bounce_mjx.config.settings import Count, PlainPath, Steps, StrictModel
+from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.task.config import EnvConfig
+
+CONFIG_FILE = "config.yaml"
+_MAX_CONFIG_BYTES = 2**16
+_MAX_ALIASES = 10
 
 
 class TrainConfig(StrictModel):
@@ -20,7 +24,7 @@ class TrainConfig(StrictModel):
     """The task."""
     ppo: PPOConfig = PPOConfig()
     """The trainer."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: NonNegativeInt = 0
     """Seed of the whole training."""
     num_seeds: Count = 1
     """Independent trainings in one program, from seeds `seed`, `seed` + 1, ...; a folder each."""
@@ -35,9 +39,9 @@ class TrainConfig(StrictModel):
     """Environment steps between two evaluations, rounded to whole blocks."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the five results."""
-    screening_episodes: Annotated[int, Field(ge=0)] = 0
+    screening_episodes: NonNegativeInt = 0
     """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
-    eval_seed: Annotated[int, Field(ge=0, lt=2**31)] = 10_000
+    eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during the training."""
     stop_when_solved: bool = False
     """End at the first evaluation that meets all five results."""
@@ -45,7 +49,27 @@ class TrainConfig(StrictModel):
     """Folder in which the run makes its own, named by the time."""
 
 
-_MAX_CONFIG_BYTES = 2**20
+class _Loader(yaml.SafeLoader):
+    """Refuses YAML whose size multiplies, as groups that repeat groups do."""
+
+    _aliases = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        is_alias = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        self._aliases += is_alias and isinstance(node, yaml.CollectionNode)
+        if self._aliases > _MAX_ALIASES:
+            raise yaml.YAMLError(f"it repeats a group more than {_MAX_ALIASES} times")
+        return node
+
+
+def load_run_config(run: Path) -> TrainConfig:
+    """The resolved config of a run.
+
+    Raises:
+      UserError: it is missing or damaged.
+    """
+    return load_config(run / CONFIG_FILE)
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -55,11 +79,13 @@ def load_config(path: Path) -> TrainConfig:
       UserError: the file is missing, is no YAML mapping, or holds an unknown key or a bad value.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(_MAX_CONFIG_BYTES + 1)
+        # To open a pipe would wait for a writer, and a device may have no end.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError("it is not a regular file")
+        data = path.read_bytes()
         if len(data) > _MAX_CONFIG_BYTES:
             raise ValueError(f"it is longer than {_MAX_CONFIG_BYTES} bytes")
-        values = yaml.safe_load(data.decode("utf-8"))
+        values = _Loader(data.decode("utf-8")).get_single_data()
     # PyYAML raises many types where a value has the form of a number or a date but is none.
     except Exception as error:
         reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())

@@ -1,4 +1,4 @@
-"""The settings of the task."""
+"""Settings of the task."""
 
 import math
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Literal
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
-from bounce_mjx.task.reward_config import RewardConfig
+from bounce_mjx.task.rewards import RewardConfig
 
 ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 

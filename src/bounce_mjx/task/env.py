@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-from brax.envs.base import Env, State
 
 from bounce_mjx.physics import Engine, PhysicsParameters, PhysicsState, make_engine
 from bounce_mjx.robot.model import (
@@ -18,18 +17,24 @@ from bounce_mjx.robot.model import (
     resting_activations,
 )
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.rewards import TERM_NAMES, RewardInputs, weighted_terms
+from bounce_mjx.task.observation import OBSERVATION, Kinematics
+from bounce_mjx.task.rewards import (
+    TERM_NAMES,
+    RewardInputs,
+    horizontal_distance,
+    weighted_terms,
+)
+from bounce_mjx.task.state import State
 
-OBSERVATION_SIZE = 29
-# MuJoCo's mjMAXVAL: a coordinate beyond it has diverged, and counts as non-finite.
+# MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
 
 
 class TaskState(NamedTuple):
-    """What an episode carries beside the physics."""
+    """State of an episode besides the physics."""
 
     target_height: jax.Array
-    """Height [] to which the ball is to bounce, m."""
+    """Target height of the bounces [], m."""
     last_action: jax.Array
     """Clipped action of the last step [6]."""
     rising: jax.Array
@@ -41,7 +46,7 @@ class TaskState(NamedTuple):
 
 
 class BounceState(NamedTuple):
-    """The whole state of one environment: brax's `pipeline_state`."""
+    """The whole state of one environment, `State.pipeline_state`."""
 
     physics: PhysicsState
     task: TaskState
@@ -49,10 +54,11 @@ class BounceState(NamedTuple):
     """The world of this environment; drawn at its reset."""
 
 
-class BounceBall(Env):
-    """One environment, unbatched and pure: `jax.vmap` and `jax.jit` its `reset` and `step`.
+class BounceBall:
+    """One environment, unbatched and pure: use `jax.vmap` and `jax.jit` on `reset` and `step`.
 
-    `done` is 1 where the episode terminated; time-outs belong to the training wrapper.
+    It has the interface of brax's `Env` by structure. `done` is 1 where the episode terminated;
+    the time limit belongs to the training wrapper.
     """
 
     def __init__(
@@ -84,7 +90,7 @@ class BounceBall(Env):
     @property
     def observation_size(self) -> int:
         """Length of the observation vector."""
-        return OBSERVATION_SIZE
+        return OBSERVATION.size
 
     @property
     def action_size(self) -> int:
@@ -96,10 +102,15 @@ class BounceBall(Env):
         """Name of the physics engine."""
         return self.engine.name
 
+    @property
+    def unwrapped(self) -> "BounceBall":
+        """The environment itself, as there is no wrapper around it."""
+        return self
+
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         check_unedited(self.mj_model, self._fingerprint)
-        config, at = self.config, self._addresses
+        config, addresses = self.config, self._addresses
         parameters = PhysicsParameters()
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
@@ -112,12 +123,12 @@ class BounceBall(Env):
         qpos = [jnp.asarray(q, noise.dtype) for q in self.mj_model.qpos0]
         qvel = [zero] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
-            qpos[at.arm_qpos[i]] = angle + config.joint_angle_noise * noise[i]
-            qvel[at.arm_qvel[i]] = config.joint_velocity_noise * noise[6 + i]
+            qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * noise[i]
+            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * noise[6 + i]
         for i, coordinate in enumerate(config.ball_init_pos):
-            qpos[at.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
+            qpos[addresses.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
-            qpos[at.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
+            qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
         physics = PhysicsState(
             jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
         )
@@ -127,17 +138,16 @@ class BounceBall(Env):
             last_action=jnp.zeros(self.action_size, noise.dtype),
             rising=jnp.zeros((), bool),
             n_bounces=zero,
-            apex=physics.qpos[at.ball_qpos[2]],
+            apex=physics.qpos[addresses.ball_qpos[2]],
         )
         metrics = {f"reward/{name}": zero for name in TERM_NAMES}
         metrics |= dict.fromkeys(
             ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"), zero
         )
+        state = BounceState(physics, task, parameters)
         return State(
-            pipeline_state=BounceState(physics, task, parameters),
-            obs=self._observation(
-                physics, task, self.engine.paddle_position(parameters, physics.qpos)
-            ),
+            pipeline_state=state,
+            obs=self.observe(self.kinematics(state), task),
             reward=zero,
             done=zero,
             metrics=metrics,
@@ -157,12 +167,12 @@ class BounceBall(Env):
     def servo_targets(self, physics: PhysicsState, action: jax.Array) -> jax.Array:
         """Servo targets ctrl [nu] of a clipped action [6]: the measured joint angles plus the
         scaled action (rad), clipped to the range of each joint that has one, times the gear."""
-        model, at = self.mj_model, self._addresses
+        model, addresses = self.mj_model, self._addresses
         targets = [jnp.zeros_like(action[0])] * model.nu
         # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
-        for i, actuator in enumerate(at.actuators):
-            target = physics.qpos[at.arm_qpos[i]] + self.config.action_scale * action[i]
-            low, high = (float(limit) for limit in model.jnt_range[at.arm_joints[i]])
+        for i, actuator in enumerate(addresses.actuators):
+            target = physics.qpos[addresses.arm_qpos[i]] + self.config.action_scale * action[i]
+            low, high = (float(limit) for limit in model.jnt_range[addresses.arm_joints[i]])
             if low < high:
                 target = jnp.clip(target, low, high)
             gear = float(model.actuator_gear[actuator, 0])
@@ -176,7 +186,7 @@ class BounceBall(Env):
         A non-finite physics state ends the episode and is replaced by the one before it, so that
         nothing non-finite leaves the environment.
         """
-        config, at = self.config, self._addresses
+        config = self.config
         before = state.pipeline_state
         finite = jnp.array(True)
         for coordinates in jax.tree.leaves(physics):
@@ -191,28 +201,33 @@ class BounceBall(Env):
         )
         action = jnp.where(finite, action, before.task.last_action)
 
-        ball = jnp.stack([physics.qpos[i] for i in at.ball_qpos[:3]])
-        ball_velocity = jnp.stack([physics.qvel[i] for i in at.ball_qvel[:3]])
-        joint_velocity = jnp.stack([physics.qvel[i] for i in at.arm_qvel])
-        paddle = self.engine.paddle_position(before.parameters, physics.qpos)
+        kinematics = self.kinematics(before._replace(physics=physics))
+        ball = kinematics.ball_position
 
-        task, bounced = update_task(config, before.task, ball, ball_velocity, paddle, action)
+        task, bounced = update_task(
+            config,
+            before.task,
+            ball,
+            kinematics.ball_velocity,
+            kinematics.paddle_position,
+            action,
+        )
         terms = weighted_terms(
             config.reward,
             RewardInputs(
                 ball_position=ball,
-                ball_velocity=ball_velocity,
-                paddle_position=paddle,
+                ball_velocity=kinematics.ball_velocity,
+                paddle_position=kinematics.paddle_position,
                 target_height=task.target_height,
                 n_bounces=task.n_bounces,
                 bounced=bounced,
                 action=action,
                 last_action=before.task.last_action,
-                joint_velocity=joint_velocity,
+                joint_velocity=kinematics.joint_velocities,
             ),
         )
-        ended = ~finite | terminated(config, ball, joint_velocity, task.target_height)
-        target = jnp.array([config.reward.target_x, config.reward.target_y], ball.dtype)
+        ended = ~finite | terminated(config, ball, kinematics.joint_velocities, task.target_height)
+        target = (config.reward.target_x, config.reward.target_y)
         apex_error = jnp.abs(before.task.apex - task.target_height)
 
         dtype = ball.dtype
@@ -220,26 +235,35 @@ class BounceBall(Env):
         metrics |= {
             "bounced": bounced.astype(dtype),
             "n_bounces": task.n_bounces,
-            "ball_xy_error": jnp.linalg.norm(ball[:2] - target),
+            "ball_xy_error": horizontal_distance(ball, target),
             "apex_error": jnp.where(bounced, apex_error, 0.0),
             "non_finite": (~finite).astype(dtype),
         }
         return state.replace(
             pipeline_state=before._replace(physics=physics, task=task),
-            obs=self._observation(physics, task, paddle),
+            obs=self.observe(kinematics, task),
             reward=sum(terms.values()),
             done=ended.astype(dtype),
-            metrics=metrics,
+            # Wrappers add metrics of their own, which a step must keep.
+            metrics=state.metrics | metrics,
         )
 
-    def _observation(self, physics: PhysicsState, task: TaskState, paddle: jax.Array) -> jax.Array:
-        """[29]: joint angles 6, ball position 3 and quaternion 4, joint velocities 6, ball's
-        linear 3 and angular 3 velocity, paddle position 3, target height 1."""
-        at = self._addresses
-        entries = [physics.qpos[i] for i in at.arm_qpos + at.ball_qpos]
-        entries += [physics.qvel[i] for i in at.arm_qvel + at.ball_qvel]
-        entries += [paddle[0], paddle[1], paddle[2], task.target_height]
-        return jnp.stack(entries)
+    def kinematics(self, state: BounceState) -> Kinematics:
+        """True positions and velocities of one environment's state, read from its physics."""
+        addresses, (qpos, qvel) = self._addresses, (state.physics.qpos, state.physics.qvel)
+        return Kinematics(
+            joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos]),
+            ball_position=jnp.stack([qpos[i] for i in addresses.ball_qpos[:3]]),
+            ball_quaternion=jnp.stack([qpos[i] for i in addresses.ball_qpos[3:]]),
+            joint_velocities=jnp.stack([qvel[i] for i in addresses.arm_qvel]),
+            ball_velocity=jnp.stack([qvel[i] for i in addresses.ball_qvel[:3]]),
+            ball_angular_velocity=jnp.stack([qvel[i] for i in addresses.ball_qvel[3:]]),
+            paddle_position=self.engine.paddle_position(state.parameters, qpos),
+        )
+
+    def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
+        """The observation [29], laid out as `OBSERVATION`; sensor noise would go here."""
+        return OBSERVATION.pack(kinematics._asdict() | {"target_height": task.target_height[None]})
 
 
 def update_task(

@@ -1,21 +1,22 @@
-"""Many environments at once: batching, time-outs and a fresh reset at every end.
+"""Batched environments with time limits; an ended episode is reset within the step that ends it.
 
-Inside, the batch is the last axis of every array, so that the physics works on contiguous
-coordinates; observations and actions face the learner with the batch first.
+Internally the batch is the last axis of every array, so that the physics works on contiguous
+coordinates. Observations [B, N] and actions [B, A] have the batch first.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+
+from bounce_mjx.task.state import Env, State
 
 
 class VectorState(NamedTuple):
     """State of a batch of B environments."""
 
     env: State
-    """brax states, the batch last in every array."""
+    """Environment states, the batch last in every array."""
     clock: jax.Array
     """Steps that count towards the time limit [B], int."""
     length: jax.Array
@@ -25,12 +26,13 @@ class VectorState(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """What one step of a batch of B environments gave."""
+    """Result of one step of B environments."""
 
     observation: jax.Array
-    """What to act on next [B, 29]: after an end, the first of the new episode."""
+    """Observation for the next action [B, N]; after an end, the first of the new episode."""
     final_observation: jax.Array
-    """What the step itself led to [B, 29]: at an end, the last of the old episode."""
+    """Observation after the step, before any reset [B, N]; at an end, the last of the old
+    episode."""
     reward: jax.Array
     """[B]."""
     terminated: jax.Array
@@ -57,24 +59,24 @@ def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
 
 
 def first_states(env: Env, key: jax.Array, num_envs: int) -> State:
-    """brax states at the start of `num_envs` episodes, the batch last; consumes `key`."""
+    """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`."""
     return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
 
 
 def observe(state: VectorState) -> jax.Array:
-    """Observations [B, 29]."""
+    """Observations [B, N]."""
     return state.env.obs.T
 
 
 def step(
     env: Env, state: VectorState, action: jax.Array, key: jax.Array, episode_steps: int
 ) -> tuple[VectorState, StepResult]:
-    """Advances every environment, and resets those that ended with a new draw.
+    """Advances every environment and resets each ended one with a new draw.
 
     Args:
-      action: [B, 6].
+      action: [B, A].
       key: consumed by the resets.
-      episode_steps: length at which an episode is truncated.
+      episode_steps: length of an episode at its time limit.
     """
     fresh = first_states(env, key, state.clock.shape[0])
     return step_with(env, state, action, fresh, episode_steps)
@@ -83,10 +85,10 @@ def step(
 def step_with(
     env: Env, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
 ) -> tuple[VectorState, StepResult]:
-    """`step` with resets that are drawn already: those of many steps at once cost less on a GPU.
+    """`step` with resets drawn beforehand; on a GPU, one draw for many steps costs less.
 
     Args:
-      fresh: `first_states` for those environments that end.
+      fresh: `first_states` that replace the states of ended episodes.
     """
     stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
     clock, length = state.clock + 1, state.length + 1

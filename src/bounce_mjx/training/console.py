@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.reports.tables import results_markdown
+from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
 
 if typing.TYPE_CHECKING:
@@ -85,9 +85,9 @@ class Reporter:
         )
         self._progress.update(self._task, completed=steps, figures=figures)
         if not self._console.is_terminal:
-            left = (self._total_steps - steps) * len(non_finite) / rate
-            line = f"{figures}  {seconds:.1f} s, {left:.0f} s left"
-            self._console.print(line, highlight=False, soft_wrap=True)
+            # The last block may go beyond the total.
+            left = max(0, self._total_steps - steps) * len(non_finite) / rate
+            self.say(f"{figures}  {seconds:.1f} s, {left:.0f} s left")
 
         if total := int(non_finite.sum()):
             had = "environment had a state that was not finite, and was reset"
@@ -97,7 +97,12 @@ class Reporter:
 
     def say(self, line: str) -> None:
         """Prints a line."""
-        self._console.print(line, highlight=False, soft_wrap=True)
+        say(self._console, line)
+
+    def flush(self) -> None:
+        """Writes everything reported so far to the logs' files."""
+        for log in self._logs:
+            log.flush()
 
     def saving_problem(
         self,
@@ -122,20 +127,31 @@ class Reporter:
         for log, report, sound in zip(self._logs, reports, healthy, strict=False):
             if not sound:
                 continue
-            for result in report.results:
-                log.add_scalar(f"results/{result.name.replace(' ', '_')}", result.value, steps)
-            for name, value in report.details.items():
-                log.add_scalar(f"results/{name}", value, steps)
-            log.add_text("results", results_markdown(report), steps)
+            group = "screening" if report.screening else "results"
+            values = {result.name.replace(" ", "_"): result.value for result in report.results}
+            for name, value in (values | report.details).items():
+                if value is not None:
+                    log.add_scalar(f"{group}/{name}", value, steps)
+            log.add_text(group, results_markdown(report), steps)
         if len(reports) == 1:
             (report,) = reports
             met = sum(result.passed is not False for result in report.results)
-            figures = ", ".join(f"{result.name} {result.value:.4g}" for result in report.results)
+            figures = ", ".join(
+                f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
+            )
             line = f"{met} of {len(report.results)} results met ({figures})"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
             line = f"{solved} of {len(reports)} seeds meet all results"
-        self.say(f"evaluation at {steps / 1e6:.1f}M steps: {line}")
+        kind = "evaluation"
+        if reports[0].screening:
+            kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"
+        self.say(f"{kind} at {steps / 1e6:.1f}M steps: {line}")
+
+
+def say(console: Console, line: str) -> None:
+    """Prints a line as it is: rich would read square brackets in a path as markup."""
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _finite_mean(values: np.ndarray) -> np.ndarray:

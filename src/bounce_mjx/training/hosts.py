@@ -1,34 +1,61 @@
-"""Training on several hosts: one process a host (or a device), of which the first is the leader.
+"""Training on several hosts: one process a host (or a device). Process 0 is the leader.
 
-Every process runs the same program on its part of the environments. What the leader alone decides
-or reads is told to the others; what all hold parts of is gathered, for the leader to save.
+Every process runs the same program on its part of the environments. The leader alone decides,
+reads and writes; the others receive its decisions (`exchange`) and send their parts of the state
+(`gather`).
 """
 
-from typing import Any, TypeVar
+import atexit
+import concurrent.futures
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
+from jax._src import distributed
 from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.training.peers import Address, Peers
 
 Tree = TypeVar("Tree")
+
+DEFAULT_TIMEOUT = 300
+
+_peers: Peers | None = None
+_host, _timeout = "", float(DEFAULT_TIMEOUT)
+_ADDRESS_BYTES = 128
 
 
 def join(
     coordinator_address: str | None = None,
     num_processes: int | None = None,
     process_id: int | None = None,
+    timeout: float = DEFAULT_TIMEOUT,
 ) -> None:
     """Joins the processes of one training; must come before any other use of JAX.
 
-    Without arguments, Slurm, Open MPI and Kubernetes tell them.
+    Without arguments, Slurm, Open MPI or Kubernetes supply them.
+
+    Args:
+      timeout: seconds to wait for the other processes, and without a sign of life after which one
+        of them counts as dead.
 
     Raises:
-      UserError: only some of the arguments are given and nothing tells the others, or the leader
-        cannot be reached.
+      UserError: only some of the arguments are given, no launcher supplies the others, or the
+        processes did not find each other in time.
     """
+    global _host, _timeout
     given = {
         "--coordinator-address": coordinator_address,
         "--num-processes": num_processes,
@@ -38,16 +65,104 @@ def join(
     if missing and len(missing) < len(given):
         raise UserError(
             f"{', '.join(f for f in given if f not in missing)} needs {', '.join(missing)} as well;"
-            " give all three, or only --distributed where Slurm, Open MPI or Kubernetes tell them"
+            " give all three, or only --distributed under Slurm, Open MPI or Kubernetes"
         )
+    _divert_native_output()
+    joined: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+    def initialize() -> None:
+        try:
+            # JAX's own time limits end the process with a stack trace: later than ours.
+            jax.distributed.initialize(
+                coordinator_address,
+                num_processes,
+                process_id,
+                initialization_timeout=int(2 * timeout + 60),
+                heartbeat_timeout_seconds=int(2 * timeout + 60),
+            )
+            joined.set_result(None)
+        except Exception as error:  # noqa: BLE001
+            joined.set_exception(error)
+
+    # In a thread, as the call cannot be interrupted.
+    threading.Thread(target=initialize, daemon=True).start()
     try:
-        jax.distributed.initialize(coordinator_address, num_processes, process_id)
-    except (RuntimeError, ValueError) as error:
+        joined.result(timeout)
+    except concurrent.futures.TimeoutError as error:
+        where = f" at {coordinator_address}" if coordinator_address else ""
+        raise UserError(
+            f"the processes of this training did not find each other{where} within {timeout:g} s; "
+            "check that all of them run, and that they reach the host and port of process 0, or "
+            "give them more time with --host-timeout"
+        ) from error
+    except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"the processes of this training cannot be joined ({reason}); start one process a host "
             "with --coordinator-address HOST:PORT, --num-processes N and --process-id I"
         ) from error
+    # Only JAX knows the address that a launcher supplied.
+    address = coordinator_address or distributed.global_state.coordinator_address
+    _host, _timeout = address.rpartition(":")[0].strip("[]"), timeout
+
+
+def connect(advice: Callable[[], str]) -> None:
+    """Connects the joined processes: from here on the death of one ends the others with a
+    sentence. Nothing happens in a training of one process.
+
+    Args:
+      advice: how to go on; the end of that sentence.
+
+    Raises:
+      UserError: the processes cannot reach each other.
+    """
+    global _peers
+    if jax.process_count() == 1:
+        return
+    peers = Peers(jax.process_index(), jax.process_count(), _timeout, advice, _exit)
+    server = None
+    words = np.zeros(_ADDRESS_BYTES, np.uint8)
+    if is_leader():
+        address, server = peers.listen()
+        encoded = f"{address.port} {address.token}".encode()
+        words[: len(encoded)] = np.frombuffer(encoded, np.uint8)
+    text = bytes(np.asarray(multihost_utils.broadcast_one_to_all(words), np.uint8)).decode()
+    port, token = text.rstrip("\0").split()
+    try:
+        if server is not None:
+            peers.accept(server, token)
+        else:
+            peers.connect(_host, Address(int(port), token))
+    except OSError as error:
+        raise UserError(
+            f"the processes of this training cannot reach each other at {_host}, port {port} "
+            f"({error}); open the ports between the hosts"
+        ) from error
+    _peers = peers
+
+
+def disconnect() -> None:
+    """Marks the end of the common work: every process may end as it likes."""
+    if _peers is not None:
+        _peers.close()
+
+
+@contextlib.contextmanager
+def leave_at_once() -> Iterator[None]:
+    """Ends a process of several that fails, without JAX's wait for the others at the exit."""
+    try:
+        yield
+    except SystemExit as error:
+        if error.code and _native_log is not None:
+            _exit(error.code)
+        raise
+    except Exception:
+        if _peers is None:
+            raise
+        # The death of another process makes JAX's exchange fail here; `Peers` names it.
+        time.sleep(3.0)
+        traceback.print_exc()
+        _exit(1)
 
 
 def is_leader() -> bool:
@@ -56,20 +171,14 @@ def is_leader() -> bool:
 
 
 def any_of(flag: bool) -> bool:
-    """Whether the flag is set in any process; all must ask at the same point."""
-    if jax.process_count() == 1:
-        return flag
-    return bool(multihost_utils.process_allgather(np.array(flag)).any())
+    """Whether the flag is set in any process. Every process must call this at the same point,
+    where it waits for the others as long as that takes."""
+    return flag if _peers is None else any(_peers.exchange(flag))
 
 
 def text_from_leader(text: str | None) -> str:
-    """The leader's text, in every process; the others give None."""
-    if jax.process_count() == 1:
-        return text
-    encoded = np.frombuffer((text or "").encode(), np.uint8)
-    length = int(multihost_utils.broadcast_one_to_all(np.int32(len(encoded))))
-    padded = encoded if is_leader() else np.zeros(length, np.uint8)
-    return bytes(multihost_utils.broadcast_one_to_all(padded)).decode()
+    """The leader's text, in every process; the others pass None."""
+    return text if _peers is None else _peers.exchange(text)[0]
 
 
 def gather(tree: Tree) -> Tree:
@@ -88,3 +197,51 @@ def distribute(tree: Tree, shardings: Any) -> Tree:
         return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
 
     return jax.tree.map(put, tree, shardings)
+
+
+_native_log: str | None = None
+# A reference, as ctypes keeps none.
+_on_abort = None
+
+
+def _divert_native_output() -> None:
+    """Sends the output of JAX's C++ to a file, and turns its abort into a sentence.
+
+    When process 0 dies, C++ prints pages and aborts in the same instant in which `Peers` notices.
+    """
+    global _native_log, _on_abort
+    sys.stderr.flush()
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="replace")
+    file, _native_log = tempfile.mkstemp(prefix="bounce_mjx_", suffix=".log")
+    os.dup2(file, 2)
+    os.close(file)
+    atexit.register(_remove, _native_log)
+
+    def abort(_: int) -> None:
+        # `Peers` knows more, and ends the process within this time if another one died.
+        time.sleep(3.0)
+        print(
+            f"error: JAX aborted this process; {_native_log} has the reason",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(1)
+
+    _on_abort = ctypes.CFUNCTYPE(None, ctypes.c_int)(abort)
+    # Not by the module signal, whose handlers run in the main thread alone.
+    libc = ctypes.CDLL(None)
+    libc.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
+    libc.signal(signal.SIGABRT, ctypes.cast(_on_abort, ctypes.c_void_p))
+
+
+def _remove(path: str) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(path)
+
+
+def _exit(status: Any) -> NoReturn:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if _native_log is not None:
+        _remove(_native_log)
+    os._exit(status if isinstance(status, int) else 1)

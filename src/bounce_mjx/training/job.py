@@ -1,4 +1,7 @@
-"""The main job's work: trains until it is done or stopped, evaluates and saves on the way."""
+"""The job: trains until it is done or stopped, and evaluates and saves meanwhile.
+
+It is the same for every algorithm (`trainer.Trainer`).
+"""
 
 import concurrent.futures
 import contextlib
@@ -7,9 +10,9 @@ import importlib
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -17,56 +20,59 @@ from rich.console import Console
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folder import (
+from bounce_mjx.runs.folders import (
     Checkpoint,
-    CheckpointWriter,
     best_checkpoint,
     create_run,
     find_run,
     has_checkpoint,
     latest_checkpoint,
-    load_progress,
-    load_training_state,
     save_config,
     seed_folders,
 )
+from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
+from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
-from bounce_mjx.training.console import Reporter
-from bounce_mjx.training.devices import make_mesh, state_sharding
+from bounce_mjx.training.console import Reporter, say
+from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import open_log
-from bounce_mjx.training.programs import compile_programs, initial_shapes, num_iterations
 from bounce_mjx.training.signals import StopRequest
+from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, iterations_per_block
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
+Tree = TypeVar("Tree")
+
 # Time between two attempts to save on a full disk once the training is over.
 RETRY_SECONDS = 2.0
 
-# Imported by name, beside the compilation, as drawing takes half a second to import; so is orbax.
+# Imported by name during the compilation, as its imports take half a second; so is orbax.
 REPORT_MODULE = "bounce_mjx.training.report"
 
 
 class Outcome(NamedTuple):
-    """What the training of one seed came to."""
+    """The end of the training of one seed."""
 
     run: Path
     """The run's folder; of several seeds, the seed's."""
     seed: int
     report: Report | None
-    """Evaluation of the best checkpoint; None if the training diverged before any."""
+    """Evaluation of the best checkpoint on fresh resets; None if the seed diverged before its first
+    evaluation."""
     best_steps: int
     """Environment steps at the best checkpoint."""
     solved_steps: int | None
     """Environment steps at the first evaluation that met all five results."""
     fault: str | None
-    """What was the first not to be finite, if the training diverged."""
+    """The first quantity that was not finite, and when, if the training diverged."""
     seconds: dict[str, float]
-    """Where the time went, for all seeds together."""
+    """Seconds by phase, of all seeds together."""
 
 
 class TrainingStopped(Exception):
@@ -74,24 +80,33 @@ class TrainingStopped(Exception):
 
 
 def train(
-    config: TrainConfig, console: Console, *, resume: Path | None = None, report: bool = True
+    config: TrainConfig,
+    console: Console,
+    make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+    *,
+    command: str,
+    resume: Path | None = None,
+    report: bool = True,
 ) -> list[Outcome]:
     """Trains as the config says; an outcome of each seed.
 
     Args:
+      make_trainer: builds the trainer; raises UserError where the config does not fit it.
+      command: the user's command, to which `--resume` may be added.
       resume: the run to go on with, in place.
-      report: prepare for drawing the report, beside the compilation.
+      report: import the modules of the report during the compilation.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
-        the training diverged, or its end could not be saved.
+        another process trains in the run's folder, the training diverged, or its end could not be
+        saved.
       TrainingStopped: SIGINT or SIGTERM came; the state is saved.
     """
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-        job = _Job(config, console, resume, stop, pool, stack)
+        job = _Job(config, console, make_trainer, command, resume, stop, pool, stack)
         job.compile(report)
         job.train()
         job.finish()
@@ -103,60 +118,85 @@ class _Member:
     """One seed of a training."""
 
     run: Path
-    """Where its best checkpoint and its log go; with one seed, the run's folder itself."""
+    """Folder of its best checkpoint and its log; with one seed, the run's folder itself."""
     config: TrainConfig
-    """As if it were trained alone."""
+    """Its config as a training of one seed."""
     progress: Progress
-    fault: str | None = None
-    """What was the first not to be finite, once it diverged."""
+    best_policy: Policy | None = None
+    """The policy of its best checkpoint, as numpy arrays, if this process trained it."""
+    final: Report | None = None
+    """Evaluation of its best checkpoint on fresh resets, after the end of the training."""
+
+    @property
+    def report(self) -> Report | None:
+        """The figures of its best checkpoint."""
+        return self.final or self.progress.best
 
 
 class _Job:
     """A training in progress.
 
     With several seeds the run's folder has the latest state of all, and each seed has a folder of
-    its own in it, which is like that of a run of one seed. On several hosts every process does the
-    same, but the leader alone writes.
+    its own in it, which is like the folder of a run of one seed. On several hosts every process
+    does the same, but the leader alone writes.
     """
 
     def __init__(
         self,
         config: TrainConfig,
         console: Console,
+        make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+        command: str,
         resume: Path | None,
         stop: StopRequest,
         pool: concurrent.futures.Executor,
         stack: contextlib.ExitStack,
     ):
         self.config, self.console, self.resumed = config, console, resume is not None
-        self.stop, self.pool, self.stack = stop, pool, stack
+        self.command, self.stop, self.pool, self.stack = command, stop, pool, stack
+        self.run: Path | None = resume
         self.clock = Clock()
+        hosts.connect(self._advice)
         self.env = BounceBall(config.env)
-        self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        # What is wrong with the config must be said before a folder is made.
-        trainer = make_trainer(config.ppo, self.env, config.env.episode_steps)
-        self.trainer = trainer if config.num_seeds == 1 else population(trainer)
-        self.block_steps = num_iterations(config) * config.ppo.batch_steps
+        # A mistake in the config must be found before a folder is made.
+        self.trainer = make_trainer(config, self.env)
+        self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
-        self.state: TrainingState | None = None
+        self.state: Any = None
         self.steps = 0
         if resume is None:
             self._create()
         else:
             self._resume(resume)
-        self.go_on = f"go on with: python train_jax.py --resume {shlex.quote(str(self.run))}"
-        self.device = self.mesh.devices.flat[0].device_kind
-        if self.mesh.size > 1:
-            self.device = f"{self.mesh.size} x {self.device}"
-        console.print(
-            f"physics: {self.env.engine.name} ({self.env.engine.reason})", highlight=False
-        )
-        console.print(f"device: {self.device}  run: {self.run}", highlight=False, soft_wrap=True)
+        mesh = self.trainer.mesh
+        self.device = mesh.devices.flat[0].device_kind
+        if mesh.size > 1:
+            self.device = f"{mesh.size} x {self.device}"
+        say(console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        for warning in self.env.engine.warnings:
+            say(console, f"warning: {warning}")
+        library = "" if self.trainer.library == JAX else f"library: {self.trainer.library}  "
+        say(console, f"device: {self.device}  {library}run: {self.run}")
         self.clock.lap("setup")
+
+    @property
+    def _go_on(self) -> str:
+        return f"go on with: {self.command} --resume {shlex.quote(str(self.run))}"
+
+    def _advice(self) -> str:
+        """How to go on after the death of a process."""
+        try:
+            latest = latest_checkpoint(self.run) if self.run else None
+        except UserError:
+            latest = None
+        if latest is None:
+            return "start again, as no checkpoint had been saved yet"
+        return f"{self._go_on} on every host (the last checkpoint is {latest.folder})"
 
     def _create(self) -> None:
         run = str(create_run(self.config)) if hosts.is_leader() else None
         self.run = Path(hosts.text_from_leader(run))
+        self._lock()
         self.members = [
             _Member(folder, config, Progress()) for folder, config in self._folders_of_seeds()
         ]
@@ -172,14 +212,24 @@ class _Job:
         alone = [self.config.model_copy(update={"seed": s, "num_seeds": 1}) for s in seeds]
         return list(zip(seed_folders(self.run, seeds), alone, strict=True))
 
+    def _lock(self) -> None:
+        """Takes the run's folder for this training; a refusal ends all processes."""
+        refusal = ""
+        if hosts.is_leader():
+            try:
+                self.stack.enter_context(lock_run(self.run))
+            except UserError as error:
+                refusal = str(error)
+        refusal = hosts.text_from_leader(refusal)
+        if refusal:
+            raise UserError(refusal)
+
     def _resume(self, path: Path) -> None:
         self.run = find_run(path)
-        shapes = initial_shapes(self.config, self.trainer)
+        self._lock()
         latest = latest_checkpoint(self.run)
-        state, plain = load_training_state(latest, shapes)
-        self.state = hosts.distribute(
-            state, state_sharding(self.mesh, shapes, self.config.num_seeds)
-        )
+        check_library(latest, self.trainer.library)
+        self.state, plain = load_training_state(latest, self.trainer.state_template())
         self.steps = latest.steps
         of_seeds = [plain] if self.config.num_seeds == 1 else plain["seeds"]
         self.members = [
@@ -190,45 +240,30 @@ class _Job:
             _write_config(self.run, self.config)
 
     def compile(self, report: bool) -> None:
-        """Compiles the programs, and starts what is written while they run."""
+        """Compiles the programs; logs are opened and modules imported meanwhile."""
         with self.console.status("compiling"):
-            first_step = self.steps if self.resumed else None
-            opening: concurrent.futures.Future | None = None
-
-            def open_logs() -> None:
-                nonlocal opening
-                opening = self.pool.submit(self._open_logs, first_step)
-                self.pool.submit(importlib.import_module, "orbax.checkpoint")
-                if report:
-                    opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
-
-            compiling = self.pool.submit(
-                compile_programs,
-                self.config,
-                self.env,
-                self.trainer,
-                self.mesh,
-                self.pool,
-                open_logs,
-            )
+            compiling = self.pool.submit(self._compile, report)
             if not self.stop.wait_for(compiling):
                 if self.resumed:
-                    raise TrainingStopped(f"stopped before anything was trained; {self.go_on}")
+                    raise TrainingStopped(f"stopped before anything was trained; {self._go_on}")
                 if hosts.is_leader():
                     shutil.rmtree(self.run, ignore_errors=True)
                 raise TrainingStopped(
                     f"stopped before anything was trained, so its folder {self.run} is removed"
                 )
-            self.programs = compiling.result()
-            if self.state is None:
-                self.state = jax.block_until_ready(self.programs.init())
+            opening = compiling.result()
+            # A process that has its programs from the cache waits here for one that compiles them:
+            # the exchange between devices would give up after 30 s.
+            hosts.any_of(False)
+            self.trainer.start(self.state)
+            self.state = None
         self.writers: list[CheckpointWriter] = []
         if hosts.is_leader():
             of_members = [(member.run, member.config) for member in self.members]
             several = self.config.num_seeds > 1
             self.writers = [
-                CheckpointWriter(*of)
-                for of in ([(self.run, self.config)] if several else []) + of_members
+                CheckpointWriter(*arguments)
+                for arguments in ([(self.run, self.config)] if several else []) + of_members
             ]
         for writer in self.writers:
             self.stack.callback(writer.close)
@@ -236,6 +271,18 @@ class _Job:
             Reporter(opening.result(), self.console, self.config, self.steps)
         )
         self.clock.lap("compile")
+
+    def _compile(self, report: bool) -> concurrent.futures.Future:
+        """Returns once the training can start, with the future of its logs. The longest program
+        goes first: Python traces one program at a time, while XLA compiles others."""
+        compiling = self.trainer.compile(self.pool)
+        opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
+        self.pool.submit(importlib.import_module, "orbax.checkpoint")
+        if report:
+            opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
+        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
+        compiling.result()
+        return opening
 
     def _open_logs(self, first_step: int | None) -> list["SummaryWriter"]:
         if not hosts.is_leader():
@@ -262,7 +309,7 @@ class _Job:
             self._run_block()
 
     def finish(self) -> None:
-        """Waits until all is saved.
+        """Waits until all is saved, and evaluates the best policy on fresh resets.
 
         Raises:
           TrainingStopped: a stop was requested.
@@ -273,7 +320,10 @@ class _Job:
         _wait_until_saved(self.writers, self.reporter, self.stop)
         self.clock.lap("save")
         if stopping:
-            raise TrainingStopped(f"stopped after {self.steps:,} steps; {self.go_on}")
+            hosts.disconnect()
+            raise TrainingStopped(f"stopped after {self.steps:,} steps; {self._go_on}")
+        self._evaluate_best()
+        hosts.disconnect()
 
     def outcomes(self) -> list[Outcome]:
         """What became of each seed."""
@@ -281,10 +331,10 @@ class _Job:
             Outcome(
                 m.run,
                 m.config.seed,
-                m.progress.best,
+                m.report,
                 m.progress.best_steps,
                 m.progress.solved_steps,
-                m.fault,
+                m.progress.fault,
                 self.clock.seconds,
             )
             for m in self.members
@@ -294,7 +344,7 @@ class _Job:
         return hosts.any_of(self.stop.requested)
 
     def _healthy(self) -> list[_Member]:
-        return [member for member in self.members if member.fault is None]
+        return [member for member in self.members if member.progress.fault is None]
 
     def _all_solved(self) -> bool:
         return all(member.progress.solved_steps is not None for member in self._healthy())
@@ -310,28 +360,74 @@ class _Job:
 
     def _evaluate(self) -> bool:
         """Evaluates and saves; False if a stop was requested meanwhile."""
-        evaluating = self.pool.submit(self.programs.evaluate, self.state)
+        snapshot = self.trainer.snapshot()
+        reports = self._wait_for_reports(self.evaluators.select, snapshot.policy)
+        if reports is None:
+            return False
+        healthy = [member.progress.fault is None for member in self.members]
+        self.reporter.evaluation(self.steps, reports, healthy)
+        best = []
+        for i, member in enumerate(self.members):
+            if healthy[i] and member.progress.improves(reports[i], self.steps):
+                member.best_policy = self._of_seed(snapshot.policy, i)
+                best.append(i)
+        self._save(best, snapshot)
+        return True
+
+    def _evaluate_best(self) -> None:
+        """Evaluates the best policies on fresh resets, and writes the results.
+
+        Raises:
+          TrainingStopped: a stop was requested meanwhile.
+        """
+        policies = [
+            member.best_policy or load_policy(best_checkpoint(member.run), member.config)
+            for member in self.members
+            if member.progress.best is not None
+        ]
+        # The place of a seed that diverged before its first evaluation is filled by another's.
+        filled = iter(policies)
+        policies = [
+            policies[0] if member.progress.best is None else next(filled) for member in self.members
+        ]
+        policy = policies[0]
+        if self.config.num_seeds > 1:
+            policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
+        reports = self._wait_for_reports(self.evaluators.final, policy)
+        if reports is None:
+            hosts.disconnect()
+            raise TrainingStopped(
+                f"stopped after {self.steps:,} steps, before the final evaluation; {self._go_on}"
+            )
+        for member, report in zip(self.members, reports, strict=True):
+            member.final = None if member.progress.best is None else report
+        for writer, member in zip(self.writers[-len(self.members) :], self.members, strict=False):
+            writer.save((), self.steps, member.best_policy, results=self._results(member))
+        _wait_until_saved(self.writers, self.reporter, self.stop)
+        self.clock.lap("save")
+
+    def _wait_for_reports(
+        self, evaluate: Callable[[Policy], list[Report]], policy: Policy
+    ) -> list[Report] | None:
+        """A report of each seed; None if a stop was requested meanwhile."""
+        if jax.process_count() > 1:
+            # See `compile`.
+            self.evaluators.wait()
+            hosts.any_of(False)
+        evaluating = self.pool.submit(evaluate, policy)
         # On several hosts a process that went its own way would keep the others waiting.
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
-            return False
+            return None
         reports = evaluating.result()
         self.clock.lap("evaluate")
-        healthy = [member.fault is None for member in self.members]
-        self.reporter.evaluation(self.steps, reports, healthy)
-        best = [
-            i
-            for i, (member, report) in enumerate(zip(self.members, reports, strict=True))
-            if member.fault is None and member.progress.improves(report, self.steps)
-        ]
-        self._save(best)
-        return True
+        return reports
 
     def _run_block(self) -> None:
         started = time.perf_counter()
-        block = self.pool.submit(self.programs.run, self.state)
+        block = self.pool.submit(self.trainer.run)
         if not self.stop.wait_for(block):
             self.reporter.say("stopping after this block; the same signal again ends it at once")
-        self.state, metrics = block.result()
+        metrics = block.result()
         seconds = time.perf_counter() - started
         faults = metrics.pop("fault")
         self.steps += self.block_steps
@@ -352,15 +448,15 @@ class _Job:
         """
         before = (self.steps - self.block_steps) // self.config.ppo.batch_steps
         for member, of_block in zip(self.members, faults, strict=True):
-            if member.fault is not None or not of_block.any():
+            if member.progress.fault is not None or not of_block.any():
                 continue
             first = int(np.argmax(of_block != 0))
-            member.fault = (
-                f"{CHECKED[of_block[first] - 1]} was the first that was not finite, at iteration "
-                f"{before + first + 1}"
+            member.progress.fault = (
+                f"{self.trainer.checked[int(of_block[first]) - 1]} was the first that was not "
+                f"finite, at iteration {before + first + 1}"
             )
             if self.config.num_seeds > 1:
-                self.reporter.say(f"seed {member.config.seed} diverged: {member.fault}")
+                self.reporter.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
         for writer in self.writers:
@@ -370,31 +466,78 @@ class _Job:
         except UserError:
             kept = "no checkpoint had been saved yet"
         raise UserError(
-            f"the training was stopped as it diverged: {self.members[-1].fault}; {kept}, and a new "
-            "run may do with a lower learning rate or other rewards"
+            f"the training was stopped as it diverged: {self.members[-1].progress.fault}; {kept}; "
+            "start a new run with a lower learning rate or other rewards"
         )
 
-    def _save(self, best: list[int]) -> None:
-        """Starts to save the latest state, and that of the seeds in `best` as their best."""
-        state = hosts.gather(self.state)
-        if not hosts.is_leader():
-            return
-        results = [
-            member.progress.results(self.steps, self.clock.seconds, self.device)
-            for member in self.members
-        ]
-        plain = [member.progress.to_dict() for member in self.members]
-        if self.config.num_seeds == 1:
-            names = ("latest", "best") if best else ("latest",)
-            self.writers[0].save(names, self.steps, policy_of(state), state, plain[0], results[0])
-        else:
-            seeds = {"seeds": plain}
-            self.writers[0].save(("latest",), self.steps, policy_of(state), state, seeds, None)
-            for i, writer in enumerate(self.writers[1:]):
-                names = ("best",) if i in best else ()
-                one = jax.tree.map(lambda x, i=i: x[i], state)
-                writer.save(names, self.steps, policy_of(one), one, plain[i], results[i])
+    def _save(self, best: list[int], snapshot: Snapshot | None = None) -> None:
+        """Starts to save the latest state, and for the seeds in `best` their best checkpoint.
+
+        Args:
+          snapshot: the latest state, if it is at hand.
+        """
+        policy, state = snapshot or self.trainer.snapshot()
+        # A second signal may end the process: the log must not lack what the checkpoint holds.
+        self.reporter.flush()
+        several = self.config.num_seeds > 1
+        library = {"library": self.trainer.library}
+        plain = [member.progress.model_dump() | library for member in self.members]
+        if several and self.writers:
+            self.writers[0].save(("latest",), self.steps, policy, state, {"seeds": plain} | library)
+        for i, writer in enumerate(self.writers[-len(self.members) :]):
+            names = ("best",) if i in best else ()
+            if not several:
+                names = ("latest", *names)
+            writer.save(
+                names,
+                self.steps,
+                self._of_seed(policy, i),
+                self._of_seed(state, i),
+                plain[i],
+                self._results(self.members[i]),
+            )
         self.clock.lap("save")
+
+    def _of_seed(self, tree: Tree, index: int) -> Tree:
+        """The part of one seed in a policy or a state."""
+        return tree if self.config.num_seeds == 1 else jax.tree.map(lambda x: x[index], tree)
+
+    def _results(self, member: _Member) -> dict[str, Any] | None:
+        """The content of the seed's results.json; None before its first evaluation."""
+        results = member.progress.results(self.steps, self.clock.seconds, self.device)
+        if results is None:
+            return None
+        figures = {} if member.final is None else member.final.to_dict()
+        return {
+            "library": self.trainer.library,
+            "fresh_resets": member.final is not None,
+            **results,
+            **figures,
+        }
+
+
+def check_library(checkpoint: Checkpoint, library: str) -> None:
+    """Compares the library that began a run with the one that is to go on.
+
+    Raises:
+      UserError: they differ, or the checkpoint is damaged.
+    """
+    began = library_of(checkpoint)
+    if began != library:
+        command = "train" if began == JAX else f"train-torch --library {began}"
+        raise UserError(
+            f"{checkpoint.run} was trained with {began}, not with {library}; go on with: "
+            f"bounce-mjx {command} --resume {shlex.quote(str(checkpoint.run))}"
+        )
+
+
+def library_of(checkpoint: Checkpoint) -> str:
+    """The library that trained a checkpoint.
+
+    Raises:
+      UserError: the checkpoint is damaged.
+    """
+    return str(read_record(checkpoint).progress.get("library", JAX))
 
 
 def _wait_until_saved(
@@ -427,7 +570,7 @@ def _write_config(run: Path, config: TrainConfig) -> None:
 
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> Progress:
     """The evaluations from which a seed goes on."""
-    progress = Progress.from_dict(plain, latest)
+    progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
         return progress
     # The best checkpoint itself knows best what it holds: it may be older than the latest one
@@ -435,7 +578,7 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = best_checkpoint(run)
-        stored = Progress.from_dict(load_progress(best), best)
+        stored = Progress.from_dict(read_record(best).progress, best.folder)
         progress.best, progress.best_steps = stored.best, stored.best_steps
     return progress
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.figures import pixels
 from bounce_mjx.reports.page import record_checkpoint, write_report
-from bounce_mjx.runs.folder import find_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.training.log import open_log
 
 

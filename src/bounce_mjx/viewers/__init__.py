@@ -1,1 +1,1 @@
-"""Ways to see the environment: a web page, MuJoCo's own viewer, a video, a replay page."""
+"""Viewers: a live web page, MuJoCo's own window, a video and an offline replay page."""

@@ -1,10 +1,10 @@
-"""The live page: the scene, controls and plots, served by viser to any browser."""
+"""The live page: the scene, controls and plots, which viser serves to any browser."""
 
 import collections
 import html
-import queue
 import socket
 import time
+from collections.abc import Mapping
 
 import numpy as np
 import viser
@@ -13,6 +13,7 @@ from rich.console import Console
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.viewers.controls import Controls
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene
@@ -22,19 +23,12 @@ from bounce_mjx.viewers.simulation import Frame, Simulation
 _PICTURE_RATE = 50.0
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
-_PUSHES = {
-    "up": (0, 0, 1),
-    "away": (1, 0, 0),
-    "back": (-1, 0, 0),
-    "left": (0, 1, 0),
-    "right": (0, -1, 0),
-}
 
 
 def run_browser(
     simulation: Simulation,
     *,
-    shown: int,
+    num_shown: int,
     speed: float,
     seconds: float | None,
     host: str,
@@ -45,65 +39,37 @@ def run_browser(
     """Serves the page until the simulated `seconds` are over (None: until Ctrl-C).
 
     Args:
-      shown: environments shown at first; the page's slider goes up to all of the simulation.
-      port: a free one.
+      num_shown: environments shown at first; the page's slider goes up to all of the simulation.
+      port: a free port.
     """
     with open_server(host, port) as server:
-        _Page(server, simulation, shown, speed, title).run(seconds, console)
+        page = _Page(server, simulation, num_shown=num_shown, speed=speed, title=title)
+        address = f"[{host}]" if ":" in host else host
+        # A host may look like markup.
+        console.print(
+            f"viewer: http://{address}:{server.get_port()}  (Ctrl-C ends it)",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+        page.run(seconds)
 
 
 class _Page:
+    """A simulation in real time on a server."""
+
     def __init__(
         self,
         server: viser.ViserServer,
         simulation: Simulation,
-        shown: int,
+        *,
+        num_shown: int,
         speed: float,
         title: str,
     ):
         self._server = server
         self._simulation = simulation
-        self._pace = Pace(simulation.env.dt)
-        self._scene = Scene(server, simulation.env, shown)
-        self._shown = shown
-        # The page's callbacks run in threads; what they ask for is done between two steps.
-        self._wishes: queue.SimpleQueue = queue.SimpleQueue()
-        self._history: collections.deque[Frame] = collections.deque(
-            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
-        )
-        self._add_controls(speed, shown, title)
-        self._add_plots()
-
-    def run(self, seconds: float | None, console: Console) -> None:
-        """Steps in real time, and sends pictures and plots."""
-        server, simulation = self._server, self._simulation
-        console.print(
-            f"viewer: http://{server.get_host()}:{server.get_port()}  (Ctrl-C ends it)",
-            highlight=False,
-            soft_wrap=True,
-        )
-        self._scene.update([simulation.frame])
-        left = float("inf") if seconds is None else round(seconds / simulation.env.dt)
-        next_plot = 0.0
-        while left > 0:
-            changed = self._grant_wishes()
-            due = 0 if self._paused.value else self._pace.due(self._speed.value)
-            due = min(due, left)
-            frames = [simulation.step() for _ in range(due)]
-            left -= due
-            self._history.extend(frames)
-            if frames or changed:
-                self._scene.update(frames or [simulation.frame])
-            if time.monotonic() >= next_plot and (frames or changed):
-                self._update_plots()
-                next_plot = time.monotonic() + 1.0 / _PLOT_RATE
-            time.sleep(1.0 / _PICTURE_RATE)
-            if self._paused.value:
-                self._pace.forget()
-        server.flush()
-
-    def _add_controls(self, speed: float, shown: int, title: str) -> None:
-        gui, simulation = self._server.gui, self._simulation
+        gui = server.gui
         gui.configure_theme(
             show_logo=False, show_share_button=False, control_width="medium",
             brand_color=(230, 95, 20),
@@ -111,45 +77,53 @@ class _Page:
         gui.set_panel_label("bounce_mjx")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(280)
-        gui.add_markdown(f"**{title}**")
-        self._paused = gui.add_checkbox("pause", False)
-        self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, float(np.clip(speed, 0.1, 2.0)))
-        number = gui.add_slider(
-            "robots", 1, max(2, simulation.num_envs), 1, shown, disabled=simulation.num_envs == 1
+        self._controls = Controls(server, simulation, title=title, speed=speed, num_shown=num_shown)
+        self._settings = self._controls.read()
+        self._scene = Scene(server, simulation.env, num_shown)
+        self._history: collections.deque[Frame] = collections.deque(
+            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
         )
-        reset = gui.add_button("reset", icon=viser.Icon.REFRESH)
-        low, high = simulation.env.config.target_height_range
-        with gui.add_folder("target height"):
-            drawn = gui.add_checkbox("drawn at each reset", simulation.target_height is None)
-            height = gui.add_slider(
-                "height, m", min(0.3, low), max(0.8, high), 0.01,
-                float(np.round(simulation.target_height or 0.5 * (low + high), 2)),
-            )  # fmt: skip
-        with gui.add_folder("push the ball"):
-            strength = gui.add_slider("speed, m/s", 0.05, 1.0, 0.05, 0.2)
-            push = gui.add_button_group("towards", tuple(_PUSHES))
+        self._add_plots()
 
-        @reset.on_click
-        def _(_) -> None:
-            self._wish(self._reset)
+    def run(self, seconds: float | None) -> None:
+        """Steps the simulation and sends pictures and plots."""
+        simulation = self._simulation
+        pace = Pace(simulation.env.dt)
+        self._scene.update([simulation.frame])
+        steps_left = float("inf") if seconds is None else round(seconds / simulation.env.dt)
+        next_plot = 0.0
+        while steps_left > 0:
+            changed = self._obey_controls()
+            due = 0 if self._settings.paused else pace.due(self._settings.speed)
+            due = min(due, steps_left)
+            frames = [simulation.step() for _ in range(due)]
+            steps_left -= due
+            self._history.extend(frames)
+            if frames or changed:
+                self._scene.update(frames or [simulation.frame])
+                if time.monotonic() >= next_plot:
+                    self._update_plots()
+                    next_plot = time.monotonic() + 1.0 / _PLOT_RATE
+            time.sleep(1.0 / _PICTURE_RATE)
+            if self._settings.paused:
+                pace.forget()
+        self._server.flush()
 
-        @number.on_update
-        def _(_) -> None:
-            self._wish(lambda: self._show(number.value))
-
-        @drawn.on_update
-        def _(_) -> None:
-            self._wish(lambda: self._aim(None if drawn.value else height.value))
-
-        @height.on_update
-        def _(_) -> None:
-            drawn.value = False
-            self._wish(lambda: self._aim(height.value))
-
-        @push.on_click
-        def _(_) -> None:
-            velocity = strength.value * np.array(_PUSHES[push.value])
-            self._wish(lambda: simulation.push(velocity))
+    def _obey_controls(self) -> bool:
+        """Applies the controls' settings and requests; whether there was any change."""
+        before, now = self._settings, self._controls.read()
+        self._settings = now
+        if now.target_height != before.target_height:
+            self._simulation.target_height = now.target_height
+        if now.num_shown != before.num_shown:
+            self._scene.show(now.num_shown)
+        reset, push = self._controls.take_reset(), self._controls.take_push()
+        if reset:
+            self._simulation.reset()
+            self._history.clear()
+        if push is not None:
+            self._simulation.push(push)
+        return now != before or reset or push is not None
 
     def _add_plots(self) -> None:
         gui = self._server.gui
@@ -173,7 +147,7 @@ class _Page:
                 height=190,
             )
             gui.add_markdown("reward, by term")
-            self._terms = gui.add_html(reward_bars(np.zeros(len(TERM_NAMES))))
+            self._terms = gui.add_html(reward_bars(dict.fromkeys(TERM_NAMES, 0.0)))
 
     def _update_plots(self) -> None:
         if not self._history:
@@ -185,61 +159,43 @@ class _Page:
         times = np.arange(1 - len(heights), 1) * dt
         self._heights.data = (times, *heights.T)
         recent = list(self._history)[-round(1.0 / _PLOT_RATE / dt) :]
-        self._terms.content = reward_bars(np.mean([f.reward_terms[0] for f in recent], axis=0))
-
-    def _wish(self, action) -> None:
-        self._wishes.put(action)
-
-    def _grant_wishes(self) -> bool:
-        """Does what the page asked for; whether it asked for anything."""
-        asked = False
-        while not self._wishes.empty():
-            self._wishes.get()()
-            asked = True
-        return asked
-
-    def _reset(self) -> None:
-        self._simulation.reset()
-        self._history.clear()
-
-    def _show(self, number: int) -> None:
-        if number != self._shown:
-            self._shown = number
-            self._scene.show(number)
-
-    def _aim(self, height: float | None) -> None:
-        self._simulation.target_height = height
+        terms = np.mean([frame.reward_terms[0] for frame in recent], axis=0)
+        self._terms.content = reward_bars(dict(zip(TERM_NAMES, terms, strict=True)))
 
 
-def reward_bars(terms: np.ndarray) -> str:
-    """A bar chart of weighted reward terms [15] as HTML, and their sum."""
-    rows = [
-        (name.replace("_", " "), value, value / max(5.0, np.abs(terms).max()))
-        for name, value in zip(TERM_NAMES, np.round(terms, 2) + 0.0, strict=True)
-    ]
+def reward_bars(terms: Mapping[str, float]) -> str:
+    """A bar chart of the weighted reward terms as HTML, and their sum."""
+    longest = max(5.0, *map(abs, terms.values()))
     lines = []
-    for name, value, share in rows:
+    for name, value in terms.items():
+        share = value / longest
         left = 50.0 + 50.0 * min(share, 0.0)
         color = "#2b8a3e" if value >= 0.0 else "#c92a2a"
         lines.append(
             f'<div style="display:flex;align-items:center;height:15px">'
-            f'<span style="width:44%">{html.escape(name)}</span>'
-            f'<span style="width:16%;text-align:right;padding-right:6px">{value:.2f}</span>'
+            f'<span style="width:44%">{html.escape(name.replace("_", " "))}</span>'
+            f'<span style="width:16%;text-align:right;padding-right:6px">{_rounded(value)}</span>'
             f'<span style="width:40%;height:9px;position:relative;background:#eef0f3">'
             f'<span style="position:absolute;height:9px;left:{left:.1f}%;'
             f'width:{50.0 * abs(share):.1f}%;background:{color}"></span></span></div>'
         )
+    total = _rounded(sum(terms.values()))
     return (
         f'<div style="font:11px sans-serif;padding:0 12px 8px 12px">{"".join(lines)}'
-        f'<div style="padding-top:4px"><b>sum {terms.sum():.2f}</b> a step</div></div>'
+        f'<div style="padding-top:4px"><b>sum {total}</b> a step</div></div>'
     )
 
 
+def _rounded(value: float) -> str:
+    """Two decimals, without the sign of a negative zero."""
+    return f"{round(value, 2) + 0.0:.2f}"
+
+
 def free_port(host: str, port: int) -> int:
-    """The first free port from `port` on.
+    """The first free port of 100, from `port` on.
 
     Raises:
-      UserError: the host is not an address of this machine, or no port is free.
+      UserError: the host is not an address of this machine, or none of the ports is free.
     """
     reason = "no port is free"
     for candidate in range(port, min(port + 100, 2**16)):

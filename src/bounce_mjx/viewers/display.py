@@ -1,4 +1,4 @@
-"""The model as it is shown: with the two markers, and every geom that MuJoCo shows as a mesh."""
+"""The displayed model: the two markers, and each visible geom as a mesh."""
 
 from collections.abc import Iterator
 
@@ -12,21 +12,21 @@ from bounce_mjx.task.env import BounceBall
 
 TARGET_SITE = "target_height"
 HOME_SITE = "paddle_home"
-# MuJoCo shows the geom groups 0 to 2 unless told otherwise.
+# By default MuJoCo shows the geom groups 0 to 2.
 _SHOWN_GROUPS = 3
 _SEGMENTS = 40
 _CREASE_ANGLE = np.radians(30.0)
 
 
 class Display:
-    """A model to show, and where its parts are for given coordinates."""
+    """A model for display, and the poses of its parts for given coordinates."""
 
     def __init__(self, env: BounceBall):
         self.model = _with_markers(env.config)
         self.data = mujoco.MjData(self.model)
         self._config = env.config
         self._target = self.model.site(TARGET_SITE).id
-        # MuJoCo leaves the position out where it was zero in the file.
+        # MuJoCo ignores a position that was zero in the file.
         self.model.site_sameframe[self._target] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
     def pose(self, qpos: np.ndarray, target_height: float) -> None:
@@ -43,7 +43,7 @@ class Display:
 
 
 def _with_markers(config: EnvConfig) -> mujoco.MjModel:
-    """The config's model, with the two marker sites where it lacks them."""
+    """The config's model, with the two marker sites added if it lacks them."""
     spec = mujoco.MjSpec.from_file(str(config.mjcf or resource_path("mjcf/bounce_ball.xml")))
     sites = {site.name for site in spec.sites}
     reward = config.reward
@@ -66,7 +66,7 @@ def _with_markers(config: EnvConfig) -> mujoco.MjModel:
 
 
 def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
-    """Every body that has something to show: its id, and its shown geoms in its own frame."""
+    """Each body with visible geoms: its id, and those geoms as meshes in the body's frame."""
     for body in range(model.nbody):
         scene = trimesh.Scene()
         for geom in np.flatnonzero(model.geom_bodyid == body):
@@ -90,7 +90,8 @@ def site_mesh(model: mujoco.MjModel, name: str) -> tuple[trimesh.Trimesh, np.nda
 
 
 def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """None for a plane or a height field, which are no part of the robot."""
+    """A geom's mesh in its own frame; None for a plane or a height field, which is no part of the
+    robot."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.mesh(model.geom_dataid[geom])
         vertices = model.mesh_vert[mesh.vertadr.item() :][: mesh.vertnum.item()]
@@ -119,14 +120,14 @@ def _primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
 
 
 def _color(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """The geom's colour [4]; its material's, unless it has one of its own, as in MuJoCo."""
+    """The geom's colour [4] by MuJoCo's rule: its own, or its material's if it has the default."""
     own, material = model.geom_rgba[geom], model.geom_matid[geom]
     is_default = np.allclose(own, (0.5, 0.5, 0.5, 1.0))
     return model.mat_rgba[material] if material >= 0 and is_default else own
 
 
 def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
-    # glTF's colour factors are linear, MuJoCo's colours are meant for the screen.
+    # glTF has linear colour factors, MuJoCo has screen colours.
     linear = np.append(rgba[:3] ** 2.2, rgba[3])
     return trimesh.visual.material.PBRMaterial(
         baseColorFactor=np.round(linear * 255.0).astype(np.uint8),

@@ -1,4 +1,4 @@
-"""Files that a user names to be written."""
+"""Output files that a user names."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,10 @@ from bounce_mjx.errors import UserError
 
 
 def check_writable(path: Path, flag: str, suffixes: tuple[str, ...]) -> None:
-    """Spares the user a recording that could not be written.
+    """Checks an output file before the recording.
 
     Raises:
-      UserError: the suffix is another one, or no file can be made there.
+      UserError: the suffix is not one of `suffixes`, or no file can be made there.
     """
     if path.suffix.lower() not in suffixes:
         raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
@@ -24,10 +24,10 @@ def check_writable(path: Path, flag: str, suffixes: tuple[str, ...]) -> None:
 
 
 def replace_file(source: Path, path: Path, flag: str) -> None:
-    """Moves a finished file to where the user wants it.
+    """Moves a finished file to the path that the user gave.
 
     Raises:
-      UserError: it cannot be.
+      UserError: the file cannot be moved there.
     """
     try:
         source.replace(path)

@@ -1,4 +1,4 @@
-"""MuJoCo's own viewer, where there is a display."""
+"""MuJoCo's own window, on a machine with a display."""
 
 import os
 import queue
@@ -31,10 +31,10 @@ _HELP = {
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, as far as the environment tells."""
+    """Whether a window can be opened, by the environment variables."""
     if sys.platform == "linux":
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    # On a Mac, MuJoCo's viewer needs an interpreter of its own.
+    # On a Mac, MuJoCo's viewer needs its own interpreter, mjpython.
     return sys.platform != "darwin" or "MJPYTHON_BIN" in os.environ
 
 
@@ -61,14 +61,14 @@ class _Window:
         self._simulation = simulation
         self._display = Display(simulation.env)
         self._paused, self._speed = False, speed
-        # Keys arrive in the window's thread; they act between two steps.
+        # Keys arrive in the window's thread and take effect between two steps.
         self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def run(self, seconds: float | None) -> None:
         simulation, display = self._simulation, self._display
         dt = simulation.env.dt
         pace, trail = Pace(dt), [simulation.frame.ball[0]]
-        left = float("inf") if seconds is None else round(seconds / dt)
+        steps_left = float("inf") if seconds is None else round(seconds / dt)
         display.pose(simulation.frame.qpos[0], simulation.frame.target_height[0])
         with mujoco.viewer.launch_passive(
             display.model,
@@ -79,11 +79,11 @@ class _Window:
         ) as viewer:
             with viewer.lock():
                 mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
-            while viewer.is_running() and left > 0:
+            while viewer.is_running() and steps_left > 0:
                 while not self._keys.empty():
                     self._press(self._keys.get())
-                due = 0 if self._paused else min(pace.due(self._speed), left)
-                left -= due
+                due = 0 if self._paused else min(pace.due(self._speed), steps_left)
+                steps_left -= due
                 for _ in range(due):
                     frame = simulation.step()
                     trail.append(frame.ball[0])
@@ -110,8 +110,8 @@ class _Window:
             simulation.reset()
         elif key in (_UP, _DOWN):
             step = _TARGET_STEP if key == _UP else -_TARGET_STEP
-            present = float(simulation.frame.target_height[0])
-            simulation.target_height = max(_TARGET_STEP, present + step)
+            height = float(simulation.frame.target_height[0])
+            simulation.target_height = max(_TARGET_STEP, height + step)
         elif key in (_RIGHT, _LEFT):
             self._speed = float(np.clip(self._speed * (1.25 if key == _RIGHT else 0.8), 0.1, 4.0))
         elif chr(key) in pushes:
@@ -127,8 +127,8 @@ class _Window:
         }
         font, corner = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
         return [
-            (font, place, "\n".join(lines), "\n".join(lines.values()))
-            for place, lines in (
+            (font, position, "\n".join(lines), "\n".join(lines.values()))
+            for position, lines in (
                 (corner.mjGRID_TOPLEFT, state),
                 (corner.mjGRID_BOTTOMLEFT, _HELP),
             )

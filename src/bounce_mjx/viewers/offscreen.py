@@ -1,4 +1,4 @@
-"""Pictures of the model without a screen."""
+"""Rendering without a screen."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ _TRAIL_RADIUS = 0.004
 _TRAIL_RGB = (1.0, 0.45, 0.05)
 _MAX_GEOMS = 2000
 _BACKENDS = ("egl", "osmesa")
-# In a process of its own: a library that fails to load would stay half loaded in this one.
+# Runs in a separate process: a library that fails to load would stay half loaded in this one.
 _PROBE = """
 import mujoco
 from mujoco.{backend} import GLContext
@@ -27,10 +27,10 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 
 def choose_backend() -> str:
-    """The OpenGL library that works here: MUJOCO_GL's, or else EGL or OSMesa.
+    """A working OpenGL library: the one that MUJOCO_GL names, or else EGL or OSMesa.
 
     Raises:
-      UserError: none works.
+      UserError: no library works.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if sys.platform != "linux":
@@ -38,20 +38,20 @@ def choose_backend() -> str:
     for backend in (wanted,) if wanted else _BACKENDS:
         if backend not in (*_BACKENDS, "glfw"):
             raise UserError(
-                f"the environment variable MUJOCO_GL is {wanted!r}, but pictures are made with "
-                "egl, osmesa or glfw; set it to one of them or unset it"
+                f"the environment variable MUJOCO_GL is {wanted!r}, but rendering needs "
+                "egl, osmesa or glfw; set it to one of these or unset it"
             )
         if works(backend):
             return backend
     tried = f"MUJOCO_GL={wanted} does not work" if wanted else "neither EGL nor OSMesa works"
     raise UserError(
-        f"no picture can be made, as {tried} here; install an OpenGL library, on Debian "
+        f"pictures cannot be rendered, as {tried} here; install an OpenGL library, on Debian "
         "or Ubuntu with: apt-get install libegl1 libgl1-mesa-dri, or: apt-get install libosmesa6"
     )
 
 
 def works(backend: str) -> bool:
-    """Whether an OpenGL library can draw here; tried in a process of its own."""
+    """Whether an OpenGL library can render here, by a test in a separate process."""
     probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
     return subprocess.run(probe, capture_output=True).returncode == 0
 
@@ -63,7 +63,7 @@ class Renderer:
         self._display = Display(env)
         model = self._display.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        # Half of what the model asks for: on a CPU that is twice as fast, and still smooth.
+        # Half of the model's setting: twice as fast on a CPU, and still smooth.
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2048)
         model.vis.quality.offsamples = min(model.vis.quality.offsamples, 4)
         self._gl = _gl_context(backend)(width, height)
@@ -93,8 +93,8 @@ class Renderer:
 
         Args:
           qpos: generalised positions [nq].
-          target_height: where the marker is, m.
-          trail: positions of the ball [P, 3] that a line connects, the oldest first, m.
+          target_height: height of the marker, m.
+          trail: ball positions [P, 3] to connect by a line, oldest first, m.
         """
         self._display.pose(qpos, target_height)
         self._gl.make_current()
@@ -116,7 +116,7 @@ class Renderer:
 
 
 def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
-    """Adds a line through positions [P, 3] to a scene, the fainter the older."""
+    """Adds a line through positions [P, 3] to a scene; older segments are fainter."""
     for i, (start, end) in enumerate(zip(trail[:-1], trail[1:], strict=True)):
         if scene.ngeom >= scene.maxgeom:
             return
@@ -129,7 +129,7 @@ def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
 
 
 def _camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
-    """The model's overview, or else the free camera that MuJoCo opens a viewer with."""
+    """The model's overview camera, or else the default free camera of MuJoCo's viewer."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA)
@@ -140,7 +140,7 @@ def _camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 
 def _gl_context(backend: str):
-    # Only now: the import of one of them keeps the process from using the other.
+    # A process can use only the first of these libraries that it imports.
     if backend == "egl":
         from mujoco.egl import GLContext
     elif backend == "osmesa":

@@ -1,13 +1,16 @@
-"""How simulated time keeps up with the clock."""
+"""Simulation in real time."""
 
 import time
 
-# A program that falls behind by more than this slows down instead of catching up, s.
+SPEED_RANGE = (0.1, 2.0)
+"""Slowest and fastest speed of a viewer, as factors of real time."""
+
+# A program that falls behind by more than this slows down and does not catch up, s.
 _MAX_LAG = 0.1
 
 
 class Pace:
-    """Counts the control steps that are due since the last call."""
+    """Control steps that are due, by the clock."""
 
     def __init__(self, dt: float):
         self._dt = dt
@@ -15,11 +18,11 @@ class Pace:
         self.forget()
 
     def forget(self) -> None:
-        """Lets the time since the last call pass without a step."""
+        """Skips the time since the last call."""
         self._last = time.monotonic()
 
     def due(self, speed: float) -> int:
-        """Control steps to take now, at `speed` times real time."""
+        """Control steps that became due since the last call, at `speed` times real time."""
         now = time.monotonic()
         self._owed += speed * min(now - self._last, _MAX_LAG)
         self._last = now

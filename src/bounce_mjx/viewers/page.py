@@ -1,7 +1,8 @@
-"""An episode as one HTML file that replays offline in any browser."""
+"""The replay page: episodes in one HTML file, for any browser, offline."""
 
 import contextlib
 import io
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,10 +15,12 @@ from bounce_mjx.viewers.simulation import Frame, Simulation, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
+# viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
+_STOP_SECONDS = 1.0
 
 
 def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | None) -> None:
-    """Writes a recording of the simulation, with all its environments, as a page.
+    """Writes a recording of all environments of the simulation as a page.
 
     Raises:
       UserError: the file cannot be written.
@@ -45,11 +48,16 @@ def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | 
 
 @contextlib.contextmanager
 def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
-    """A viser server, without the lines that it prints; port 0 is any free one."""
+    """A viser server that prints nothing; port 0 takes any free port.
+
+    Closing it takes a second at most: a background thread waits for clients that do not answer.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
         yield server
     finally:
+        stopping = threading.Thread(target=server.stop, daemon=True)
         with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+            stopping.start()
+            stopping.join(_STOP_SECONDS)

@@ -1,6 +1,7 @@
-"""The three-dimensional scene of the web page and of the replay page, made with viser."""
+"""The 3D scene of the live page and of the replay page, built with viser."""
 
 import collections
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -17,7 +18,7 @@ _LABEL_HEIGHT = 0.74
 _TRAIL_SECONDS = 0.6
 _TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
-# A camera that sees one arm, its ball and the highest targets.
+# The camera sees one arm, its ball and the highest targets.
 _LOOK_AT = np.array([0.34, 0.0, 0.38])
 _VIEW = np.array([0.95, -1.05, 0.40])
 _FIELD_OF_VIEW = math.radians(40.0)
@@ -33,14 +34,14 @@ class Scene:
         self.show(num_envs)
 
     def show(self, num_envs: int) -> None:
-        """Builds the scene for the first `num_envs` environments of the frames to come."""
+        """Builds the scene for the first `num_envs` environments of the next frames."""
         self._num_envs = num_envs
         self._offsets = _grid(num_envs)
         scene = self._server.scene
         scene.reset()
-        nowhere = np.zeros((num_envs, 3)), np.ones(num_envs, bool)
+        no_trail = np.zeros((num_envs, 3)), np.ones(num_envs, bool)
         length = round(_TRAIL_SECONDS / self._env.dt)
-        self._passed = collections.deque([nowhere] * length, maxlen=length)
+        self._passed = collections.deque([no_trail] * length, maxlen=length)
         scene.set_up_direction("+z")
         scene.configure_environment_map(hdri=None)
         scene.configure_default_lights(False)
@@ -95,7 +96,7 @@ class Scene:
         self._look()
 
     def update(self, frames: Sequence[Frame]) -> None:
-        """Shows the last of the frames since the last update; all of them make the trail."""
+        """Shows the last of the frames since the last update; the trail uses all of them."""
         display, model, number = self._display, self._display.model, self._num_envs
         frame = frames[-1]
         positions = np.zeros((number, model.nbody, 3))
@@ -104,8 +105,8 @@ class Scene:
         for i in range(number):
             display.pose(frame.qpos[i], frame.target_height[i])
             positions[i], rotations[i] = display.data.xpos, display.data.xquat
-            for name, place in sites.items():
-                place[i] = display.data.site(name).xpos
+            for name, site_positions in sites.items():
+                site_positions[i] = display.data.site(name).xpos
         with self._server.atomic():
             for body, handle in self._bodies.items():
                 if model.body_weldid[body]:
@@ -122,16 +123,16 @@ class Scene:
                     label.text = text
 
     def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
-        """The balls' ways of the last moments as line segments [S, 2, 3] and their colours, which
-        fade with age; a reset cuts them."""
+        """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
+        age; a reset cuts the paths."""
         for frame in frames:
             self._passed.append((frame.ball[: self._num_envs], frame.over[: self._num_envs]))
         balls = np.stack([ball for ball, _ in self._passed])
         cut = np.stack([over for _, over in self._passed])[:-1]
         cut = np.flip(np.logical_or.accumulate(np.flip(cut, axis=0), axis=0), axis=0)
         segments = np.stack([balls[:-1], balls[1:]], axis=2) + self._offsets[:, None]
-        # A segment of an episode that is over shrinks to the ball, as it may not be left out: the
-        # page draws the number of segments that it knew first.
+        # The page always draws its initial number of segments, so a segment from an earlier episode
+        # stays and shrinks to the ball.
         segments = np.where(cut[..., None, None], (balls[-1] + self._offsets)[:, None], segments)
         age = np.linspace(1.0, 0.0, len(balls))[:, None]
         colors = age * _BACKGROUND + (1.0 - age) * _TRAIL_COLOR
@@ -141,22 +142,24 @@ class Scene:
         return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
     def _look(self) -> None:
-        """Turns the camera of every page to the environments."""
+        """Turns the camera of every page towards the environments."""
         extent = 1.0 + 1.25 * np.linalg.norm(np.ptp(self._offsets, axis=0))
         position = _LOOK_AT + extent * _VIEW
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(position), tuple(_LOOK_AT)
         camera.up, camera.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, _LOOK_AT
+            # A page whose own camera is invalid keeps it.
+            with contextlib.suppress(ValueError, TypeError, AssertionError):
+                client.camera.position, client.camera.look_at = position, _LOOK_AT
 
 
 def _grid(number: int) -> np.ndarray:
-    """Places [number, 3] in rows across the view, around the origin, m."""
+    """Offsets [number, 3] of a grid of environments around the origin, m."""
     columns = math.ceil(math.sqrt(number))
     row, column = np.divmod(np.arange(number), columns)
-    places = np.stack([row, column, np.zeros(number)], axis=1) * _SPACING
-    return places - 0.5 * (places.min(axis=0) + places.max(axis=0))
+    offsets = np.stack([row, column, np.zeros(number)], axis=1) * _SPACING
+    return offsets - 0.5 * (offsets.min(axis=0) + offsets.max(axis=0))
 
 
 def _add_lights(scene: viser.SceneApi) -> None:
@@ -172,7 +175,7 @@ def _add_lights(scene: viser.SceneApi) -> None:
 
 
 def _add_floor(scene: viser.SceneApi) -> None:
-    """Squares of 0.2 m, to read distances by."""
+    """A floor of 0.2 m squares, as a scale."""
     scene.set_background_image(np.full((1, 1, 3), _BACKGROUND, np.uint8))
     scene.add_grid(
         "/floor",

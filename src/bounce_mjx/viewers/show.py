@@ -1,5 +1,6 @@
-"""The part of the command lines that `view` and `play` share."""
+"""The viewing options that `view` and `play` share, and the viewers that they start."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,10 +9,12 @@ from rich.console import Console
 
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
+from bounce_mjx.viewers.pace import SPEED_RANGE
 from bounce_mjx.viewers.scene import MAX_ENVS
 from bounce_mjx.viewers.simulation import Simulation
 
@@ -19,34 +22,35 @@ _RECORDED_SECONDS = 10.0
 
 
 class ViewerOptions(StrictModel):
-    """How to see it."""
+    """Choice of a viewer or a recording."""
 
     viewer: Literal["auto", "browser", "native"] = "auto"
-    """browser serves a page, native opens MuJoCo's own window; auto: native where there is a
-    display, else browser."""
+    """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
+    display and browser elsewhere."""
     video: Path | None = None
-    """File to film to, .mp4 or .gif, in place of a viewer."""
+    """File for a video, .mp4 or .gif, instead of a viewer."""
     html: Path | None = None
-    """File for a page that replays the episode offline, in place of a viewer."""
+    """File for a page that replays the episode offline, instead of a viewer."""
     seconds: Positive | None = None
-    """Simulated time, s; left out: 10 of a recording, and a viewer until it is closed."""
+    """Simulated time, s. The default is 10 for a recording; a viewer runs until it is closed."""
     num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
-    """Robots side by side, on the page and in the replay."""
-    speed: Annotated[float, Field(ge=0.1, le=2.0)] = 1.0
+    """Robots side by side, on the live page and in the replay."""
+    speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
     """Speed of a viewer, as a factor of real time."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None
-    """Pictures a second of a recording; left out: 60 of a video, 25 of a GIF, 30 of a page."""
+    """Frames per second of a recording. The default is 60 for an MP4, 25 for a GIF and 30 for a
+    page."""
     size: tuple[Annotated[int, Field(ge=64, le=4096)], Annotated[int, Field(ge=64, le=4096)]] = (
         640,
         480,
     )
-    """Width and height of a video, pixels."""
+    """Width and height of a video in pixels."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Seed of the resets."""
     host: str = "127.0.0.1"
-    """Address that the page is served at; 0.0.0.0 lets other machines in."""
+    """Address of the page's server; 0.0.0.0 also admits other machines."""
     port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
-    """Port of the page; the next free one where it is taken."""
+    """Port of the page's server, or the next free port."""
 
 
 def show(
@@ -58,15 +62,16 @@ def show(
     target_height: float | None,
     console: Console,
 ) -> None:
-    """Shows or records an environment under a controller.
+    """Shows or records an environment under a controller; Ctrl-C closes a viewer.
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here.
+      KeyboardInterrupt: Ctrl-C came during the compilation or the recording.
     """
     recorded = options.video is not None or options.html is not None
     if recorded and options.viewer != "auto":
         raise UserError(
-            f"--viewer {options.viewer} and --video or --html exclude each other; leave one out"
+            f"--viewer {options.viewer} and --video or --html exclude each other; give only one"
         )
     viewer = options.viewer
     if viewer == "auto":
@@ -89,11 +94,11 @@ def show(
         port = free_port(options.host, options.port)
 
     num_envs = options.num_envs
-    # The page's slider goes up to the simulated number. MJX simulates 16 too slowly on a CPU.
+    # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if not recorded and viewer == "browser" and env.engine.name == "fused":
         num_envs = MAX_ENVS
     with console.status("compiling"):
-        simulation = Simulation(env, controller, num_envs, options.seed)
+        simulation = run_interruptible(Simulation, env, controller, num_envs, options.seed)
         simulation.target_height = target_height
 
     if recorded:
@@ -105,17 +110,20 @@ def show(
                 write_page(options.html, simulation, recording, options.fps)
         for path in (options.video, options.html):
             if path is not None:
-                console.print(f"written: {path}", highlight=False, soft_wrap=True)
-    elif viewer == "native":
-        run_native(simulation, speed=options.speed, seconds=options.seconds)
-    else:
-        run_browser(
-            simulation,
-            shown=options.num_envs,
-            speed=options.speed,
-            seconds=options.seconds,
-            host=options.host,
-            port=port,
-            title=title,
-            console=console,
-        )
+                # rich would take brackets in a path for its markup.
+                console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
+        return
+    with contextlib.suppress(KeyboardInterrupt):
+        if viewer == "native":
+            run_native(simulation, speed=options.speed, seconds=options.seconds)
+        else:
+            run_browser(
+                simulation,
+                num_shown=options.num_envs,
+                speed=options.speed,
+                seconds=options.seconds,
+                host=options.host,
+                port=port,
+                title=title,
+                console=console,
+            )

@@ -5,15 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task.state import State
 from bounce_mjx.viewers.controllers import Controller
-
-# Entries of the observation.
-_BALL, _BALL_VELOCITY, _PADDLE, _TARGET = slice(6, 9), slice(19, 22), slice(25, 28), 28
 
 
 class Frame(NamedTuple):
@@ -32,24 +29,23 @@ class Frame(NamedTuple):
     n_bounces: np.ndarray
     """Consecutive bounces [N]."""
     reward_terms: np.ndarray
-    """Weighted reward terms of the step [N, 15], in the order of `rewards.TERM_NAMES`."""
+    """Weighted reward terms of the step [N, R], in the order of `rewards.TERM_NAMES`."""
     over: np.ndarray
-    """Whether the episode ended or was truncated with this step [N]; the next frame is in a new
-    one."""
+    """Whether the episode ended or timed out on this step [N]; the next frame starts a new one."""
 
 
 class Simulation:
-    """N environments under a controller, each reset when its episode is over."""
+    """N environments under a controller; an environment is reset when its episode is over."""
 
     def __init__(self, env: BounceBall, controller: Controller, num_envs: int, seed: int):
         """Compiles the programs, which takes seconds, and resets all environments."""
         self.env = env
         self.num_envs = num_envs
         self.target_height: float | None = None
-        """One target height for all environments, m; None for the drawn ones."""
+        """Target height of all environments, m; None for the height drawn at each reset."""
         self._controller = controller
         self._key = jax.random.PRNGKey(seed)
-        self._reset_program = jax.jit(self._fresh_states)
+        self._reset_program = jax.jit(self._start)
         self._step_program = jax.jit(self._advance)
         self._push = np.zeros(3, np.float32)
         self.reset()
@@ -59,9 +55,8 @@ class Simulation:
     def reset(self) -> Frame:
         """Starts a new episode in every environment; its first frame."""
         self._key, key = jax.random.split(self._key)
-        self._states = self._reset_program(key)
-        self._steps = jnp.zeros(self.num_envs, jnp.int32)
-        self.frame = _frame(self.env.dt, self._states, self._steps, self._steps > 0)
+        self._states, self._steps, frame = self._reset_program(key)
+        self.frame = jax.device_get(frame)
         return self.frame
 
     def push(self, velocity: tuple[float, float, float]) -> None:
@@ -70,15 +65,15 @@ class Simulation:
 
     def step(self) -> Frame:
         """Advances one control step."""
-        self._key, self._states, self._steps, seen = self._step_program(
+        self._key, self._states, self._steps, frame = self._step_program(
             self._key, self._states, self._steps, self._target(), self._push
         )
         self._push = np.zeros(3, np.float32)
-        self.frame = _frame(self.env.dt, *seen)
+        self.frame = jax.device_get(frame)
         return self.frame
 
     def record(self, seconds: float) -> Frame:
-        """The present frame and those of the following `seconds`, stacked."""
+        """The current frame and the frames of the following `seconds`, stacked."""
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
         return Frame(*(np.stack(values) for values in zip(*frames, strict=True)))
@@ -89,6 +84,10 @@ class Simulation:
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(self.env.reset, out_axes=-1)(jax.random.split(key, self.num_envs))
 
+    def _start(self, key: jax.Array) -> tuple[State, jax.Array, Frame]:
+        states, steps = self._fresh_states(key), jnp.zeros(self.num_envs, jnp.int32)
+        return states, steps, _view(self.env, states, steps, steps > 0)
+
     def _advance(self, key, states, steps, target, push):
         key, reset_key, action_key = jax.random.split(key, 3)
         states = _influence(self.env, states, target, push)
@@ -98,14 +97,14 @@ class Simulation:
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
         fresh = self._fresh_states(reset_key)
         following = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after)
-        return key, following, jnp.where(over, 0, steps), (after, steps, over)
+        return key, following, jnp.where(over, 0, steps), _view(self.env, after, steps, over)
 
 
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
     """A recording [T, N, ...] at another rate.
 
-    Positions are interpolated in time, but not across a reset; all else is that of the last
-    control step.
+    Positions are interpolated in time, but not across a reset; the other values are those of the
+    last control step.
 
     Args:
       dt: time between the frames of the recording, s.
@@ -115,10 +114,10 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
       The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts: [F, N, ...].
     """
     last = len(recording.time) - 1
-    at = np.arange(int(last * dt * fps + 1e-6)) / (fps * dt)
-    before = np.minimum(at.astype(int), last)
+    steps = np.arange(int(last * dt * fps + 1e-6)) / (fps * dt)
+    before = np.minimum(steps.astype(int), last)
     after = np.minimum(before + 1, last)
-    fraction = (at - before)[:, None] * ~recording.over[before]
+    fraction = (steps - before)[:, None] * ~recording.over[before]
     frames = Frame(*(values[before] for values in recording))
 
     def blend(values):
@@ -133,32 +132,34 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
 
 
 def _influence(env: BounceBall, states: State, target: jax.Array, push: jax.Array) -> State:
-    """States [.., N] with another target height [] (nan for the same) and a pushed ball [3]."""
-    physics, task = states.pipeline_state
-    velocity = list(find_addresses(env.mj_model).ball_qvel[:3])
-    heights = jnp.where(jnp.isnan(target), task.target_height, target)
-    return states.replace(
-        pipeline_state=states.pipeline_state._replace(
-            physics=physics._replace(
-                qvel=physics.qvel.at[jnp.array(velocity)].add(push[:, None]),
-            ),
-            task=task._replace(target_height=heights),
-        ),
-        obs=states.obs.at[_BALL_VELOCITY].add(push[:, None]).at[_TARGET].set(heights),
+    """States [..., N] with another target height [] (nan keeps it) and a ball pushed by a velocity
+    [3], m/s."""
+    physics, task = states.pipeline_state.physics, states.pipeline_state.task
+    velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
+    changed = states.pipeline_state._replace(
+        physics=physics._replace(qvel=physics.qvel.at[velocity].add(push[:, None])),
+        task=task._replace(target_height=jnp.where(jnp.isnan(target), task.target_height, target)),
     )
 
+    def observe(state: BounceState) -> jax.Array:
+        return env.observe(env.kinematics(state), state.task)
 
-def _frame(dt: float, states: State, steps: jax.Array, over: jax.Array) -> Frame:
-    """The NumPy view of states (batch last) `steps` control steps after their resets."""
-    states, steps, over = jax.device_get((states, steps, over))
-    obs, task = states.obs, states.pipeline_state.task
+    observation = jax.vmap(observe, in_axes=-1, out_axes=-1)(changed)
+    return states.replace(pipeline_state=changed, obs=observation)
+
+
+def _view(env: BounceBall, states: State, steps: jax.Array, over: jax.Array) -> Frame:
+    """The frame of states (batch last) `steps` control steps after their resets."""
+    physics, task = states.pipeline_state.physics, states.pipeline_state.task
+    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
+    terms = [states.metrics[f"reward/{name}"] for name in TERM_NAMES]
     return Frame(
-        time=steps * dt,
-        qpos=states.pipeline_state.physics.qpos.T,
-        ball=obs[_BALL].T,
-        paddle=obs[_PADDLE].T,
+        time=steps * env.dt,
+        qpos=physics.qpos.T,
+        ball=kinematics.ball_position.T,
+        paddle=kinematics.paddle_position.T,
         target_height=task.target_height,
         n_bounces=task.n_bounces,
-        reward_terms=np.stack([states.metrics[f"reward/{name}"] for name in TERM_NAMES], axis=-1),
+        reward_terms=jnp.stack(terms, axis=-1),
         over=over,
     )

@@ -1,4 +1,4 @@
-"""An episode as a film: MP4, or an animated GIF for a web page."""
+"""Videos of an episode: MP4, or an animated GIF for a web page."""
 
 import contextlib
 import subprocess
@@ -16,13 +16,13 @@ from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 from bounce_mjx.viewers.simulation import Frame, Simulation, resample
 
 SUFFIXES = (".mp4", ".gif")
-# A GIF counts time in 1/100 s, and browsers show no more than 50 frames a second.
+# A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
 _DEFAULT_FPS = {".mp4": 60, ".gif": 25}
 _MAX_GIF_FPS = 50
 _TRAIL_SECONDS = 0.5
 _ENCODINGS = {
     ".mp4": "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart".split(),
-    # One palette, made of what moves, and in each picture only what changed.
+    # One palette, for the moving parts; each picture stores only its changed pixels.
     ".gif": (
         "-filter_complex",
         "split[a][b];[a]palettegen=max_colors=128:stats_mode=diff[p];"
@@ -34,7 +34,7 @@ _ENCODINGS = {
 
 
 class VideoWriter:
-    """Films simulations to a file; everything that can fail beforehand does so at once."""
+    """Writes recordings as a video; its constructor checks all that can be checked beforehand."""
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int | None):
         """Chooses the OpenGL library.
@@ -58,7 +58,7 @@ class VideoWriter:
         self._backend = choose_backend()
 
     def write(self, simulation: Simulation, recording: Frame) -> None:
-        """Writes a recording of the simulation, of its first environment.
+        """Writes a recording of the simulation's first environment.
 
         Raises:
           UserError: the file cannot be written.
@@ -69,13 +69,13 @@ class VideoWriter:
             self._command(unfinished), stdin=subprocess.PIPE, stderr=subprocess.PIPE
         )
         try:
-            # A broken pipe means that the encoder gave up; it says why.
+            # A broken pipe means that the encoder failed; it prints the reason.
             with contextlib.suppress(BrokenPipeError):
                 for picture in self._pictures(simulation.env, frames):
                     encoder.stdin.write(picture.tobytes())
-            _, complaint = encoder.communicate()
+            _, errors = encoder.communicate()
             if encoder.returncode:
-                reason = " ".join(complaint.decode(errors="replace").split())
+                reason = " ".join(errors.decode(errors="replace").split())
                 raise UserError(
                     f"--video {self._path} cannot be written ({reason[-200:]}); give another file"
                 )
@@ -86,7 +86,7 @@ class VideoWriter:
             unfinished.unlink(missing_ok=True)
 
     def _command(self, path: Path) -> list[str]:
-        """The encoder's command line, which reads pictures from its standard input."""
+        """The command line of an encoder that reads pictures from its standard input."""
         width, height = self._size
         pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
         encoding = _ENCODINGS[path.suffix.lower()]
@@ -108,8 +108,8 @@ class VideoWriter:
 
 
 def caption(picture: np.ndarray, frame: Frame) -> np.ndarray:
-    """A picture [height, width, 3] with the first environment's bounce count, target height and
-    ball height drawn in."""
+    """A picture [height, width, 3] with a caption: the first environment's bounce count, target
+    height and ball height."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     unit = max(10, image.height // 24)
@@ -117,15 +117,15 @@ def caption(picture: np.ndarray, frame: Frame) -> np.ndarray:
     draw.rounded_rectangle((unit, unit, 11 * unit, 6.2 * unit), unit // 2, fill=(15, 20, 28, 170))
     count = f"{frame.n_bounces[0]:.0f}"
     draw.text((1.6 * unit, 1.2 * unit), count, font=large, fill="white")
-    after = 1.6 * unit + draw.textlength(count, font=large) + 0.5 * unit
-    draw.text((after, 2.1 * unit), "bounces", font=small, fill=(255, 255, 255, 220))
+    left = 1.6 * unit + draw.textlength(count, font=large) + 0.5 * unit
+    draw.text((left, 2.1 * unit), "bounces", font=small, fill=(255, 255, 255, 220))
     for row, (name, value, color) in enumerate(
         (
             ("target", frame.target_height[0], (120, 235, 140, 255)),
             ("ball", frame.ball[0, 2], (255, 190, 120, 255)),
         )
     ):
-        at = 3.7 * unit + 1.15 * row * unit
-        draw.text((1.6 * unit, at), name, font=small, fill=color)
-        draw.text((10.4 * unit, at), f"{value:.2f} m", font=small, fill=color, anchor="ra")
+        top = 3.7 * unit + 1.15 * row * unit
+        draw.text((1.6 * unit, top), name, font=small, fill=color)
+        draw.text((10.4 * unit, top), f"{value:.2f} m", font=small, fill=color, anchor="ra")
     return np.asarray(image)

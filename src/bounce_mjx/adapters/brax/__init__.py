@@ -1,1 +1,30 @@
-"""brax: its registry and what its trainers need."""
+"""brax: importing this package registers the environment as "bounce_ball".
+
+Then `brax.envs.get_environment("bounce_ball")` returns a `BounceBall`, and brax's wrappers and
+trainers accept every `BounceBall`. Needs the extra `brax`.
+"""
+
+import contextlib
+import io
+
+from bounce_mjx.errors import UserError
+
+try:
+    # brax imports MJX, which prints a line for each optional part that is not installed.
+    with contextlib.redirect_stdout(io.StringIO()):
+        import brax.envs
+except ImportError as error:
+    raise UserError(
+        f"brax cannot be imported ({error}); install it with pip install 'bounce_mjx[brax]'"
+    ) from error
+
+from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
+from bounce_mjx.task.env import BounceBall
+
+__all__ = ["ENV_NAME", "device_put_replicated"]
+
+ENV_NAME = "bounce_ball"
+
+# BounceBall has the interface of brax's Env; this lets it pass brax's isinstance checks.
+brax.envs.Env.register(BounceBall)
+brax.envs.register_environment(ENV_NAME, BounceBall)

@@ -1,7 +1,7 @@
-"""Gymnasium: `gymnasium.make` and `gymnasium.make_vec("bounce_mjx/BounceBall-v0")`.
+"""The classes behind `gymnasium.make` and `gymnasium.make_vec("bounce_mjx/BounceBall-v0")`.
 
-The arrays are NumPy's; `bounce_mjx.torch.gymnasium` has the same with tensors that stay on JAX's
-device. Keyword arguments are the settings of `EnvConfig`.
+Arrays are NumPy's; `adapters/torch/gymnasium_env.py` has a vectorised environment with tensors that
+stay on JAX's device. Keyword arguments are the settings of `EnvConfig`.
 """
 
 import weakref
@@ -10,26 +10,27 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
-from brax.envs.base import State
 from gymnasium.vector import AutoresetMode
 
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.task import vector
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import OBSERVATION_SIZE, BounceBall, BounceState
+from bounce_mjx.task.env import BounceBall, BounceState
+from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.task.state import State
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
-ENV_ID = "bounce_mjx/BounceBall-v0"
 ACTION_SPACE = gymnasium.spaces.Box(-1.0, 1.0, (len(JOINT_NAMES),), np.float32)
-OBSERVATION_SPACE = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+OBSERVATION_SPACE = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION.size,), np.float32)
 _FRAMES_PER_SECOND = 50
 _HEIGHT, _WIDTH = 480, 640
 
 
 class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment; the time limit is its own."""
+    """One environment with the time limit of its config."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": _FRAMES_PER_SECOND}
 
@@ -37,10 +38,10 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Makes the environment.
 
         Args:
-          settings: of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
 
         Raises:
-          UserError: a setting or the render mode is wrong, or nothing can draw here.
+          UserError: a setting or the render mode is wrong, or there is no OpenGL to draw with.
         """
         _check_render_mode(render_mode)
         self.task = BounceBall(validate(EnvConfig, settings, ENV_ID))
@@ -57,7 +58,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode: its first observation [29], and no information."""
+        """Starts an episode: its first observation [29] and an empty info."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
         self._length = 0
@@ -92,9 +93,11 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many environments at once. One that ends is reset within the step that ends it;
-    `info["final_obs"]` [B, 29] is what that step itself led to, for every environment, and
-    `info["_final_obs"]` [B] tells which have ended."""
+    """B environments; an ended episode is reset within the step that ends it.
+
+    `info["final_obs"]` [B, 29] is every environment's observation after the step, before any reset;
+    `info["_final_obs"]` [B] is true where the episode ended.
+    """
 
     metadata = {
         "render_modes": ["rgb_array"],
@@ -113,7 +116,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(OBSERVATION_SPACE, num_envs)
         self._reset = jax.jit(lambda key: vector.reset(self.task, key, num_envs))
-        self._step = jax.jit(self._step_with_a_key, donate_argnums=0)
+        self._step = jax.jit(self._step_and_split_key, donate_argnums=0)
         self._state: vector.VectorState | None = None
         self._key: jax.Array | None = None
         self._pictures = Pictures(self.task) if render_mode else None
@@ -121,7 +124,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts every episode afresh: observations [B, 29], and no information."""
+        """Starts a new episode in every environment: observations [B, 29] and an empty info."""
         super().reset(seed=seed)
         self._key, key = jax.random.split(_key(self.np_random))
         self._state = self._reset(key)
@@ -133,13 +136,13 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         """Advances every environment under the actions [B, 6].
 
         Returns:
-          Observations [B, 29], rewards [B], terminated [B], truncated [B], and the environments'
-          metrics with the terminal observations.
+          Observations [B, 29], rewards [B], terminated [B], truncated [B], and an info of the
+          environments' metrics and the final observations.
         """
         self._state, self._key, result = self._step(
             self._state, np.asarray(actions, np.float32), self._key
         )
-        # Copies, as the user may write into them.
+        # Copies, as the caller may write into them.
         result = jax.tree.map(np.array, result)
         info = dict(result.metrics) | {
             "final_obs": result.final_observation,
@@ -162,7 +165,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         if self._pictures is not None:
             self._pictures.close()
 
-    def _step_with_a_key(
+    def _step_and_split_key(
         self, state: vector.VectorState, action: jax.Array, key: jax.Array
     ) -> tuple[vector.VectorState, jax.Array, vector.StepResult]:
         key, reset_key = jax.random.split(key)
@@ -177,7 +180,7 @@ class Pictures:
     def __init__(self, task: BounceBall):
         renderer = Renderer(task, _WIDTH, _HEIGHT, choose_backend())
         self._render = renderer.render
-        # Also at the end of the process, where OpenGL would be gone before the renderer.
+        # Also at exit, where OpenGL would be gone before the renderer.
         self.close = weakref.finalize(self, renderer.close)
 
     def draw(self, state: BounceState) -> np.ndarray:
@@ -191,4 +194,4 @@ def _key(generator: np.random.Generator) -> jax.Array:
 
 def _check_render_mode(render_mode: str | None) -> None:
     if render_mode not in (None, "rgb_array"):
-        raise UserError(f'render_mode is {render_mode!r}, but must be "rgb_array" or left out')
+        raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')

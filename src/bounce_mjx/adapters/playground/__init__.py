@@ -1,4 +1,4 @@
-"""MuJoCo Playground: importing this package puts the environment into its registry."""
+"""MuJoCo Playground: importing this package registers the environment as "BounceBall"."""
 
 from bounce_mjx.adapters.playground.environment import PlaygroundBounceBall
 

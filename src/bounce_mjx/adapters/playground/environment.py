@@ -1,10 +1,9 @@
-"""MuJoCo Playground: `import bounce_mjx.playground` puts the environment into its registry, as
-`registry.load("BounceBall")`. For its own trainers; the physics is this project's."""
+"""The environment for MuJoCo Playground's trainers and wrappers, with this project's physics."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
-import brax.envs
 import jax
 import mujoco
 import numpy as np
@@ -14,6 +13,7 @@ from mujoco import mjx
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task import state as core
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 
@@ -25,10 +25,14 @@ except ImportError as error:
     ) from error
 
 ENV_NAME = "BounceBall"
+_NO_RANDOMIZATION = (
+    "Playground's randomization_fn changes an MJX model, which this environment does not use, "
+    "so it would have no effect; train without it"
+)
 
 
 def default_config() -> config_dict.ConfigDict:
-    """The settings of `EnvConfig`, and the names that Playground gives to some of them."""
+    """The settings of `EnvConfig`, some under Playground's own names."""
     config = EnvConfig()
     return config_dict.create(
         ctrl_dt=config.control_dt,
@@ -44,7 +48,7 @@ def default_config() -> config_dict.ConfigDict:
 
 
 class PlaygroundBounceBall(MjxEnv):
-    """The environment as Playground's trainers and wrappers use it."""
+    """One environment with Playground's interface."""
 
     def __init__(
         self,
@@ -63,7 +67,6 @@ class PlaygroundBounceBall(MjxEnv):
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
         self.task = BounceBall(validate(EnvConfig, settings, ENV_NAME))
-        self._mjx_model: mjx.Model | None = None
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
@@ -71,7 +74,7 @@ class PlaygroundBounceBall(MjxEnv):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [6]."""
-        return _to_playground(self.task.step(_to_brax(state), action))
+        return _to_playground(self.task.step(_from_playground(state), action))
 
     @property
     def xml_path(self) -> str:
@@ -90,16 +93,24 @@ class PlaygroundBounceBall(MjxEnv):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The model in MJX."""
-        if self._mjx_model is None:
-            self._mjx_model = mjx.put_model(self.mj_model)
+        """The model in MJX, for reading; the environment steps another one."""
         return self._mjx_model
 
+    @functools.cached_property
+    def _mjx_model(self) -> mjx.Model:
+        return mjx.put_model(self.mj_model)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Playground's domain randomisation assigns a model here, which no step would use."""
+        if name == "_mjx_model":
+            raise UserError(_NO_RANDOMIZATION)
+        super().__setattr__(name, value)
+
     def render(self, trajectory: list[State] | State, *args: Any, **kwargs: Any) -> Sequence[Any]:
-        """Pictures of one state or of several, as Playground draws them."""
+        """Playground's pictures of one state or of a list of states."""
         states = trajectory if isinstance(trajectory, list) else [trajectory]
-        drawn = [state.replace(data=self._mj_data(state)) for state in states]
-        drawable = drawn if isinstance(trajectory, list) else drawn[0]
+        with_data = [state.replace(data=self._mj_data(state)) for state in states]
+        drawable = with_data if isinstance(trajectory, list) else with_data[0]
         return render_array(self.mj_model, drawable, *args, **kwargs)
 
     def _mj_data(self, state: State) -> mujoco.MjData:
@@ -109,8 +120,8 @@ class PlaygroundBounceBall(MjxEnv):
         return data
 
 
-def _to_playground(state: brax.envs.State) -> State:
-    """`data` is the `BounceState`, not MJX's."""
+def _to_playground(state: core.State) -> State:
+    """The field `data` holds a `BounceState`, not MJX's data."""
     return State(
         data=state.pipeline_state,
         obs=state.obs,
@@ -121,8 +132,8 @@ def _to_playground(state: brax.envs.State) -> State:
     )
 
 
-def _to_brax(state: State) -> brax.envs.State:
-    return brax.envs.State(
+def _from_playground(state: State) -> core.State:
+    return core.State(
         pipeline_state=state.data,
         obs=state.obs,
         reward=state.reward,

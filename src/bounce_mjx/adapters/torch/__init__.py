@@ -1,10 +1,10 @@
-"""The environment for PyTorch, through DLPack and without a copy; needs the extra `torch`."""
+"""The environment for PyTorch, without a copy through DLPack; needs the extra `torch`."""
 
 try:
     import torch  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        "bounce_mjx.torch needs PyTorch, which is not installed; "
+        "bounce_mjx.adapters.torch needs PyTorch, which is not installed; "
         "install it with pip install 'bounce_mjx[torch]'"
     ) from error
 

@@ -11,9 +11,11 @@ from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
 class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
-    """B environments. One that ends is reset within the step that ends it; `info["final_obs"]`
-    [B, 29] is what that step itself led to, for every environment, and `info["_final_obs"]` [B]
-    tells which have ended."""
+    """B environments; an ended episode is reset within the step that ends it.
+
+    `info["final_obs"]` [B, N] is every environment's observation after the step, before any reset;
+    `info["_final_obs"]` [B] is true where the episode ended.
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "torch": True}
 
@@ -27,7 +29,7 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Starts every episode afresh: observations [B, 29], and no information."""
+        """Starts a new episode in every environment: observations [B, N] and an empty info."""
         super().reset(seed=seed)
         observation, _ = self.env.reset(seed)
         return observation, {}
@@ -35,7 +37,7 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def step(
         self, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advances every environment under the actions [B, 6], float32."""
+        """Advances every environment under the actions [B, A], float32."""
         result = self.env.step(actions)
         info = {"final_obs": result.final_observation, "_final_obs": result.done}
         return result.observation, result.reward, result.terminated, result.truncated, info

@@ -1,7 +1,7 @@
-"""The networks of `policy.py` in PyTorch, and their way back to a `Policy`.
+"""The networks of `learning/networks.py` in PyTorch, and their conversion to a `Policy`.
 
-Same layers, activation, initial weights and normalisation, so that what is learned in PyTorch can
-be saved, evaluated and shown by everything that takes a `Policy`.
+Layers, activation, initial weights and normalisation are the same, so that every command that
+takes a `Policy` takes one learned in PyTorch.
 """
 
 import itertools
@@ -11,27 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from brax.training.types import UInt64
 from torch import nn
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning import statistics
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import (
-    MAX_NORMALIZED,
-    MIN_STD,
-    MIN_VARIANCE,
-    Policy,
-    init_normalizer,
-    make_networks,
-)
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD, MIN_VARIANCE
 from bounce_mjx.robot.model import JOINT_NAMES
-from bounce_mjx.task.env import OBSERVATION_SIZE
+from bounce_mjx.task.observation import OBSERVATION
 
 
 class Normalizer(nn.Module):
-    """`policy.normalize` with its running statistics.
+    """`learning.statistics` as a module: running statistics and the normalisation by them.
 
-    It serves as rsl_rl's observation normaliser (`update`) and as skrl's preprocessor (`train`).
+    rsl_rl uses it as its observation normaliser (`update`), skrl as its preprocessor (`train`).
     """
 
     def __init__(self, size: int, device: torch.device | str | None = None):
@@ -43,7 +37,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
-        """Takes observations [..., N] into the statistics (Chan, Golub and LeVeque 1979)."""
+        """Adds observations [..., N] to the statistics (Chan, Golub and LeVeque 1979)."""
         batch = observation.reshape(-1, observation.shape[-1])
         old_count = self.count.clone()
         self.count += batch.shape[0]
@@ -55,7 +49,7 @@ class Normalizer(nn.Module):
         self.std = torch.sqrt(self.summed_variance / self.count + MIN_VARIANCE)
 
     def forward(self, observation: torch.Tensor | None, train: bool = False) -> torch.Tensor | None:
-        """Normalises observations [..., N], after taking them in if `train` is set."""
+        """Normalises observations [..., N]; `train` adds them to the statistics first."""
         if observation is None:
             return None
         if train:
@@ -75,8 +69,8 @@ def make_mlp(config: PPOConfig, num_inputs: int, num_outputs: int) -> nn.Sequent
 
 
 def init_weights(mlp: nn.Sequential, output_gain: float) -> None:
-    """Orthogonal weights as in `policy.make_networks`: 0.01 is the gain of the mean's output,
-    sqrt(2) that of everything else."""
+    """Sets orthogonal weights as in `learning/networks.py`: gain sqrt(2), and `output_gain` in the
+    last layer, where the policy's mean has 0.01."""
     linears = linears_of(mlp)
     for linear in linears:
         gain = output_gain if linear is linears[-1] else 2**0.5
@@ -92,15 +86,15 @@ def linears_of(mlp: nn.Module) -> list[nn.Linear]:
 def to_policy(
     config: PPOConfig, normalizer: Normalizer, linears: Sequence[nn.Linear], log_std: torch.Tensor
 ) -> Policy:
-    """The policy that acts as the networks do: same normalised observation, same mean.
+    """The `Policy` with these networks' normalisation and mean.
 
     Args:
-      normalizer: of the observation [29].
-      linears: hidden layers and output of the mean.
+      normalizer: of the observation [N].
+      linears: hidden layers and output layer of the mean.
       log_std: logarithm of the standard deviation [6].
 
     Raises:
-      UserError: the layers are not those of the config.
+      UserError: the layers differ from those of the config.
     """
     layers = [
         {"kernel": _array(linear.weight).T, "bias": _array(linear.bias)} for linear in linears
@@ -112,24 +106,16 @@ def to_policy(
             "std_logparam": {"log_value": _array(log_std)},
         }
     }
-    networks = make_networks(config, OBSERVATION_SIZE, len(JOINT_NAMES))
-    wanted = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
-    shapes, wanted_shapes = (jax.tree.map(lambda x: x.shape, tree) for tree in (params, wanted))
-    if shapes != wanted_shapes:
+    networks = make_networks(config, OBSERVATION.size, len(JOINT_NAMES))
+    expected = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
+    shapes, expected_shapes = (jax.tree.map(lambda x: x.shape, tree) for tree in (params, expected))
+    if shapes != expected_shapes:
         raise UserError(
-            f"the policy's network has layers {shapes}, but the config's has {wanted_shapes}; "
+            f"the policy's network has layers {shapes}, but the config's has {expected_shapes}; "
             "build it with the hidden_layers of the config"
         )
-    count = int(normalizer.count)
-    statistics = init_normalizer(OBSERVATION_SIZE).replace(
-        count=UInt64(hi=jnp.uint32(count >> 32), lo=jnp.uint32(count & 0xFFFFFFFF)),
-        mean=jnp.asarray(_array(normalizer.mean)),
-        std=jnp.asarray(_array(normalizer.std)),
-        summed_variance=jnp.asarray(_array(normalizer.summed_variance)),
-    )
-    # As float32, in which checkpoints hold it; brax starts it as a Python number.
-    statistics = statistics.replace(std_eps=jnp.float32(statistics.std_eps))
-    return Policy(statistics, jax.tree.map(jnp.asarray, params))
+    mean, std = (jnp.asarray(_array(x)) for x in (normalizer.mean, normalizer.std))
+    return Policy(statistics.Normalizer(mean, std), jax.tree.map(jnp.asarray, params))
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Many arrays in one block of memory.
 
-Each array that goes from one call of a program to the next costs a microsecond or more of Python,
-and each that goes from JAX to PyTorch tens of them on CUDA. So a step takes and gives one block
-for its state, and gives one for its results, of which PyTorch's tensors are views.
+Each array passed from one call of a program to the next costs a microsecond or more of Python, and
+each array passed from JAX to PyTorch tens of microseconds on CUDA. So a step takes and returns its
+state as one block and returns its results as another, of which PyTorch's tensors are views.
 """
 
 import math
@@ -16,7 +16,7 @@ _TORCH_TYPES = {"float32": torch.float32, "int32": torch.int32, "bool": torch.bo
 
 
 class _Part(NamedTuple):
-    """Where one array lies in the block."""
+    """Place of one array in the block."""
 
     shape: tuple[int, ...]
     dtype: jnp.dtype
@@ -29,7 +29,7 @@ class _Part(NamedTuple):
 class Layout:
     """The places of a pytree's arrays in a block of words, int32 [W].
 
-    Numbers of four bytes take a word each, bools a byte; every array begins with a new word.
+    Numbers of four bytes take a word each, bools a byte; every array starts at a new word.
     """
 
     def __init__(self, shapes: Any):
@@ -55,7 +55,7 @@ class Layout:
         return self._tree.unflatten(arrays)
 
     def view(self, block: torch.Tensor, name: str) -> torch.Tensor:
-        """The array of a field, where the pytree is a flat named tuple, as a view of the block."""
+        """The array of a field as a view of the block; the pytree must be a flat named tuple."""
         part = self._named[name]
         values = block[part.start : part.stop].view(_TORCH_TYPES[part.dtype.name])
         count = math.prod(part.shape)

@@ -21,15 +21,15 @@ import contextlib
 import io
 from typing import Any
 
-import numpy as np
 import torch
+from torch import nn
 
+from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.networks import Normalizer, init_weights, linears_of, to_policy
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.task.env import BounceBall
 
 try:
     from rsl_rl.algorithms import PPO
@@ -71,6 +71,11 @@ class RslRlVecEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """The current observations."""
         return self._observations
+
+    def set_observations(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> None:
+        """Replaces the current observations [B, 29] and critic metrics [B, K], after a new
+        `TorchVectorEnv.state`."""
+        self._observations = self._groups(observation, critic_metrics)
 
     def step(
         self, actions: torch.Tensor
@@ -119,67 +124,29 @@ class Network(MLPModel):
         init_weights(self.mlp, output_gain=2**0.5 if self.distribution is None else 0.01)
 
 
-class RslRlLearner:
+class RslRlLearner(Learner):
     """rsl_rl's PPO on its own storage, stepped by its runner's loop without the runner's log,
     which would wait for the device at every step."""
 
     library = "rsl_rl"
 
-    def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
-        """Builds environments, networks and algorithm."""
-        torch.manual_seed(seed)
-        self.config = config
-        self.vector = TorchVectorEnv(
-            env,
-            config.num_envs,
-            seed=seed,
-            critic_metrics=config.critic_metrics,
-            reward_scale=config.reward_scale,
-        )
+    def _build(self) -> None:
         self.env = RslRlVecEnv(self.vector)
         self.env.episode_length_buf = torch.randint_like(
             self.env.episode_length_buf, self.env.max_episode_length
         )
-        self._observations = self.env.get_observations()
         # rsl_rl prints its networks.
         with contextlib.redirect_stdout(io.StringIO()):
             self.algorithm = PPO.construct_algorithm(
-                self._observations, self.env, algorithm_config(config), str(self.env.device)
+                self.env.get_observations(),
+                self.env,
+                algorithm_config(self.config),
+                str(self.env.device),
             )
-
-    def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`.
-
-        Returns:
-          The environment's metrics of each step [iterations, T], and the losses [iterations].
-        """
+        self.optimizer = self.algorithm.optimizer
         self.algorithm.train_mode()
-        rollouts, losses = [], []
-        for _ in range(iterations):
-            steps = []
-            with torch.inference_mode():
-                for _ in range(self.config.rollout_length):
-                    actions = self.algorithm.act(self._observations)
-                    self._observations, rewards, dones, extras = self.env.step(actions)
-                    self.algorithm.process_env_step(self._observations, rewards, dones, extras)
-                    steps.append(self.env.step_metrics())
-                self.algorithm.compute_returns(self._observations)
-            loss = self.algorithm.update()
-            rollouts.append(torch.stack(steps).cpu())
-            losses.append(
-                {
-                    "loss/policy": loss["surrogate"],
-                    "loss/value": loss["value"],
-                    "policy/entropy": loss["entropy"],
-                    "policy/learning_rate": self.algorithm.learning_rate,
-                }
-            )
-        per_step = torch.stack(rollouts).numpy()
-        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
-        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
 
     def policy(self) -> Policy:
-        """The policy as it acts now, without its noise."""
         actor = self.algorithm.get_policy()
         return to_policy(
             self.config,
@@ -187,6 +154,38 @@ class RslRlLearner:
             linears_of(actor.mlp),
             actor.distribution.log_std_param,
         )
+
+    def _iterate(self) -> tuple[torch.Tensor, dict[str, float]]:
+        steps = []
+        with torch.inference_mode():
+            for _ in range(self.config.rollout_length):
+                actions = self.algorithm.act(self.env.get_observations())
+                observations, rewards, dones, extras = self.env.step(actions)
+                self.algorithm.process_env_step(observations, rewards, dones, extras)
+                steps.append(self.env.step_metrics())
+            self.algorithm.compute_returns(observations)
+        loss = self.algorithm.update()
+        return torch.stack(steps), {
+            "loss/policy": loss["surrogate"],
+            "loss/value": loss["value"],
+            "policy/entropy": loss["entropy"],
+            "policy/learning_rate": self.algorithm.learning_rate,
+        }
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"actor": self.algorithm.actor, "critic": self.algorithm.critic}
+
+    def _set_learning_rate(self, rate: float) -> None:
+        self.algorithm.learning_rate = rate
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+
+    def _observed(self) -> dict[str, torch.Tensor]:
+        observations = self.env.get_observations()
+        return {name: observations[name] for name in ("policy", "critic")}
+
+    def _observe(self, policy: torch.Tensor, critic: torch.Tensor) -> None:
+        self.env.set_observations(policy, critic)
 
 
 def algorithm_config(config: PPOConfig) -> dict[str, Any]:

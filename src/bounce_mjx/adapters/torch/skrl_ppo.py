@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.networks import (
     Normalizer,
     init_weights,
@@ -30,7 +31,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
-from bounce_mjx.task.env import BounceBall
 
 try:
     from skrl.agents.torch.ppo import PPO, PPO_CFG
@@ -110,76 +110,72 @@ class SkrlEnv(Wrapper):
         """Nothing is held open."""
 
 
-class SkrlLearner:
+class SkrlLearner(Learner):
     """skrl's PPO, stepped as its trainers step it but with the terminal observations at an end,
     from which it then bootstraps time-outs."""
 
     library = "skrl"
 
-    def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
-        """Builds environments, networks and agent."""
-        torch.manual_seed(seed)
-        self.config = config
-        self.vector = TorchVectorEnv(
-            env,
-            config.num_envs,
-            seed=seed,
-            critic_metrics=config.critic_metrics,
-            reward_scale=config.reward_scale,
-        )
+    def _build(self) -> None:
         self.env = SkrlEnv(self.vector)
         self._observations, _ = self.env.reset()
         self._states = self.env.state()
         self.vector.clock = torch.randint_like(self.vector.clock, self.vector.episode_steps)
+        models = {"policy": _Actor(self.config, self.env), "value": _Critic(self.config, self.env)}
         self.agent = PPO(
-            models={"policy": _Actor(config, self.env), "value": _Critic(config, self.env)},
+            models=models,
             memory=RandomMemory(
-                memory_size=config.rollout_length,
-                num_envs=config.num_envs,
+                memory_size=self.config.rollout_length,
+                num_envs=self.config.num_envs,
                 device=self.env.device,
             ),
             observation_space=self.env.observation_space,
             state_space=self.env.state_space,
             action_space=self.env.action_space,
             device=self.env.device,
-            cfg=agent_config(config, self.env),
+            cfg=agent_config(self.config, self.env),
         )
         self.agent.init()
         self.agent.enable_training_mode(True)
-        self._iteration = 0
-
-    def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`.
-
-        Returns:
-          The environment's metrics of each step [iterations, T], and the losses [iterations].
-        """
-        rollouts, losses = [], []
-        for _ in range(iterations):
-            if self.agent.scheduler is not None:
-                self.agent.scheduler.max_lr = float(max_learning_rate(self.config, self._iteration))
-            self._iteration += 1
-            self.agent.tracking_data.clear()
-            rollouts.append(torch.stack([self._step() for _ in range(self.config.rollout_length)]))
-            tracked = self.agent.tracking_data
-            losses.append(
-                {
-                    "loss/policy": tracked["Loss / Policy loss"][-1],
-                    "loss/value": tracked["Loss / Value loss"][-1],
-                    "policy/action_std": tracked["Policy / Standard deviation"][-1],
-                    "policy/learning_rate": self.agent.optimizer.param_groups[0]["lr"],
-                }
-            )
-        per_step = torch.stack(rollouts).cpu().numpy()
-        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
-        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
+        self.optimizer = self.agent.optimizer
 
     def policy(self) -> Policy:
-        """The policy as it acts now, without its noise."""
         actor = self.agent.policy
         return to_policy(
             self.config, self.agent._observation_preprocessor, linears_of(actor.mlp), actor.log_std
         )
+
+    def _iterate(self) -> tuple[torch.Tensor, dict[str, float]]:
+        if self.agent.scheduler is not None:
+            self.agent.scheduler.max_lr = float(max_learning_rate(self.config, self.iteration))
+        self.agent.tracking_data.clear()
+        steps = torch.stack([self._step() for _ in range(self.config.rollout_length)])
+        tracked = self.agent.tracking_data
+        return steps, {
+            "loss/policy": tracked["Loss / Policy loss"][-1],
+            "loss/value": tracked["Loss / Value loss"][-1],
+            "policy/action_std": tracked["Policy / Standard deviation"][-1],
+            "policy/learning_rate": self.optimizer.param_groups[0]["lr"],
+        }
+
+    def _modules(self) -> dict[str, torch.nn.Module]:
+        return {
+            "policy": self.agent.policy,
+            "value": self.agent.value,
+            "observation_statistics": self.agent._observation_preprocessor,
+            "state_statistics": self.agent._state_preprocessor,
+        }
+
+    def _set_learning_rate(self, rate: float) -> None:
+        # The scheduler reads it from here.
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+
+    def _observed(self) -> dict[str, torch.Tensor]:
+        return {"observations": self._observations, "states": self._states}
+
+    def _observe(self, observations: torch.Tensor, states: torch.Tensor) -> None:
+        self._observations, self._states = observations, states
 
     def _step(self) -> torch.Tensor:
         """One step of every environment, and an update where it ends a rollout; its metrics."""

@@ -1,28 +1,30 @@
-"""Many environments at once for PyTorch: `vector.py` behind tensors.
+"""Batched environments for PyTorch: `task/vector.py` with tensors.
 
-Tensors and arrays share their memory (DLPack), on the CPU as on CUDA, and nothing waits for the
-device: DLPack lets each library's stream wait for the other's. The state is donated to the next
-step, so nothing that a step hands out is a part of it.
+Tensors and arrays share their memory through DLPack, on the CPU and on CUDA. The host never waits
+for the device, as DLPack makes each library's stream wait for the other's. The state is donated to
+the next step, so a step returns no view of it.
 """
 
+import copy
 import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.ppo import step_metrics
+from bounce_mjx.learning.metrics import step_metrics
 from bounce_mjx.task import vector
 from bounce_mjx.task.env import BounceBall
 
 
 class StepResult:
-    """What one step of B environments gave, as tensors that share memory with JAX's array.
+    """Result of one step of B environments, as tensors that share memory with JAX's array.
 
-    All are views of one block of memory, made when they are first asked for.
+    All tensors are views of one block of memory, made at their first use.
     """
 
     def __init__(self, block: jax.Array, layout: Layout):
@@ -31,17 +33,18 @@ class StepResult:
 
     @functools.cached_property
     def observation(self) -> torch.Tensor:
-        """What to act on next [B, 29]: after an end, the first of the new episode."""
+        """Observation for the next action [B, N]; after an end, the first of the new episode."""
         return self._layout.view(self._block, "observation")
 
     @functools.cached_property
     def critic_metrics(self) -> torch.Tensor:
-        """The metrics that only the value network sees, of the same instant [B, K]."""
+        """The value network's additional inputs at the same instant [B, K]."""
         return self._layout.view(self._block, "critic_metrics")
 
     @functools.cached_property
     def final_observation(self) -> torch.Tensor:
-        """What the step itself led to [B, 29]: at an end, the last of the old episode."""
+        """Observation after the step, before any reset [B, N]; at an end, the last of the old
+        episode."""
         return self._layout.view(self._block, "final_observation")
 
     @functools.cached_property
@@ -76,7 +79,7 @@ class StepResult:
 
 
 class TorchVectorEnv:
-    """B environments whose ended episodes start afresh within the step that ended them."""
+    """B environments; an ended episode is reset within the step that ends it."""
 
     def __init__(
         self,
@@ -88,15 +91,14 @@ class TorchVectorEnv:
         reward_scale: float = 1.0,
         device: torch.device | str | None = None,
     ):
-        """Compiles nothing yet; `reset` and `step` do when they are first called.
+        """Compiles nothing; the first calls of `reset` and `step` do.
 
         Args:
-          env: the task; the default one if left out.
+          env: the task; None for the default one.
           seed: of all resets.
-          critic_metrics: names of the metrics that a value network may see beside the
-            observation.
+          critic_metrics: names of the metrics that are additional inputs of the value network.
           reward_scale: factor of the rewards.
-          device: where the tensors must lie; JAX's default device if left out.
+          device: the device of the tensors, which must be JAX's default device; None accepts it.
 
         Raises:
           UserError: torch cannot use JAX's device, `device` is another one, or a metric is unknown.
@@ -117,7 +119,7 @@ class TorchVectorEnv:
         unknown = [name for name in critic_metrics if name not in known]
         if unknown:
             raise UserError(
-                f"critic_metrics names {unknown[0]!r}, which is no metric of the environment; "
+                f"critic_metrics names {unknown[0]!r}, which is not a metric of the environment; "
                 f"choose from {', '.join(sorted(known))}"
             )
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
@@ -132,10 +134,10 @@ class TorchVectorEnv:
         self._block: jax.Array | None = None
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Starts every episode afresh, with resets drawn from `seed` if one is given.
+        """Starts a new episode in every environment; a `seed` seeds all following resets.
 
         Returns:
-          The observations [B, 29] and the critic's metrics [B, K].
+          The observations [B, N] and the critic metrics [B, K].
         """
         if seed is not None:
             self._key = jax.random.PRNGKey(seed)
@@ -147,8 +149,8 @@ class TorchVectorEnv:
         """Advances every environment.
 
         Args:
-          action: [B, 6], float32, on the environments' device; clipped to [-1, 1]. It must not be
-            changed in place before the observation of this step has been used.
+          action: [B, A], float32, on the environments' device; clipped to [-1, 1]. Do not change
+            it in place before the first use of this step's observation.
 
         Raises:
           UserError: the action has another shape, type or device, or `reset` was never called.
@@ -168,10 +170,31 @@ class TorchVectorEnv:
         self._block, result = self._jit_step(self._block, shared)
         return StepResult(result, self._result_layout)
 
+    def sibling(self, seed: int) -> "TorchVectorEnv":
+        """As many other environments on the same compiled programs.
+
+        Args:
+          seed: of their resets.
+        """
+        other = copy.copy(self)
+        other._key, other._block = jax.random.PRNGKey(seed), None
+        return other
+
+    @property
+    def state(self) -> np.ndarray:
+        """Everything that the next step needs, one block [W], int32; a copy, which may be set."""
+        if self._block is None:
+            self.reset()
+        return np.array(self._block)
+
+    @state.setter
+    def state(self, value: np.ndarray) -> None:
+        self._block = jnp.array(value)
+
     @property
     def clock(self) -> torch.Tensor:
-        """Steps of each episode that count towards its time limit [B], int32; a copy. Setting it
-        spreads the time-outs of episodes that all began together."""
+        """Steps of each episode that count towards its time limit [B], int32; a copy. Assign
+        different values to spread the time-outs of episodes that began together."""
         if self._block is None:
             self.reset()
         # A copy, as the next step takes the memory of the state.
@@ -233,7 +256,7 @@ class TorchVectorEnv:
 
 
 class _Carried(NamedTuple):
-    """What the next step needs."""
+    """Inputs of the next step besides the action."""
 
     vector: vector.VectorState
     key: jax.Array
@@ -254,12 +277,12 @@ class _StepArrays(NamedTuple):
 
 
 def _slim(state: vector.VectorState) -> vector.VectorState:
-    """The state without what no step reads."""
+    """The state without the fields that no step reads."""
     return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
 
 
 def _whole(slim: vector.VectorState, template: Any) -> vector.VectorState:
-    """A slim state with zeros for what it lacks, which the compiler drops."""
+    """A slim state with zeros in the missing fields, which the compiler drops."""
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template.env)
     filled = slim.env.replace(
         obs=zeros.obs, reward=zeros.reward, done=zeros.done, metrics=zeros.metrics
@@ -285,7 +308,7 @@ def _shared_device(wanted: torch.device | None) -> torch.device:
     same = wanted is None or (wanted.type == shared.type and wanted.index in (None, shared.index))
     if not same:
         raise UserError(
-            f"device is {wanted}, but JAX's arrays lie on {shared}; leave it out, or choose JAX's "
+            f"device is {wanted}, but JAX's arrays lie on {shared}; omit it, or choose JAX's "
             "device with JAX_PLATFORMS"
         )
     return shared

@@ -7,6 +7,13 @@ constants from a compiled `mujoco.MjModel` and refuses any other kind.
 
 from bounce_mjx.physics.fused.dynamics import paddle_position, step
 from bounce_mjx.physics.fused.model import FusedModel, read_model
-from bounce_mjx.physics.fused.support import UnsupportedModelError
+from bounce_mjx.physics.fused.support import UnsupportedModelError, unsupported_feature
 
-__all__ = ["FusedModel", "UnsupportedModelError", "paddle_position", "read_model", "step"]
+__all__ = [
+    "FusedModel",
+    "UnsupportedModelError",
+    "paddle_position",
+    "read_model",
+    "step",
+    "unsupported_feature",
+]

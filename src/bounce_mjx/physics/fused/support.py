@@ -3,11 +3,20 @@
 import mujoco
 import numpy as np
 
-from bounce_mjx.robot.model import Addresses
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 
 class UnsupportedModelError(ValueError):
     """The model has a feature that the fused engine does not compute; the text names it."""
+
+
+def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
+    """A feature of the model that the fused engine does not compute; None if it computes all."""
+    try:
+        check_supported(mj_model, find_addresses(mj_model))
+    except UnsupportedModelError as error:
+        return str(error)
+    return None
 
 
 def check_supported(mj_model: mujoco.MjModel, at: Addresses) -> None:
@@ -79,9 +88,10 @@ def _check_bodies(m: mujoco.MjModel, at: Addresses) -> None:
     box = mujoco.mjtGeom.mjGEOM_BOX
     _require(m.geom_type[at.paddle_geom] == box, "a paddle that is not a box")
     _require(not np.any(m.body_gravcomp), "gravity compensation (gravcomp)")
-    springs = np.any(m.jnt_stiffness) or np.any(m.jnt_stiffnesspoly)
-    _require(not springs, "joint springs (stiffness)")
-    _require(not np.any(m.dof_dampingpoly), "nonlinear joint damping")
+    nonlinear = np.any(m.jnt_stiffnesspoly)
+    _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
+    _require(not np.any(m.jnt_stiffness), "joint springs (stiffness)")
+    _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
     _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
     inertia = m.body_inertia[at.ball_body]

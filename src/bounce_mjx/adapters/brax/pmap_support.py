@@ -1,8 +1,7 @@
-"""What brax's own trainers need from this side to run on a newer jax.
+"""`jax.device_put_replicated` for brax's trainers on a newer JAX.
 
-brax 0.14.2 calls `jax.device_put_replicated` in `brax.training.agents.ppo.train`, but jax 0.10
-removed that function. This file is the one place that gives it back. Nothing else in the package
-uses it, as the package's own trainer (`ppo.py`) does not need it.
+brax 0.14.2 calls this function in `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed
+it. The package's own trainer does not use it.
 """
 
 import contextlib
@@ -18,10 +17,9 @@ _NAME = "device_put_replicated"
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Within it, `brax.training.agents.ppo.train.train` runs on a jax that lacks
-    `jax.device_put_replicated`; a jax that has the function is left as it is.
+    """Provides `jax.device_put_replicated` inside a `with` block, where JAX lacks it.
 
-    Not for several threads at once: the function is added to the module `jax` and removed again.
+    Not thread-safe: the function is added to the module `jax` and removed at the end.
     """
     if hasattr(jax, _NAME):
         yield

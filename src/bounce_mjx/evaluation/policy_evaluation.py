@@ -1,5 +1,7 @@
 """The five results of a policy, on any engine."""
 
+from typing import Literal, NamedTuple
+
 import jax
 
 from bounce_mjx.config.validation import validate
@@ -12,6 +14,16 @@ from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 
 
+class Evaluation(NamedTuple):
+    """A report, and the engine behind it."""
+
+    report: Report
+    engine: str
+    """fused, mjx or mujoco."""
+    warnings: tuple[str, ...]
+    """Reasons to doubt the engine's physics, one sentence each."""
+
+
 def evaluate_policy(
     policy: Policy,
     env_config: EnvConfig,
@@ -20,16 +32,16 @@ def evaluate_policy(
     episodes: int = DEFAULT_EPISODES,
     seed: int = DEFAULT_SEED,
     target_height: float | None = None,
-    physics: str = "config",
-) -> tuple[Report, str]:
-    """Measures the five results.
+    physics: Literal["config", "fused", "mjx", "mujoco"] = "config",
+) -> Evaluation:
+    """Measures the five results of a policy without its noise.
 
     Args:
+      env_config, ppo_config: of the policy's training; the latter gives the networks.
+      episodes: each from its own reset.
+      seed: of the resets.
       target_height: one target height for all episodes, m; None for the config's range.
-      physics: "fused", "mjx", "mujoco", or "config" for the config's.
-
-    Returns:
-      The report, and the name of the engine.
+      physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
 
     Raises:
       UserError: the engine does not support the model.
@@ -41,6 +53,12 @@ def evaluate_policy(
         changes["physics"] = physics
     env = BounceBall(validate(EnvConfig, dict(env_config) | changes, "evaluation"))
     networks = make_networks(ppo_config, env.observation_size, env.action_size)
-    make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
+    on_c = physics == "mujoco"
+    make = make_mujoco_evaluator if on_c else make_evaluator
     statistics = make(env, networks, episodes)(policy, jax.random.PRNGKey(seed))
-    return judge(env, statistics), physics if physics == "mujoco" else env.engine.name
+    return Evaluation(
+        judge(env, statistics),
+        engine="mujoco" if on_c else env.engine.name,
+        # They tell of models on which MuJoCo's solver does not converge, unlike the fused physics.
+        warnings=env.engine.warnings if on_c else (),
+    )

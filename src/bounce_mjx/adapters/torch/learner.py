@@ -1,0 +1,170 @@
+"""The common part of the PyTorch learners: random numbers of their own, and their state as data."""
+
+import abc
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+import torch
+from torch import nn
+
+from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy
+
+State = dict[str, Any]
+
+
+class Learner(abc.ABC):
+    """A library's PPO on a batch of environments.
+
+    Between two calls of `learn`, its state is the networks, the statistics, Adam's moments, the
+    learning rate, the environments, what they showed last, and PyTorch's random state.
+    """
+
+    library: ClassVar[str]
+    optimizer: torch.optim.Adam
+    iteration: int = 0
+    """Iterations done."""
+
+    def __init__(self, config: PPOConfig, vector: TorchVectorEnv, seed: int):
+        """Builds networks and algorithm; several learners do not share random numbers."""
+        self.config, self.vector = config, vector
+        outside = _random_state(vector.device)
+        torch.manual_seed(seed)
+        self._build()
+        self._random = _random_state(vector.device)
+        _set_random_state(vector.device, outside)
+
+    def learn(self, iterations: int) -> dict[str, np.ndarray]:
+        """Trains for `iterations`.
+
+        Returns:
+          The environment's metrics of each step [iterations, T], and the losses [iterations].
+        """
+        outside = _random_state(self.vector.device)
+        _set_random_state(self.vector.device, self._random)
+        rollouts, losses = [], []
+        for _ in range(iterations):
+            rollout, loss = self._iterate()
+            rollouts.append(rollout)
+            losses.append(loss)
+            self.iteration += 1
+        self._random = _random_state(self.vector.device)
+        _set_random_state(self.vector.device, outside)
+        per_step = torch.stack(rollouts).cpu().numpy()
+        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
+        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
+
+    def state(self) -> State:
+        """Everything that training goes on from, as nested dictionaries of numpy arrays."""
+        return {
+            "modules": {
+                name: {key: _to_array(tensor) for key, tensor in module.state_dict().items()}
+                for name, module in self._modules().items()
+            },
+            "adam": {
+                str(i): {key: _to_array(moment) for key, moment in self._moments(parameter).items()}
+                for i, parameter in enumerate(self._parameters())
+            },
+            "learning_rate": _split_words(np.float64(self.optimizer.param_groups[0]["lr"])),
+            "iteration": np.int32(self.iteration),
+            "env": self.vector.state,
+            "observed": {name: _to_array(tensor) for name, tensor in self._observed().items()},
+            "random": {name: _to_array(tensor) for name, tensor in self._random.items()},
+        }
+
+    def restore(self, state: State) -> None:
+        """Goes on from a `state`."""
+        for name, module in self._modules().items():
+            current = module.state_dict()
+            module.load_state_dict(
+                {key: _to_tensor(x, current[key]) for key, x in state["modules"][name].items()}
+            )
+        for i, parameter in enumerate(self._parameters()):
+            self.optimizer.state[parameter] = {
+                key: _to_tensor(state["adam"][str(i)][key], moment)
+                for key, moment in self._moments(parameter).items()
+            }
+        rate = np.asarray(state["learning_rate"])
+        self._set_learning_rate(float(rate.view(np.float64)[0]))
+        self.iteration = int(state["iteration"])
+        self.vector.state = state["env"]
+        observed = self._observed().items()
+        self._observe(**{n: _to_tensor(state["observed"][n], tensor) for n, tensor in observed})
+        self._random = {name: torch.from_numpy(np.array(x)) for name, x in state["random"].items()}
+
+    def is_finite(self) -> bool:
+        """Whether every parameter is finite."""
+        return all(bool(parameter.isfinite().all()) for parameter in self._parameters())
+
+    @abc.abstractmethod
+    def policy(self) -> Policy:
+        """The policy as it acts now, without its noise."""
+
+    @abc.abstractmethod
+    def _build(self) -> None:
+        """Builds networks, algorithm and `optimizer`, and resets the environments."""
+
+    @abc.abstractmethod
+    def _iterate(self) -> tuple[torch.Tensor, dict[str, float]]:
+        """One iteration: the environment's metrics of each step [T, M], and the losses."""
+
+    @abc.abstractmethod
+    def _modules(self) -> dict[str, nn.Module]:
+        """Networks and statistics."""
+
+    @abc.abstractmethod
+    def _set_learning_rate(self, rate: float) -> None:
+        """Sets the learning rate wherever the library keeps it."""
+
+    @abc.abstractmethod
+    def _observed(self) -> dict[str, torch.Tensor]:
+        """The tensors that the next action depends on."""
+
+    @abc.abstractmethod
+    def _observe(self, **observed: torch.Tensor) -> None:
+        """Sets the tensors of `_observed`."""
+
+    def _parameters(self) -> list[nn.Parameter]:
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
+
+    def _moments(self, parameter: nn.Parameter) -> dict[str, torch.Tensor]:
+        """Adam's state of a parameter, which PyTorch makes at the first update."""
+        zeros = {
+            "step": torch.zeros(()),
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+        }
+        return self.optimizer.state.get(parameter) or zeros
+
+
+def _random_state(device: torch.device) -> dict[str, torch.Tensor]:
+    states = {"cpu": torch.get_rng_state()}
+    return states if device.type == "cpu" else states | {"cuda": torch.cuda.get_rng_state(device)}
+
+
+def _set_random_state(device: torch.device, states: dict[str, torch.Tensor]) -> None:
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states:
+        torch.cuda.set_rng_state(states["cuda"], device)
+
+
+def _to_array(tensor: torch.Tensor) -> np.ndarray:
+    """A copy, as the training goes on in the tensor's memory."""
+    return _split_words(tensor.detach().cpu().numpy().copy())
+
+
+def _split_words(array: np.ndarray) -> np.ndarray:
+    """Numbers of 64 bits as pairs of words [..., 2], as JAX reads checkpoints in 32 bits."""
+    array = np.asarray(array)
+    return array[..., None].view(np.uint32) if array.dtype.itemsize == 8 else array
+
+
+def _to_tensor(array: jax.Array | np.ndarray, like: torch.Tensor) -> torch.Tensor:
+    """The tensor of `_to_array`, with the type and the device of another."""
+    array = np.array(array)
+    wanted = like.detach().cpu().numpy().dtype
+    if wanted.itemsize == 8:
+        array = array.view(wanted)[..., 0]
+    return torch.from_numpy(np.array(array)).to(like.device)

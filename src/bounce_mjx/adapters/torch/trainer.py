@@ -1,0 +1,145 @@
+"""PyTorch's PPO implementations as trainers of the job: one learner a seed."""
+
+import concurrent.futures
+import importlib
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from bounce_mjx.adapters.torch.learner import Learner
+from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.metrics import rollout_metrics
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training.devices import make_mesh
+from bounce_mjx.training.trainer import Metrics, Snapshot, iterations_per_block
+
+_LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
+
+
+class TorchTrainer:
+    """A library's PPO, its seeds one after another; see `training.trainer.Trainer`."""
+
+    checked = ("reward", "loss/value", "loss/policy", "parameters")
+
+    def __init__(self, library: str, config: TrainConfig, env: BounceBall):
+        """
+        Raises:
+          UserError: the library is not installed, or the config does not fit it or the environment.
+        """
+        if (config.num_devices or 1) > 1:
+            raise UserError(
+                f"num_devices is {config.num_devices}, but PyTorch trains on one device here; "
+                "leave it out, or train with bounce-mjx train"
+            )
+        self.library = library
+        self.mesh: Mesh = make_mesh(1, config.ppo)
+        self._iterations = iterations_per_block(config)
+        first = make_vector_env(config.ppo, env, config.seed)
+        self.learners: list[Learner] = []
+        for seed in range(config.seed, config.seed + config.num_seeds):
+            vector = first.sibling(seed) if self.learners else first
+            self.learners.append(_learner_class(library)(config.ppo, vector, seed))
+        self._diverged: set[int] = set()
+
+    def state_template(self) -> Any:
+        one = jax.tree.map(np.asarray, self.learners[0].state())
+        seeds = (len(self.learners),) if len(self.learners) > 1 else ()
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), one)
+
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        # The step of the environments is compiled at its first call.
+        return pool.submit(lambda: None)
+
+    def start(self, state: Any | None = None) -> None:
+        if state is None:
+            return
+        for i, learner in enumerate(self.learners):
+            one = state
+            if len(self.learners) > 1:
+                one = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
+            learner.restore(one)
+            if not learner.is_finite():
+                self._diverged.add(i)
+
+    def run(self) -> Metrics:
+        blocks = {
+            i: summarize(learner.learn(self._iterations))
+            for i, learner in enumerate(self.learners)
+            if i not in self._diverged
+        }
+        for i, block in blocks.items():
+            block["fault"] = faults(block, self.learners[i].is_finite())
+            if block["fault"].any():
+                self._diverged.add(i)
+        # A library may raise exceptions for what is not finite, so a diverged seed only waits.
+        names = next(iter(blocks.values()))
+        nothing = {name: np.full(self._iterations, np.nan) for name in names}
+        nothing |= {"task/non_finite": np.zeros(self._iterations)}
+        nothing |= {"fault": np.full(self._iterations, len(self.checked))}
+        of_seeds = [blocks.get(i, nothing) for i in range(len(self.learners))]
+        return {name: np.stack([block[name] for block in of_seeds]) for name in names}
+
+    def snapshot(self) -> Snapshot:
+        snapshots = [
+            Snapshot(jax.tree.map(np.asarray, learner.policy()), learner.state())
+            for learner in self.learners
+        ]
+        if len(snapshots) == 1:
+            return snapshots[0]
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
+
+
+def make_learner(library: str, config: PPOConfig, env: BounceBall, seed: int) -> Learner:
+    """The PPO of a library.
+
+    Raises:
+      UserError: the library is not installed.
+    """
+    return _learner_class(library)(config, make_vector_env(config, env, seed), seed)
+
+
+def make_vector_env(config: PPOConfig, env: BounceBall, seed: int) -> TorchVectorEnv:
+    """The environments of a learner."""
+    return TorchVectorEnv(
+        env,
+        config.num_envs,
+        seed=seed,
+        critic_metrics=config.critic_metrics,
+        reward_scale=config.reward_scale,
+    )
+
+
+def summarize(metrics: Metrics) -> Metrics:
+    """Metrics of each iteration [I] from those of a learner: the environment's [I, T], as the
+    trainer in JAX reports them, and the learner's own [I]."""
+    own = {name: values for name, values in metrics.items() if values.ndim == 1}
+    steps = {name: values for name, values in metrics.items() if values.ndim == 2}
+    return own | {
+        name: np.asarray(value) for name, value in jax.vmap(rollout_metrics)(steps).items()
+    }
+
+
+def faults(metrics: Metrics, finite_parameters: bool) -> np.ndarray:
+    """The metric "fault" [I] of a learner's block.
+
+    Args:
+      metrics: each [I].
+      finite_parameters: whether the parameters were finite at the end.
+    """
+    *names, _ = TorchTrainer.checked
+    numbers = np.zeros(len(metrics["reward"]), int)
+    if not finite_parameters:
+        numbers[-1] = len(TorchTrainer.checked)
+    for number, name in reversed(list(enumerate(names, start=1))):
+        numbers[~np.isfinite(metrics[name])] = number
+    return numbers
+
+
+def _learner_class(library: str) -> type[Learner]:
+    module = importlib.import_module(f"bounce_mjx.adapters.torch.{library}_ppo")
+    return getattr(module, _LEARNERS[library])

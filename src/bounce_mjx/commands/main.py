@@ -1,0 +1,64 @@
+"""The console script: `bounce-mjx train|eval|play|view|plot|report|train-torch`."""
+
+import contextlib
+import difflib
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import INTERRUPTED
+
+COMMANDS = {
+    "train": "train a policy that keeps the ball bouncing",
+    "eval": "measure the five results of a trained policy",
+    "play": "show a trained policy",
+    "view": "show the environment under random, zero or scripted actions",
+    "plot": "draw the learning curves of runs, and an evaluation",
+    "report": "write the report of a run, report.html",
+    "train-torch": "train with a PyTorch library",
+}
+_HELP = """usage: bounce-mjx COMMAND [ARGUMENTS]
+
+A robot arm learns to bounce a ball.
+
+{commands}
+
+bounce-mjx COMMAND --help lists the arguments of a command.
+"""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs a command line, of which the first word names the command.
+
+    A command is imported only when it is chosen, as each brings libraries that take seconds.
+    """
+    with exit_on_user_error():
+        name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
+        if name in ("--help", "-h"):
+            lines = (f"  {command:<13}{meaning}" for command, meaning in COMMANDS.items())
+            print(_HELP.format(commands="\n".join(lines)), end="")
+            return
+        if name not in COMMANDS:
+            near = difflib.get_close_matches(name, COMMANDS, n=1)
+            advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
+            raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
+        with _interruptible():
+            module = importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}")
+        module.main(rest)
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Lets Ctrl-C end the process at once, without Python's exception: a library that is being
+    imported may turn that into another."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

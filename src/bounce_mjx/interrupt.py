@@ -1,0 +1,57 @@
+"""Ctrl-C during work that Python cannot interrupt, such as a compilation by XLA."""
+
+import concurrent.futures
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+Result = TypeVar("Result")
+
+INTERRUPTED = 130
+"""Exit status of a process that Ctrl-C ended, by the shells' convention."""
+
+# Windows does not interrupt an unlimited wait.
+_POLL_SECONDS = 0.1
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C came while a thread was in work that cannot be stopped."""
+
+
+def run_interruptible(function: Callable[..., Result], *arguments: Any, **keywords: Any) -> Result:
+    """Calls a function in a thread of its own and waits for its result.
+
+    Python runs signal handlers in the main thread, between two bytecodes. On that thread a
+    compilation would therefore delay Ctrl-C until its end.
+
+    Raises:
+      Interrupted: Ctrl-C came. The thread cannot be stopped: end the process with `leave`.
+      BaseException: the function raised it.
+    """
+    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
+
+    def run() -> None:
+        try:
+            future.set_result(function(*arguments, **keywords))
+        except BaseException as error:  # noqa: BLE001
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        while not concurrent.futures.wait([future], timeout=_POLL_SECONDS).done:
+            pass
+    except KeyboardInterrupt as interrupt:
+        raise Interrupted from interrupt
+    return future.result()
+
+
+def leave(status: int = INTERRUPTED) -> NoReturn:
+    """Ends the process at once, without waiting for its threads.
+
+    The interpreter's own way out would free what a compilation in another thread still uses.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)

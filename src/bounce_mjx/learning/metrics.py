@@ -1,0 +1,71 @@
+"""Metrics of a rollout: means over its steps and over the episodes that ended in it."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.task import vector
+
+Metrics = dict[str, jax.Array]
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["columns"], meta_fields=["names"])
+@dataclasses.dataclass(frozen=True)
+class Packed:
+    """Metrics in one array, as on a GPU each small array of a loop costs a kernel."""
+
+    names: tuple[str, ...]
+    columns: jax.Array
+    """The metrics in the order of their names [..., M]."""
+
+    @classmethod
+    def of(cls, metrics: Metrics) -> "Packed":
+        """Packs metrics of one shape [...]."""
+        return cls(tuple(metrics), jnp.stack(list(metrics.values()), axis=-1))
+
+    def metrics(self) -> Metrics:
+        """The metrics, each [...]."""
+        return dict(zip(self.names, jnp.moveaxis(self.columns, -1, 0), strict=True))
+
+
+def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
+    """Means over each group of environments [G] of one step, and sums over the episodes in it that
+    ended on the step."""
+    ended = result.terminated | result.truncated
+    means = result.metrics | {"reward": result.reward}
+    totals = {
+        "ended": ended,
+        "return": jnp.where(ended, result.episode_return, 0.0),
+        "length": jnp.where(ended, result.episode_length, 0),
+        "bounces": jnp.where(ended, result.metrics["n_bounces"], 0.0),
+        "apex_error": result.metrics["apex_error"],
+        "bounced": result.metrics["bounced"],
+        "non_finite": result.metrics["non_finite"],
+    }
+    # One array, as on a GPU each small one costs a kernel.
+    rows = jnp.stack([x.astype(result.reward.dtype) for x in (means | totals).values()])
+    sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
+    count = result.reward.size // groups
+    return {
+        name: total if name in totals else total / count
+        for name, total in zip(means | totals, sums, strict=True)
+    }
+
+
+def rollout_metrics(steps: Metrics) -> Metrics:
+    """Metrics of a rollout from those of its steps and groups [T, G]. Where no episode ended (or
+    no bounce happened), its means are not a number."""
+    ended, bounced = jnp.sum(steps["ended"]), jnp.sum(steps["bounced"])
+    rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
+    return rewards | {
+        "episode/return": jnp.sum(steps["return"]) / ended,
+        "episode/length": jnp.sum(steps["length"]) / ended,
+        "episode/bounces": jnp.sum(steps["bounces"]) / ended,
+        "episode/ended": ended,
+        "task/apex_error": jnp.sum(steps["apex_error"]) / bounced,
+        "task/ball_xy_error": jnp.mean(steps["ball_xy_error"]),
+        "task/n_bounces": jnp.mean(steps["n_bounces"]),
+        "task/non_finite": jnp.sum(steps["non_finite"]),
+    }

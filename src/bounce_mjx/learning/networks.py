@@ -1,0 +1,69 @@
+"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights.
+
+A policy's file holds the parameters under the names that the modules have here; so a module
+keeps its name.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from bounce_mjx.learning.gaussian import Gaussian
+
+_GAIN = math.sqrt(2.0)
+# A small gain, so that the first mean actions are near 0.
+_MEAN_GAIN = 0.01
+
+
+class MLP(nn.Module):
+    """Dense layers hidden_0, hidden_1, ... with SiLU between them."""
+
+    widths: tuple[int, ...]
+    """Width of each layer."""
+    activate_final: bool
+    """Whether SiLU follows the last layer too."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Outputs [..., widths[-1]] for inputs [..., N]."""
+        for i, width in enumerate(self.widths):
+            dense = nn.Dense(
+                width, kernel_init=nn.initializers.orthogonal(_GAIN), name=f"hidden_{i}"
+            )
+            x = dense(x)
+            if self.activate_final or i + 1 < len(self.widths):
+                x = nn.silu(x)
+        return x
+
+
+class LogParameter(nn.Module):
+    """A positive vector whose logarithm is the parameter `log_value`."""
+
+    size: int
+    initial: float
+
+    @nn.compact
+    def __call__(self) -> jax.Array:
+        """The vector [size]."""
+        log_initial = jnp.log(jnp.float32(self.initial))
+        log_value = self.param("log_value", lambda _: jnp.full(self.size, log_initial))
+        return jnp.exp(log_value)
+
+
+class PolicyNetwork(nn.Module):
+    """A Gaussian over actions: its mean depends on the input, its standard deviation does not."""
+
+    hidden_layers: tuple[int, ...]
+    action_size: int
+    init_noise_std: float
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> Gaussian:
+        """Distribution of the action [..., A] for normalised observations [..., N]."""
+        hidden = MLP(self.hidden_layers, activate_final=True)(observation)
+        mean_init = nn.initializers.orthogonal(_MEAN_GAIN)
+        mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
+        std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
+        return Gaussian(mean, jnp.broadcast_to(std, mean.shape))

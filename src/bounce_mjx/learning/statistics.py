@@ -1,0 +1,74 @@
+"""Running statistics of the networks' inputs, and the normalisation by them."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+# A normalised input is clipped to this many standard deviations.
+MAX_NORMALIZED = 10.0
+# Added to the variance of every input.
+MIN_VARIANCE = 1e-6
+# An input that never varied has the standard deviation sqrt(MIN_VARIANCE), up to rounding.
+MIN_STD = 1.01 * MIN_VARIANCE**0.5
+
+
+class Normalizer(NamedTuple):
+    """Mean and standard deviation [N] by which inputs are normalised."""
+
+    mean: jax.Array
+    std: jax.Array
+
+
+class RunningStatistics(NamedTuple):
+    """Statistics of all inputs so far."""
+
+    count: jax.Array
+    """Number of inputs []. As float32 it is exact up to 2^24 times the size of a batch."""
+    mean: jax.Array
+    """Their mean [N]; 0 before the first input."""
+    summed_variance: jax.Array
+    """Sum of their squared distances from the mean [N]."""
+    std: jax.Array
+    """Their standard deviation [N], with MIN_VARIANCE; 1 before the first input."""
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The normaliser by these statistics."""
+        return Normalizer(self.mean, self.std)
+
+
+def init_normalizer(size: int) -> Normalizer:
+    """The normaliser [size] that changes nothing."""
+    return Normalizer(jnp.zeros(size, jnp.float32), jnp.ones(size, jnp.float32))
+
+
+def init_statistics(size: int) -> RunningStatistics:
+    """Statistics of inputs [size] before the first one."""
+    mean, std = init_normalizer(size)
+    return RunningStatistics(jnp.zeros((), jnp.float32), mean, jnp.zeros_like(mean), std)
+
+
+def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
+    """Adds a batch of inputs [..., N] (Welford 1962; for batches, Chan, Golub and LeVeque 1979)."""
+    axes = tuple(range(batch.ndim - 1))
+    count = statistics.count + batch.size // batch.shape[-1]
+    from_old_mean = batch - statistics.mean
+    mean = statistics.mean + jnp.sum(from_old_mean, axis=axes) / count
+    added_variance = jnp.sum(from_old_mean * (batch - mean), axis=axes)
+    # Rounding may make the sum negative.
+    summed_variance = jnp.maximum(statistics.summed_variance + added_variance, 0.0)
+    std = jnp.sqrt(summed_variance / count + MIN_VARIANCE)
+    return RunningStatistics(count, mean, summed_variance, std)
+
+
+def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
+    """Inputs [..., N] in standard deviations from their mean, clipped to +-MAX_NORMALIZED.
+
+    An input that never varied becomes 0, whatever its value. The fused physics keeps the ball's
+    quaternion and spin constant; other engines let them drift by rounding, which must not be
+    magnified to a signal.
+    """
+    standardized = (inputs - normalizer.mean) / normalizer.std
+    clipped = jnp.clip(standardized, -MAX_NORMALIZED, MAX_NORMALIZED)
+    return jnp.where(normalizer.std > MIN_STD, clipped, 0.0)

@@ -1,0 +1,110 @@
+"""Files of a run: JSON that is checked as it is read, text that is written whole or not at all, and
+the manifest that tells whether a checkpoint is as it was written."""
+
+import hashlib
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import pydantic
+from pydantic_core import to_jsonable_python
+
+PARTIAL = ".partial"
+MANIFEST_FILE = "manifest.json"
+_MAX_JSON_BYTES = 64 * 2**20
+
+ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
+
+
+class Manifest(pydantic.BaseModel):
+    """manifest.json: size and SHA-256 of every other file of a checkpoint, by name."""
+
+    format: Literal[1] = 1
+    files: dict[str, dict[Literal["size", "sha256"], int | str]]
+
+
+def to_json(plain: Any) -> str:
+    """Plain data as JSON. A number that is not finite becomes null: JSON cannot spell it."""
+    # Not by `pydantic_core.to_json`, which cannot write a path that is not UTF-8.
+    return json.dumps(to_jsonable_python(plain, inf_nan_mode="null"), indent=2) + "\n"
+
+
+def read_json(path: Path, model: type[ModelT]) -> ModelT:
+    """Reads JSON of the shape that `model` describes; OSError or ValueError for anything else."""
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise ValueError(f"{path.name} is too large")
+    try:
+        return model.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{path.name}: {first_mistake(error)}") from error
+    except RecursionError as error:
+        raise ValueError(f"{path.name} is nested too deeply") from error
+
+
+def first_mistake(error: pydantic.ValidationError) -> str:
+    """The first mistake in stored data, on one line: its place, and the type expected there."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}".removeprefix(": ")
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Writes a text file; a reader sees the old text or the new one, both whole."""
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        partial.write_text(text, encoding="utf-8")
+        sync(partial)
+        partial.rename(path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def sync(path: Path) -> None:
+    """Brings a file, or the entries of a folder, to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def seal(folder: Path) -> None:
+    """Writes the manifest of a checkpoint whose other files are complete."""
+    files = {name: _entry(p) for name, p in _regular_files(folder).items() if name != MANIFEST_FILE}
+    write_atomically(folder / MANIFEST_FILE, to_json(Manifest(files=files)))
+
+
+def check_integrity(folder: Path) -> None:
+    """Raises OSError or ValueError where a file is not as the manifest describes it."""
+    present = _regular_files(folder)
+    if present.pop(MANIFEST_FILE, None) is None:
+        raise ValueError(f"it has no {MANIFEST_FILE}")
+    expected = read_json(folder / MANIFEST_FILE, Manifest).files
+    for name in sorted(present.keys() | expected.keys()):
+        if name not in present:
+            raise ValueError(f"{name} is missing")
+        # The size first: a file may be too large to be hashed in reasonable time.
+        size = expected.get(name, {}).get("size")
+        if present[name].stat().st_size != size or _entry(present[name]) != expected[name]:
+            raise ValueError(f"{name} is not as it was written")
+
+
+def _entry(path: Path) -> dict[str, int | str]:
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"size": path.stat().st_size, "sha256": digest}
+
+
+def _regular_files(folder: Path) -> dict[str, Path]:
+    """The files under a folder by relative name, without hidden ones; ValueError for a link or a
+    device, which may have no end."""
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        mode = path.lstat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise ValueError(f"{path.name} is not a regular file")
+        if stat.S_ISREG(mode) and not path.name.startswith("."):
+            files[path.relative_to(folder).as_posix()] = path
+    return files

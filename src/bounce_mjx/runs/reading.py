@@ -1,0 +1,156 @@
+"""The content of a checkpoint, read so that a damaged or crafted one is refused in one sentence.
+
+Arrays are numbers in OCDBT and zarr, all else is JSON: nothing in a checkpoint can be run. Every
+function raises a `UserError` where the checkpoint is damaged, or of another config than its run.
+"""
+
+import math
+import os
+from typing import Any
+
+import jax
+import numpy as np
+import pydantic
+import tensorstore
+
+from bounce_mjx.config.files import differing_keys
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.robot.model import JOINT_NAMES
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.files import check_integrity, read_json
+from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.task.observation import OBSERVATION
+
+RECORD_FILE = "run.json"
+
+# What may differ between a checkpoint and the training that is resumed from it: everything else
+# shapes its state. The MJCF file may have moved, but must describe the same model.
+RESUMABLE_KEYS = frozenset(
+    "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
+    "num_devices env.mjcf".split()
+)
+
+
+class Record(pydantic.BaseModel):
+    """run.json."""
+
+    steps: int
+    config: dict[str, Any]
+    progress: dict[str, Any]
+
+
+def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
+    """Restores the policy of a checkpoint."""
+    networks = make_networks(config.ppo, OBSERVATION.size, len(JOINT_NAMES))
+
+    def initial_policy() -> Policy:
+        params = networks.policy_network.init(jax.random.PRNGKey(0))
+        return Policy(init_normalizer(OBSERVATION.size), params)
+
+    read_record(checkpoint)
+    # A policy acts in single and in double precision, whichever it was trained in.
+    return _read_arrays(checkpoint, "policy", jax.eval_shape(initial_policy), "same_kind")
+
+
+def load_training_state(
+    checkpoint: Checkpoint, template: TrainingState
+) -> tuple[TrainingState, dict[str, Any]]:
+    """Restores the whole training state of a checkpoint, and the evaluations up to it.
+
+    Args:
+      template: its shapes and types, as from `jax.eval_shape`.
+    """
+    if not (checkpoint.folder / "training").is_dir():
+        raise UserError(
+            f"the checkpoint {checkpoint.folder} holds no training state to go on from, only a "
+            "policy; give a run that bounce-mjx train made"
+        )
+    record = read_record(checkpoint)
+    return _read_arrays(checkpoint, "training", template, "no"), record.progress
+
+
+def read_record(checkpoint: Checkpoint) -> Record:
+    """The plain data of a checkpoint, once every file of it is found as it was written."""
+    try:
+        check_integrity(checkpoint.folder)
+        record = read_json(checkpoint.folder / RECORD_FILE, Record)
+        if record.steps != checkpoint.steps:
+            raise ValueError(f"it was written after {record.steps} steps")
+    except (OSError, ValueError) as error:
+        raise _damaged(checkpoint, error) from error
+    config = validate(TrainConfig, record.config, str(checkpoint.folder / RECORD_FILE))
+    differing = differing_keys(load_run_config(checkpoint.run), config) - RESUMABLE_KEYS
+    if differing:
+        raise UserError(
+            f"the checkpoint {checkpoint.folder} is of another config than "
+            f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
+            "restore that file or give another checkpoint"
+        )
+    return record
+
+
+def _read_arrays(checkpoint: Checkpoint, item: str, template: Any, casting: str) -> Any:
+    """An item of a checkpoint in the structure of `template`.
+
+    Args:
+      casting: how the stored types may differ from the template's (see `numpy.can_cast`).
+    """
+    leaves, tree = jax.tree_util.tree_flatten_with_path(template)
+    wanted = {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in leaves}
+    # Not read by orbax, whose readers print tracebacks from their threads where a file is damaged.
+    files = {"driver": "file", "path": f"{os.path.abspath(checkpoint.folder / item)}/"}
+    try:
+        opening = {
+            name: tensorstore.open(
+                {
+                    "driver": "zarr",
+                    "kvstore": {"driver": "ocdbt", "base": files, "path": f"{name}/"},
+                },
+                open=True,
+                read=True,
+            )
+            for name in wanted
+        }
+        stored = {name: array.result() for name, array in opening.items()}
+        for name, array in stored.items():
+            _check_array(name, array, wanted[name], casting)
+        reading = [array.read() for array in stored.values()]
+        arrays = [array.result() for array in reading]
+    # A damaged file raises many types; all of them mean the same here.
+    except Exception as error:
+        raise _damaged(checkpoint, error) from error
+    typed = [
+        jax.numpy.asarray(a, leaf.dtype) for a, leaf in zip(arrays, wanted.values(), strict=True)
+    ]
+    return jax.tree_util.tree_unflatten(tree, typed)
+
+
+def _check_array(
+    name: str, array: tensorstore.TensorStore, wanted: jax.ShapeDtypeStruct, casting: str
+) -> None:
+    """ValueError for an array of another kind, or one that takes more memory than its size."""
+    has, needs = (f"{x.dtype.name}{list(x.shape)}" for x in (array, wanted))
+    same_type = np.can_cast(array.dtype.numpy_dtype, wanted.dtype, casting)
+    if array.shape != wanted.shape or not same_type:
+        raise ValueError(f"its {name} is {has} where {needs} is needed")
+    # The memory of a chunk is taken before its bytes are looked at.
+    chunk = array.chunk_layout.read_chunk.shape or ()
+    if math.prod(chunk) > math.prod(max(1, length) for length in array.shape):
+        raise ValueError(f"its {name} is stored in chunks of {chunk}, larger than itself")
+    # orbax writes zstd, whose reader stops at the size of the array; blosc's reader takes the
+    # memory that the file asks for, up to 2 GB.
+    compressor = array.codec.to_json()["compressor"]
+    if compressor is not None and compressor["id"] != "zstd":
+        raise ValueError(f"its {name} is compressed by {compressor['id']}, not zstd")
+
+
+def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:
+    reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
+    return UserError(
+        f"the checkpoint {checkpoint.folder} is damaged or of another version ({reason}); give "
+        "another checkpoint"
+    )

@@ -1,0 +1,161 @@
+"""The common part of the commands that train: flags, start, results."""
+
+import importlib
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import tyro
+from rich.console import Console
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.files import differing_keys
+from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import leave
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.reports.tables import details_line, results_table, seeds_table
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import find_run
+from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.runs.reading import RESUMABLE_KEYS
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training import hosts
+from bounce_mjx.training.console import say
+from bounce_mjx.training.job import REPORT_MODULE, Outcome, TrainingStopped, train
+from bounce_mjx.training.trainer import Trainer
+
+
+class TrainingCommand(TrainConfig):
+    """The command line: the config's keys as flags, and where to start from."""
+
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
+    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
+    config: Path | None = None
+    """Preset: a YAML file such as configs/seed.yaml. By default configs/default.yaml where there is
+    an accelerator, else configs/cpu.yaml."""
+    resume: Path | None = None
+    """Folder of a run to go on with, in place, from its latest checkpoint. The other flags may then
+    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
+    stop-when-solved, num-devices and log-dir, and mjcf where that file has moved."""
+    report: bool = True
+    """Write report.html into the run's folder after the results are printed."""
+
+
+CommandT = TypeVar("CommandT", bound=TrainingCommand)
+
+
+def read_command(
+    command_class: type[CommandT], args: Sequence[str], *, prog: str, description: str, **defaults
+) -> CommandT:
+    """Reads a command line on top of the preset, or of the resumed run's config.
+
+    Args:
+      defaults: defaults of flags that are not part of the config.
+
+    Raises:
+      UserError: a flag or the preset is wrong, or the flags change a key of the resumed run that
+        cannot change.
+    """
+    config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
+    if config_path and resume:
+        raise UserError("--config and --resume exclude each other; a resumed run has its config")
+    base = load_run_config(find_run(resume)) if resume else read_preset(config_path)
+    command = parse(
+        command_class,
+        args,
+        prog=prog,
+        description=description,
+        default=command_class(**dict(base), config=config_path, resume=resume, **defaults),
+    )
+    if resume:
+        changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS
+        if changed:
+            raise UserError(
+                f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
+                "start a new run"
+            )
+    return command
+
+
+def run_command(
+    command: TrainingCommand,
+    make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+    prog: str,
+) -> None:
+    """Trains as the command says, and prints the results.
+
+    Raises:
+      UserError: see `train`.
+    """
+    console = Console(quiet=not hosts.is_leader())
+    try:
+        outcomes = train(
+            config_of(command),
+            console,
+            make_trainer,
+            command=prog,
+            resume=command.resume,
+            report=command.report,
+        )
+    except TrainingStopped as stopped:
+        say(console, str(stopped))
+        # Without waiting for a compilation or an evaluation in another thread.
+        leave(0)
+    best = show(outcomes, console)
+    if command.report and hosts.is_leader():
+        leave_report(best, console)
+
+
+def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
+    """Prints the results of a training; returns the best seed's outcome."""
+    best = max((o for o in outcomes if o.report is not None), key=lambda o: o.report.score)
+    if len(outcomes) > 1:
+        console.print(seeds_table({o.seed: o.report for o in outcomes}))
+    else:
+        console.print(results_table(best.report, f"best checkpoint, {best.best_steps:,} steps"))
+        say(console, details_line(best.report))
+    spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
+    say(console, f"time: {spent}")
+    label = "run" if len(outcomes) == 1 else f"best seed: {best.seed}  run"
+    say(console, f"{label}: {best.run}  (bounce-mjx eval {shlex.quote(str(best.run))})")
+    return best
+
+
+def leave_report(outcome: Outcome, console: Console) -> None:
+    """Draws the report. The training is safe by now, so a failure is one line."""
+    started = time.perf_counter()
+    try:
+        report_module = importlib.import_module(REPORT_MODULE)
+        page = report_module.report_training(outcome.run, outcome.report, outcome.best_steps)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        again = f"bounce-mjx report {shlex.quote(str(outcome.run))}"
+        say(console, f"report: not drawn ({reason}); draw it with: {again}")
+    else:
+        say(console, f"report: {page}  ({time.perf_counter() - started:.1f} s)")
+
+
+def config_of(command: TrainingCommand) -> TrainConfig:
+    """The run's part of a command line."""
+    return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+
+
+def path_flag(args: Sequence[str], flag: str) -> Path | None:
+    """The path that a flag gives, before the other flags are read."""
+    word = early_flag(args, flag)
+    return None if word is None else Path(word)
+
+
+def early_flag(args: Sequence[str], flag: str) -> str | None:
+    """The value of a flag that must be read before the others, in every spelling of the parser:
+    with - or _ in the name, and with = or a space before the value. The last one counts."""
+    value = None
+    for i, word in enumerate(args):
+        name, equals, given = word.partition("=")
+        if name.startswith("--") and name.replace("_", "-") == flag:
+            following = args[i + 1] if i + 1 < len(args) else ""
+            value = given if equals else following
+    return value

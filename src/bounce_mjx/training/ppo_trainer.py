@@ -1,0 +1,81 @@
+"""The trainer in JAX: the compiled programs of `ppo.py`, on one device or several."""
+
+import concurrent.futures
+import functools
+
+import jax
+import numpy as np
+
+from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training import hosts
+from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
+from bounce_mjx.training.setup import compiler_options
+from bounce_mjx.training.trainer import JAX, Metrics, Snapshot, iterations_per_block
+
+
+class PPOTrainer:
+    """This project's PPO; see `Trainer`."""
+
+    library = JAX
+    checked = CHECKED
+
+    def __init__(self, config: TrainConfig, env: BounceBall):
+        """
+        Raises:
+          UserError: the config does not fit the devices or the environment.
+        """
+        self._config = config
+        self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
+        trainer = make_trainer(config.ppo, env, config.env.episode_steps)
+        self._trainer = trainer if config.num_seeds == 1 else population(trainer)
+        seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
+        self._seeds = seeds[0] if config.num_seeds == 1 else seeds
+        self.state: TrainingState | None = None
+        """The current state, on the devices."""
+
+    @functools.cached_property
+    def _shapes(self) -> TrainingState:
+        return jax.eval_shape(self._initial_state, self._seeds)
+
+    @property
+    def _sharding(self) -> TrainingState:
+        return state_sharding(self.mesh, self._shapes, self._config.num_seeds)
+
+    def state_template(self) -> TrainingState:
+        return self._shapes
+
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        sharding = self._sharding
+        run = jax.jit(
+            lambda state: self._trainer.run(state, iterations_per_block(self._config)),
+            in_shardings=(sharding,),
+            out_shardings=(sharding, replicated(self.mesh)),
+            donate_argnums=0,
+            compiler_options=compiler_options(),
+        )
+        init = jax.jit(self._initial_state, out_shardings=sharding)
+        self._run = pool.submit(run.lower(self._shapes).compile)
+        self._init = pool.submit(init.lower(self._seeds).compile)
+        return self._run
+
+    def start(self, state: TrainingState | None = None) -> None:
+        if state is None:
+            self.state = jax.block_until_ready(self._init.result()(self._seeds))
+        else:
+            self.state = hosts.distribute(state, self._sharding)
+
+    def run(self) -> Metrics:
+        self.state, metrics = self._run.result()(self.state)
+        shape = (self._config.num_seeds, -1)
+        return {name: np.asarray(value).reshape(shape) for name, value in metrics.items()}
+
+    def snapshot(self) -> Snapshot:
+        state = hosts.gather(self.state)
+        return Snapshot(policy_of(state), state)
+
+    def _initial_state(self, seeds: jax.Array) -> TrainingState:
+        """The first state of the training of a seed [], or of those of several [S]."""
+        key = jax.random.PRNGKey
+        return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))

@@ -1,0 +1,120 @@
+"""The console script: its commands, its help, and Ctrl-C while it starts."""
+
+import importlib
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bounce_mjx
+from bounce_mjx.commands import main as console_script
+from bounce_mjx.commands import train as train_command
+
+PYTHON = [sys.executable, "-X", "importtime"]
+SCRIPT = ["-c", "from bounce_mjx.commands.main import main; main()"]
+CHECKOUT = Path(__file__).parent.parent
+
+
+def test_help_lists_the_commands(capsys) -> None:
+    console_script.main(["--help"])
+    text = capsys.readouterr().out
+    assert re.findall(r"^  ([\w-]+) +\w", text, re.MULTILINE) == list(console_script.COMMANDS)
+    console_script.main([])
+    assert capsys.readouterr().out == text
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["evl"], ("unknown command evl", "did you mean eval?", "bounce-mjx --help")),
+        (["train_torch"], ("unknown command train_torch", "did you mean train-torch?")),
+        (["zzz"], ("unknown command zzz", "choose train, eval")),
+        (["--num-envs", "3"], ("unknown command --num-envs",)),
+    ],
+)
+def test_unknown_command(args: list[str], words: tuple[str, ...], capsys) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        console_script.main(args)
+    assert exit_info.value.code == 2
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"error: .+\n", error) and all(word in error for word in words), error
+
+
+@pytest.mark.parametrize("name", ["eval", "play", "view", "plot", "report"])
+def test_help_of_a_command_names_it(name: str, capsys) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        console_script.main([name, "--help"])
+    assert exit_info.value.code == 0
+    assert f"usage: bounce-mjx {name} " in capsys.readouterr().out
+
+
+def test_every_command_has_its_module_and_the_package_its_own_form() -> None:
+    for name in console_script.COMMANDS:
+        assert callable(
+            importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}").main
+        )
+    stubs = {path.stem for path in Path(bounce_mjx.__file__).parent.glob("*.py")}
+    assert set(console_script.COMMANDS) - {"train-torch"} <= stubs
+
+
+def test_only_the_chosen_command_is_imported() -> None:
+    code = (
+        "import sys; from bounce_mjx.commands.main import main\n"
+        "try: main(['eval', '--help'])\n"
+        "except SystemExit: print(sorted(n for n in sys.modules if '.commands.' in n), end='')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("['bounce_mjx.commands.eval', 'bounce_mjx.commands.main']")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [[*SCRIPT, "eval"], ["-m", "bounce_mjx.play"], [str(CHECKOUT / "train_jax.py")]],
+    ids=["bounce-mjx eval", "python -m bounce_mjx.play", "train_jax.py"],
+)
+@pytest.mark.parametrize("moment", ["numpy", "jax", "tyro"])
+def test_ctrl_c_while_a_command_is_imported(
+    tmp_path: Path, command: list[str], moment: str
+) -> None:
+    with subprocess.Popen(
+        [*PYTHON, *command], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    ) as process:
+        # Each import is listed as it ends.
+        for line in process.stderr:
+            if line.rstrip().endswith(f" {moment}"):
+                break
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert process.returncode == 130
+    assert "Traceback" not in rest, rest
+    assert not list(tmp_path.iterdir())
+
+
+USUAL_SPELLINGS = {
+    "--stop-when-solved=false": (False, "stop_when_solved"),
+    "--stop_when_solved=True": (True, "stop_when_solved"),
+    "--stop-when-solved false": (False, "stop_when_solved"),
+    "--no-stop-when-solved": (False, "stop_when_solved"),
+    "--total-steps 1e6": (10**6, "total_steps"),
+    "--total-steps=1.5e6": (1_500_000, "total_steps"),
+    "--num-devices 1e0": (1, "num_devices"),
+    "--hidden-layers 256,64": ((256, 64), "ppo", "hidden_layers"),
+    "--hidden-layers=256,64 --seed 3": ((256, 64), "ppo", "hidden_layers"),
+    "--hidden-layers 1e2,64 16": ((100, 64, 16), "ppo", "hidden_layers"),
+    "--target-height-range 0.3,0.8": ((0.3, 0.8), "env", "target_height_range"),
+    "--ball-init-pos=0.5,-0.1,0.4": ((0.5, -0.1, 0.4), "env", "ball_init_pos"),
+    "--critic-metrics bounced,apex_error": (("bounced", "apex_error"), "ppo", "critic_metrics"),
+    "--log-dir a,b": (Path("a,b"), "log_dir"),
+}
+
+
+@pytest.mark.parametrize("flags", USUAL_SPELLINGS)
+def test_usual_spellings_of_flags(flags: str) -> None:
+    expected, *path = USUAL_SPELLINGS[flags]
+    value = train_command.read_command(flags.split())
+    for name in path:
+        value = getattr(value, name)
+    assert value == expected

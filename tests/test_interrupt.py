@@ -1,0 +1,89 @@
+"""One Ctrl-C ends a command at once, even while XLA compiles."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from bounce_mjx.interrupt import run_interruptible
+
+TIMEOUT = 120.0
+
+
+def test_the_result_and_the_exception_come_through() -> None:
+    assert run_interruptible(divmod, 7, 2) == (3, 1)
+    assert run_interruptible(int, "ff", base=16) == 255
+    with pytest.raises(ZeroDivisionError):
+        run_interruptible(divmod, 7, 0)
+    with pytest.raises(SystemExit):
+        run_interruptible(sys.exit, 2)
+
+
+def test_the_work_is_kept_off_the_thread_that_takes_signals() -> None:
+    assert run_interruptible(threading.current_thread) is not threading.main_thread()
+
+
+def test_ctrl_c_does_not_wait_for_the_work() -> None:
+    started, finish = threading.Event(), threading.Event()
+
+    def work() -> None:
+        started.set()
+        finish.wait(TIMEOUT)
+
+    def press() -> None:
+        started.wait(TIMEOUT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_interruptible(work)
+    assert not finish.is_set()
+    finish.set()
+
+
+COMMANDS = {
+    "eval": ("bounce_mjx.eval --physics mjx --episodes 4", "evaluate"),
+    "play": ("bounce_mjx.play --physics mjx --viewer browser --port 8321", "_advance"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", COMMANDS.values(), ids=COMMANDS)
+def test_ctrl_c_ends_a_command_that_compiles(case: tuple, tmp_path: Path) -> None:
+    """The signal comes while XLA compiles the largest program, and is not put off to its end.
+
+    MJX's programs take XLA more than a second.
+    """
+    command, program = case
+    log = tmp_path / "log"
+    environment = {"JAX_LOG_COMPILES": "1", "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
+    with log.open("w") as stdout:
+        process = subprocess.Popen(
+            [sys.executable, "-u", "-m", *command.split()],
+            cwd=tmp_path,
+            env=os.environ | environment,
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    try:
+        said = ""
+        for line in process.stderr:
+            said += line
+            if re.search(rf"to MLIR module conversion jit\({program}\)", line):
+                # Python still has a few lines to run before it hands over to XLA.
+                time.sleep(0.3)
+                process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT) == 130, said
+    finally:
+        process.kill()
+        process.wait()
+    assert f"conversion jit({program})" in said
+    assert f"Finished XLA compilation of jit({program})" not in said
+    assert "Traceback" not in said

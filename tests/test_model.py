@@ -1,0 +1,146 @@
+"""The robot's model: which MJCF files are refused, and which edits are noticed."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics import PhysicsState, make_engine
+from bounce_mjx.robot.model import load_model
+from test_physics import XML, edited
+
+SERVO_2 = '<position name="act2" joint="Joint2"/>'
+REFUSED = {
+    # edit, what the message must say
+    "timestep 0": ('timestep="0.001"', 'timestep="0"', "timestep 0.0"),
+    "timestep nan": ('timestep="0.001"', 'timestep="nan"', "timestep nan"),
+    "timestep negative": ('timestep="0.001"', 'timestep="-0.1"', "timestep -0.1"),
+    "position nan": (
+        '<body name="Link1" pos="0 0 0.1">',
+        '<body name="Link1" pos="0 0 nan">',
+        "nan in body_pos",
+    ),
+    "mass inf": ('mass="0.0027"', 'mass="inf"', "inf in body_mass"),
+    "gravity nan": ('gravity="0 0 -9.81"', 'gravity="0 0 nan"', "nan in gravity"),
+    "armature inf": ('armature="0.02"', 'armature="inf"', "inf in dof_armature"),
+    "velocity servo": (SERVO_2, '<velocity name="act2" joint="Joint2" kv="200"/>', "Joint2"),
+    "motor": (SERVO_2, '<motor name="act2" joint="Joint2"/>', "Joint2"),
+    "integrated velocity": (
+        SERVO_2,
+        '<intvelocity name="act2" joint="Joint2" kp="20000" actrange="-2 2"/>',
+        "Joint2",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_simulated_is_refused(tmp_path, name):
+    old, new, text = REFUSED[name]
+    assert old in XML
+    mjcf = tmp_path / "robot.xml"
+    mjcf.write_text(XML.replace(old, new, 1))
+    with pytest.raises(UserError, match=text) as error:
+        load_model(mjcf, 0.001)
+    assert "\n" not in str(error.value)
+    assert str(mjcf) in str(error.value)
+
+
+def test_the_plain_model_moves_as_the_pictured_one():
+    """Without what is only there for pictures, in a fraction of the memory."""
+    pictured, plain = (load_model(None, 0.001, visual=visual) for visual in (True, False))
+    assert mujoco.mj_sizeModel(plain) < 0.1 * mujoco.mj_sizeModel(pictured)
+    after = []
+    for model in (pictured, plain):
+        data = mujoco.MjData(model)
+        data.qpos[:6], data.qpos[8] = EnvConfig().default_joint_angles, 0.08
+        mujoco.mj_step(model, data, nstep=100)
+        after.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_array_equal(*after)
+
+
+def test_an_edited_model_is_an_error():
+    """Where a program that would not notice it is traced; colours are free."""
+    env = BounceBall()
+    key, action = jax.random.PRNGKey(0), jnp.zeros(6)
+    state = jax.eval_shape(env.reset, key)
+    env.mj_model.geom("ball").rgba[:] = 0.5
+    env.mj_model.site_pos[:] += 1.0
+    jax.eval_shape(env.reset, key)
+    jax.eval_shape(env.step, state, action)
+    env.mj_model.body("ball_link").mass[:] *= 2.0
+    for program, args in ((env.reset, (key,)), (env.step, (state, action))):
+        with pytest.raises(UserError, match="env.mj_model was edited"):
+            jax.eval_shape(program, *args)
+    env = BounceBall()
+    env.mj_model.opt.gravity[2] = -1.0
+    with pytest.raises(UserError, match="env.mj_model was edited"):
+        jax.eval_shape(env.reset, key)
+
+
+def env_of(tmp_path, *edits: tuple[str, str]) -> BounceBall:
+    text = XML
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    mjcf = tmp_path / "robot.xml"
+    mjcf.write_text(text)
+    return BounceBall(EnvConfig(mjcf=mjcf))
+
+
+def targets(env: BounceBall, angle: float, action: float) -> np.ndarray:
+    qpos = jnp.full(env.mj_model.nq, angle)
+    physics = PhysicsState(qpos, jnp.zeros(env.mj_model.nv))
+    return np.asarray(env.servo_targets(physics, jnp.full(6, action)))
+
+
+def test_a_joint_without_a_range_is_not_clipped(tmp_path):
+    env = env_of(
+        tmp_path,
+        ('name="Joint4" axis="0 0 1" range="-3.49066 3.49066"', 'name="Joint4" axis="0 0 1"'),
+    )
+    found = targets(env, 5.0, 1.0)
+    assert found[3] == pytest.approx(5.02)
+    assert found[2] == pytest.approx(2.6529)
+    assert targets(env, 0.3, 1.0)[3] == pytest.approx(0.32)
+
+
+def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
+    """A servo whose length is a multiple of the angle holds its joint as one without gear does."""
+    geared = env_of(
+        tmp_path, ('<position kp="20000" kv="200"', '<position gear="-2" kp="5000" kv="50"')
+    )
+    plain = BounceBall()
+    np.testing.assert_allclose(targets(geared, 0.2, 0.5), -2.0 * targets(plain, 0.2, 0.5))
+    after = []
+    for env in (geared, plain):
+        data = mujoco.MjData(env.mj_model)
+        data.qpos[:6], data.ctrl[:] = 0.2, targets(env, 0.2, 0.5)
+        mujoco.mj_step(env.mj_model, data, nstep=10)
+        after.append(data.qpos[:6].copy())
+    np.testing.assert_allclose(*after, atol=1e-7)
+
+
+SOLVER = 'iterations="4" ls_iterations="8"'
+UNCONVERGED = {
+    "no iteration": ('iterations="0"', ['iterations="0"'], ["solver="]),
+    "one iteration": ('iterations="1"', ['iterations="1"'], ["solver="]),
+    "few of CG": ('solver="CG" iterations="2"', ['solver="CG"', 'iterations="2"'], ["ls_"]),
+    "loose": ('iterations="4" ls_iterations="8" tolerance="1"', ['tolerance="1"'], ["iterations"]),
+}
+
+
+@pytest.mark.parametrize("name", UNCONVERGED)
+def test_a_solver_that_stops_early_is_named(name):
+    """The fused engine warns of the setting, and of no other."""
+    settings, named, innocent = UNCONVERGED[name]
+    (warning,) = make_engine(edited(SOLVER, settings), "auto").warnings
+    assert all(text in warning for text in named)
+    assert not any(text in warning for text in innocent)
+
+
+@pytest.mark.parametrize("settings", [SOLVER, "", 'solver="PGS"', 'solver="CG" iterations="50"'])
+def test_a_solver_that_converges_is_no_warning(settings):
+    assert make_engine(edited(SOLVER, settings), "auto").warnings == ()

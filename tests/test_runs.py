@@ -1,0 +1,237 @@
+"""Files of a run that came from somewhere else: each is what it should be, or one sentence."""
+
+import concurrent.futures
+import json
+import math
+import os
+import threading
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+from tensorboardX import SummaryWriter
+
+from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.files import to_json
+from bounce_mjx.runs.folders import (
+    choose_checkpoint,
+    create_run,
+    pretrained_checkpoint,
+    save_config,
+)
+from bounce_mjx.runs.progress import Progress, load_results
+from bounce_mjx.runs.reading import load_policy
+
+PRETRAINED = resource_path("pretrained")
+NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
+
+
+def report_of(values: list[float | None]) -> Report:
+    results = tuple(Result(n, "%", v, ">= 1", False) for n, v in zip(NAMES, values, strict=True))
+    details = dict.fromkeys(("episodes", "mean_consecutive_bounces", "mean_return"), 1.0)
+    return Report(results, details | {"mean_length_s": 2.0, "mean_apex_error_m": None})
+
+
+def results_of(progress: Progress) -> dict:
+    return progress.results(64, {"train": 1.0}, "cpu")
+
+
+@pytest.fixture
+def progress() -> Progress:
+    progress = Progress()
+    assert progress.improves(report_of([1.0, 2.0, None, 4.0, 5.0]), 64)
+    return progress
+
+
+# Folders
+
+
+def test_runs_started_at_once_have_folders_of_their_own(tmp_path: Path) -> None:
+    number = 16
+    start = threading.Barrier(number)
+
+    def create(_) -> Path:
+        start.wait()
+        return create_run(TrainConfig(log_dir=tmp_path))
+
+    with concurrent.futures.ThreadPoolExecutor(number) as pool:
+        runs = list(pool.map(create, range(number)))
+    assert len(set(runs)) == number
+    assert all(load_run_config(run).log_dir == tmp_path for run in runs)
+
+
+@pytest.mark.parametrize("name", ["[/x]", "exp[lr]", ":smile:", "a [red]b"])
+def test_a_path_is_printed_as_it_is(tmp_path: Path, name: str, capsys) -> None:
+    run = tmp_path / name / "2026-01-01"
+    (run / "checkpoints/best/64").mkdir(parents=True)
+    save_config(run, TrainConfig())
+    chosen = choose_checkpoint(None, tmp_path / name, Console())
+    assert chosen.run == run
+    assert capsys.readouterr().out == f"using the newest run: {run}\n"
+
+
+def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> None:
+    run = tmp_path / "[/x] exp[lr]" / "run"
+    run.parent.mkdir(parents=True)
+    run.symlink_to(PRETRAINED)
+    report = report_of([1.0, 2.0, None, 4.0, 5.0])
+    monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: (report, "fused"))
+    with pytest.raises(SystemExit) as exit_info:
+        eval_command.main([str(run)])
+    assert exit_info.value.code == 1
+    assert f"checkpoint: {run}/checkpoints/best/" in capsys.readouterr().out
+
+
+# Configs
+
+
+def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text("total_steps: 1e6\nppo: {num_envs: 2e2, hidden_layers: [1.6e1, 8]}\nseed: 1e0")
+    config = load_config(path)
+    assert (config.total_steps, config.ppo.num_envs, config.seed) == (10**6, 200, 1)
+    assert config.ppo.hidden_layers == (16, 8)
+    for bad in ("1e-1", "1.5e0", "1e400", "1e13"):
+        path.write_text(f"total_steps: {bad}")
+        with pytest.raises(UserError, match="total_steps is"):
+            load_config(path)
+
+
+def test_pipe_in_place_of_a_config_does_not_block(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "my.yaml")
+    with pytest.raises(UserError, match="my.yaml cannot be read .it is not a regular file"):
+        load_config(tmp_path / "my.yaml")
+
+
+@pytest.mark.parametrize("merge", ["{{<<: [{}]}}", "[{}]"], ids=["merged", "listed"])
+def test_groups_that_repeat_groups_are_bounded(tmp_path: Path, merge: str) -> None:
+    lines = ["a0: &a0 {seed: 1}"]
+    for i in range(40):
+        lines.append(f"a{i + 1}: &a{i + 1} {merge.format(f'*a{i}, *a{i}')}")
+    (tmp_path / "my.yaml").write_text("\n".join([*lines, "<<: *a40"]))
+    with pytest.raises(UserError, match="repeats a group more than 10 times"):
+        load_config(tmp_path / "my.yaml")
+
+
+def test_some_aliases_are_taken(tmp_path: Path) -> None:
+    text = "env: {reward: {height: &term {weight: 3}, position: *term, paddle_home: {<<: *term}}}"
+    (tmp_path / "my.yaml").write_text(text)
+    reward = load_config(tmp_path / "my.yaml").env.reward
+    assert [reward.height.weight, reward.position.weight, reward.paddle_home.weight] == [3, 3, 3]
+
+
+# Results
+
+
+def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progress) -> None:
+    (tmp_path / "results.json").write_text(to_json(results_of(progress)))
+    results = load_results(tmp_path)
+    assert results["evaluations"] == [
+        {"steps": 64, "passed": False} | dict(zip(NAMES, [1.0, 2.0, None, 4.0, 5.0], strict=True))
+    ]
+    assert Report.from_dict(results) == progress.best
+    assert Progress.model_validate(json.loads(to_json(progress.model_dump()))) == progress
+
+
+def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> None:
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128)
+    text = to_json(results_of(progress) | {"numpy": np.float64(math.nan), "tuple": (math.nan, 1)})
+    plain = json.loads(text, parse_constant=refuse)
+    assert [plain["evaluations"][1][name] for name in NAMES] == [None, None, None, None, 5.0]
+    assert (plain["numpy"], plain["tuple"]) == (None, [None, 1])
+
+
+def test_json_holds_any_path() -> None:
+    path = os.fsdecode(b"a\xff")
+    assert json.loads(to_json({"path": path})) == {"path": path}
+
+
+BAD_RESULTS = {
+    "list": "[]",
+    "number": "3",
+    "word": '"a"',
+    "empty": "",
+    "no keys": "{}",
+    "not UTF-8": b"\xff\xfe{}",
+    "too deep": "[" * 100_000,
+    "too deep inside": '{"seconds": ' + '{"a": ' * 100_000,
+    "no results": {"results": []},
+    "results of another shape": {"results": [3]},
+    "a result without a value": {"results": [{"name": "a", "measured": "", "bound": ""}]},
+    "details of another shape": {"details": [1]},
+    "details without the return": {"details": {"episodes": 1.0}},
+    "infinite value": {"seconds": {"train": math.inf}},
+    "infinite steps": {"best_steps": math.inf},
+    "number of 400 digits": {"seconds": {"train": 10**400}},
+    "negative steps": {"solved_steps": -1},
+    "evaluations of another shape": {"evaluations": {"a": 1}},
+    "an evaluation without its results": {"evaluations": [{"steps": 1, "passed": True}]},
+    "a word as device": {"device": 3},
+}
+
+
+@pytest.mark.parametrize("change", BAD_RESULTS.values(), ids=BAD_RESULTS)
+def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) -> None:
+    if isinstance(change, dict):
+        change = json.dumps(results_of(progress) | change)
+    path = tmp_path / "results.json"
+    path.write_bytes(change.encode() if isinstance(change, str) else change)
+    with pytest.raises(UserError) as error_info:
+        load_results(tmp_path)
+    sentence = str(error_info.value)
+    assert sentence.startswith(f"{path} is damaged (") and "delete it to go on" in sentence
+    assert "\n" not in sentence and len(sentence) < 500
+
+
+@pytest.mark.parametrize("main", [eval_command.main, plot_command.main], ids=["eval", "plot"])
+def test_commands_say_which_results_are_bad(tmp_path: Path, main, capsys) -> None:
+    seed = tmp_path / "seed_000"
+    (seed / "checkpoints/best/64").mkdir(parents=True)
+    save_config(tmp_path, TrainConfig(num_seeds=2))
+    save_config(seed, TrainConfig())
+    with SummaryWriter(logdir=str(seed)) as log:
+        log.add_scalar("episode/return", 1.0, 1)
+    (seed / "results.json").write_text("[]")
+    with pytest.raises(SystemExit) as exit_info:
+        main([str(tmp_path)])
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err.startswith(f"error: {seed}/results.json is damaged (")
+
+
+BAD_PROGRESS = {
+    "infinite steps": {"best_steps": math.inf},
+    "infinite evaluation": {"evaluations": [{"steps": math.inf, "passed": True}]},
+    "steps of 400 digits": {"best_steps": 10**400},
+    "best of another shape": {"best": {"results": 3}},
+    "best false": {"best": False},
+    "evaluations of another shape": {"evaluations": [3]},
+}
+
+
+@pytest.mark.parametrize("plain", BAD_PROGRESS.values(), ids=BAD_PROGRESS)
+def test_evaluations_of_another_shape(plain: dict) -> None:
+    with pytest.raises(UserError, match="the evaluations in the checkpoint x are damaged"):
+        Progress.from_dict(plain, Path("x"))
+
+
+# Precision
+
+
+def test_policy_loads_in_double_precision() -> None:
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    single = load_policy(checkpoint, config)
+    with jax.enable_x64(True):
+        double = load_policy(checkpoint, config)
+    assert double.normalizer.mean.dtype == np.dtype("float64")
+    jax.tree.map(np.testing.assert_array_equal, single, double)
