@@ -10,14 +10,17 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning import statistics
+from bounce_mjx.gpu import has_kernels
+from bounce_mjx.learning import minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.gradients import MinibatchGradients
 from bounce_mjx.learning.metrics import Metrics, Packed, rollout_metrics, step_metrics
 from bounce_mjx.learning.policy import Policy, cast_hidden_layers, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
@@ -286,26 +289,34 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             "policy/action_std": jnp.mean(distribution.std),
         }
 
+    def xla_gradients() -> MinibatchGradients:
+        """Parameters in one array, so that one kernel clips gradients and one makes a step."""
+
+        def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
+            return samples, (jnp.moveaxis(order, 1, 0), mean, deviation)
+
+        def gradient(flat_params: jax.Array, samples: Samples, minibatch):
+            order, mean, deviation = minibatch
+            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
+            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
+            return jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(flat_params)
+
+        return MinibatchGradients(lambda x: ravel_pytree(x)[0], unravel, shuffle, gradient)
+
+    shapes = jax.eval_shape(
+        lambda key: Params(networks.policy_network.init(key), networks.value_network.init(key)),
+        jax.random.PRNGKey(0),
+    )
+    unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))[1]
+    num_inputs = env.observation_size + len(config.critic_metrics)
+    if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
+        gradients = minibatch_kernel.kernel_gradients(config, env.action_size, shapes)
+    else:
+        gradients = xla_gradients()
+
     def update(state: TrainingState, samples: Samples, key: jax.Array):
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
-
-        # Gradients and parameters as one array: one kernel clips and one makes a step of Adam.
-        flat_params, unravel = ravel_pytree(state.params)
-
-        def minibatch(carry, chosen):
-            params, optimizer_state, learning_rate = carry
-            order, mean, deviation = chosen
-            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
-            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
-            gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
-                params
-            )
-            direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
-            params = params - learning_rate * direction
-            learning_rate = adapt_learning_rate(config, learning_rate, metrics["policy/kl"], limit)
-            metrics["loss/gradient_norm"] = jnp.linalg.norm(gradient)
-            return (params, optimizer_state, learning_rate), Packed.of(metrics)
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
@@ -315,21 +326,39 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             # The advantages of all minibatches are measured at once: on several devices each
             # measurement is a message, and there is one more in every minibatch anyhow.
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
-            chosen = (
-                jnp.moveaxis(order, 1, 0),
-                jnp.mean(advantage, axis=(0, 2)),
-                jnp.std(advantage, axis=(0, 2)),
-            )
-            return jax.lax.scan(minibatch, carry, chosen)
+            mean, deviation = jnp.mean(advantage, axis=(0, 2)), jnp.std(advantage, axis=(0, 2))
+            shuffled, minibatches = gradients.shuffle(samples, order, mean, deviation)
 
-        carry = (flat_params, state.optimizer, state.learning_rate)
-        (flat_params, optimizer_state, learning_rate), packed = jax.lax.scan(
+            def step(carry, minibatch):
+                params, optimizer_state, learning_rate = carry
+                gradient, metrics = gradients.gradient(params, shuffled, minibatch)
+                direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+                params = jax.tree.map(lambda x, d: x - learning_rate * d, params, direction)
+                learning_rate = adapt_learning_rate(
+                    config, learning_rate, metrics["policy/kl"], limit
+                )
+                metrics["loss/gradient_norm"] = optax.global_norm(gradient)
+                return (params, optimizer_state, learning_rate), Packed.of(metrics)
+
+            return jax.lax.scan(step, carry, minibatches)
+
+        # Between updates the optimizer's moments are flat, whichever way computes the gradients.
+        moments = jax.tree.map(
+            lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
+        )
+        carry = (gradients.pack(state.params), moments, state.learning_rate)
+        (params, moments, learning_rate), packed = jax.lax.scan(
             epoch, carry, jax.random.split(key, config.num_epochs)
+        )
+        optimizer_state = jax.tree.map(
+            lambda x, packed: ravel_pytree(gradients.unpack(packed))[0] if x.ndim else packed,
+            state.optimizer,
+            moments,
         )
         metrics = packed.metrics()
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
-        return (unravel(flat_params), optimizer_state, learning_rate), means, metrics
+        return (gradients.unpack(params), optimizer_state, learning_rate), means, metrics
 
     def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)

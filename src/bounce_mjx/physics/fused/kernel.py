@@ -10,19 +10,17 @@ than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
 
 import functools
 import math
-import os
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.custom_partitioning import custom_partitioning
 
+from bounce_mjx.gpu import has_kernels
+
 Arrays = tuple[jax.Array, ...]
 ElementwiseFunction = Callable[..., Arrays]
 
-_SWITCH = "BOUNCE_MJX_GPU_KERNEL"
-# Mosaic GPU targets NVIDIA's Hopper and later.
-_MIN_COMPUTE_CAPABILITY = 9.0
 # Environments in a block: the 128 threads of a warpgroup, with which Mosaic GPU computes.
 _BLOCK = 128
 
@@ -63,21 +61,6 @@ def elementwise(
         return (call if float32 and (interpret or has_kernels()) else function)(*args)
 
     return chosen
-
-
-def has_kernels() -> bool:
-    """Whether JAX's default device runs these kernels."""
-    if jax.default_backend() != "gpu" or os.environ.get(_SWITCH) == "off":
-        return False
-    try:
-        from jax.experimental.pallas import mosaic_gpu  # noqa: F401
-    except ImportError:
-        return False
-    # AMD's GPUs have a name here, such as gfx90a.
-    capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
-    return all(
-        c.replace(".", "").isdigit() and float(c) >= _MIN_COMPUTE_CAPABILITY for c in capabilities
-    )
 
 
 def in_kernel(
