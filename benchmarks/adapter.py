@@ -1,9 +1,9 @@
-"""What the PyTorch adapter costs: time of a step through it against the jitted step alone.
+"""Overhead of the PyTorch adapter: the time of a step through it and of the jitted step alone.
 
     python benchmarks/adapter.py --num-envs 4096 32768
 
-Each figure is the median over rounds, in which the variants take turns; within a round the steps
-follow each other without waiting, as in a training, and the device is waited for at the end.
+Each figure is the median over rounds, in which the variants take turns. Within a round the steps
+follow one another as in a training; only the end of the round waits for the device.
 """
 
 import statistics
@@ -39,7 +39,7 @@ class Command(StrictModel):
 
 
 def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
-    """Functions that take a number of steps and wait for the last one."""
+    """Functions that do a number of steps and wait for the last."""
     import torch
 
     from bounce_mjx.adapters.torch import TorchVectorEnv
@@ -88,7 +88,7 @@ def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
 
 
 def measure(command: Command, num_envs: int) -> dict[str, float]:
-    """Seconds a step of each variant."""
+    """Seconds per step of each variant."""
     variants = make_variants(num_envs)
     for run in variants.values():
         run(3)

@@ -1,9 +1,9 @@
-"""Ten minutes on end: how many environments keep the ball up, and whether the memory stays flat.
+"""Ten minutes without a reset: the share of environments that keep the ball up, and the memory.
 
     python benchmarks/endurance.py RUN --num-envs 1024 --minutes 10
 
-The policy acts without a time limit and without resets; an environment has failed at its first end
-(the ball fell, flew off, ...). A row is one minute of simulated time.
+The policy acts without a time limit and without resets. An environment fails at its first end: the
+ball falls, flies off, ... Each row is one minute of simulated time.
 """
 
 import resource
@@ -38,15 +38,15 @@ class Command(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder or a checkpoint in it; without it the newest run."""
+    """A run's folder or a checkpoint in it. The default is the newest run."""
     num_envs: Annotated[int, Field(ge=1)] = 1024
-    """Environments."""
+    """Number of environments."""
     minutes: Annotated[int, Field(ge=1)] = 10
-    """Simulated minutes of each."""
+    """Simulated minutes of each environment."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
     """Seed of the resets."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Where to look for the newest run."""
+    """Folder of runs in which to find the newest."""
     out: Path = Path("benchmarks/results")
     """Folder for endurance.json and endurance.md."""
 

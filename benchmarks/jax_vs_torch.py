@@ -1,20 +1,21 @@
 """Six PPO trainers on one task: environment steps/s, time and steps to the five results, return.
 
-    python benchmarks/jax_vs_torch.py                                    # all of it
-    python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # a part of it
-    python benchmarks/jax_vs_torch.py --methods --merge FILES            # tables of what there is
+    python benchmarks/jax_vs_torch.py                                    # all trainers and seeds
+    python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # some of them
+    python benchmarks/jax_vs_torch.py --methods --merge FILES            # existing records only
 
 ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax; the hyperparameters
-are the config's as far as each library has them (`trainers.py`, `bounce_mjx/torch/rsl_rl.py`,
-`bounce_mjx/torch/skrl.py`). Each training is a process of its own with an empty compilation cache.
+are the config's as far as each library has them (`trainers.py`, `adapters/torch/rsl_rl_ppo.py`,
+`adapters/torch/skrl_ppo.py`). Each training is a separate process with an empty compilation cache.
 All start episodes with the task's resets, and every `eval_every` steps the policy without noise is
 judged by the same evaluation on the same resets, on the fused physics.
 
 - Training clock: time in the trainer, without evaluations and without compiling. The first two
-  blocks of a trainer may compile, so each is counted as no more than the median of the others.
-- From process start: all of it, evaluations too; the evaluation compiles beside the training.
-- Every evaluation is written to jax_vs_torch.jsonl as it ends; a run that is cut short is shown as
-  far as it came. A (method, seed) that is run again replaces what was there.
+  blocks of a trainer may compile, so each counts at most as the median of the later blocks.
+- From process start: the whole time, with the evaluations, whose program compiles while the trainer
+  trains.
+- Each evaluation is written to jax_vs_torch.jsonl as it ends, so that a run that was cut short has
+  its evaluations up to then. A new run of a (method, seed) replaces the earlier one.
 """
 
 import json
@@ -61,14 +62,14 @@ _NAMES = {
 }
 _STARTED = "BOUNCE_MJX_BENCHMARK_STARTED"
 _RECORDS = "jax_vs_torch.jsonl"
-# brax and skrl (JAX) compile some of what they run a second time, in their second block.
+# brax and skrl (JAX) compile some programs again in their second block.
 _COMPILING_BLOCKS = 2
 
 Record = dict[str, Any]
 
 
 class Command(TrainConfig):
-    """The command line: the config's keys as flags, and what to run."""
+    """The command line: the config's keys as flags, and the trainings to run."""
 
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
@@ -77,22 +78,21 @@ class Command(TrainConfig):
     eval_every: Annotated[int, Field(ge=1)] = 1_000_000
     """Environment steps between two evaluations, rounded to whole iterations."""
     config: Path | None = None
-    """Preset: a YAML file. Left out: configs/default.yaml where there is an accelerator."""
+    """Preset: a YAML file. The default is the device's preset, configs/default.yaml on a GPU."""
     methods: tuple[Method, ...] = METHODS
-    """What to train; none to show what there is."""
+    """Trainers to run; none to show the existing records."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2)
     """Seeds of the trainings."""
     max_seconds: Annotated[float, Field(gt=0.0)] = 570.0
-    """A training that lasts longer than this from its process's start ends at its next
-    evaluation, s."""
+    """Time limit of a training's process, s; the training ends at its next evaluation."""
     stop_at_solved: bool = False
     """End each training at its first evaluation that meets all five results."""
     merge: tuple[Path, ...] = ()
-    """Further .jsonl files whose records are shown too."""
+    """Further .jsonl files with records to show."""
     out: Path = Path("benchmarks/results")
     """Folder for jax_vs_torch.jsonl, .md and .png."""
     worker: bool = False
-    """Train the one method and seed in this process, for the command itself."""
+    """Train one method and seed in this process; the command starts such processes itself."""
 
 
 def main() -> None:
@@ -135,7 +135,7 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {
             "JAX_COMPILATION_CACHE_DIR": cache,
-            # JAX would take most of the accelerator's memory at once; PyTorch needs some of it.
+            # JAX would otherwise reserve most of the memory, of which PyTorch needs some.
             "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
             _STARTED: str(time.time()),
         }
@@ -162,7 +162,7 @@ def train_here(command: Command) -> None:
 
 
 class _Judge:
-    """Evaluates the policy after every block, and writes what it came to; an `OnBlock`."""
+    """Evaluates the policy after every block and writes a record; an `OnBlock`."""
 
     def __init__(self, command: Command, config: TrainConfig, method: Method, file: TextIO):
         self._command, self._config, self._method, self._file = command, config, method, file
@@ -223,8 +223,8 @@ class _Judge:
 
 
 def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]:
-    """The evaluations of the newest run of each method and seed, in order, with the training clock
-    `train_seconds` of each."""
+    """The evaluations of the newest run of each method and seed, in order, each with its training
+    clock `train_seconds`."""
     runs: dict[str, list[Record]] = {}
     for record in records:
         runs.setdefault(record["run"], []).append(record)
@@ -243,7 +243,7 @@ def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]
 
 
 def summarize(runs: dict[tuple[Method, int], list[Record]]) -> dict[Method, dict[str, list]]:
-    """Of each method the figures of each seed; None where a run did not get there."""
+    """For each method the figures of each seed; None for a figure that a run did not reach."""
     summary: dict[Method, dict[str, list]] = {}
     for method in METHODS:
         of_method = [run for (name, _), run in sorted(runs.items()) if name == method]
@@ -265,25 +265,25 @@ def summarize(runs: dict[tuple[Method, int], list[Record]]) -> dict[Method, dict
 
 
 def table(runs: dict[tuple[Method, int], list[Record]]) -> str:
-    """One row a method: the mean over the seeds, and their range."""
+    """One row for each method: the mean over the seeds, and their range."""
     summary = summarize(runs)
     ours = summary.get("ours")
     some = next(iter(runs.values()))[0]
     rows = []
-    for method, of in summary.items():
-        solved = [value for value in of["solved_train"] if value is not None]
+    for method, figures in summary.items():
+        solved = [value for value in figures["solved_train"] if value is not None]
         rows.append(
             [
                 _NAMES[method],
-                f"{_mean(of['rate']) / 1e6:.3f}",
-                f"{len(solved)} of {len(of['solved_train'])}",
-                _spread(of["solved_steps"], 1e-6),
-                _spread(of["solved_train"]),
-                _ratio(of["solved_train"], ours and ours["solved_train"]),
-                _spread(of["solved_process"]),
-                _ratio(of["solved_process"], ours and ours["solved_process"]),
-                _spread(of["return"]),
-                f"{min(of['steps']) / 1e6:.1f}",
+                f"{_mean(figures['rate']) / 1e6:.3f}",
+                f"{len(solved)} of {len(figures['solved_train'])}",
+                _spread(figures["solved_steps"], 1e-6),
+                _spread(figures["solved_train"]),
+                _ratio(figures["solved_train"], ours and ours["solved_train"]),
+                _spread(figures["solved_process"]),
+                _ratio(figures["solved_process"], ours and ours["solved_process"]),
+                _spread(figures["return"]),
+                f"{min(figures['steps']) / 1e6:.1f}",
             ]
         )
     header = [
@@ -300,13 +300,13 @@ def table(runs: dict[tuple[Method, int], list[Record]]) -> str:
     ]
     return (
         f"Device: {some['device']}, {some['num_envs']:,} environments. Mean over the seeds that "
-        f"got there (least to most).\n\n{markdown_table(header, rows)}"
+        f"reached the figure (least to most).\n\n{markdown_table(header, rows)}"
     )
 
 
 def plot(runs: dict[tuple[Method, int], list[Record]], path: Path) -> None:
-    """The return over the training clock and over the steps; a circle at the first evaluation that
-    meets all five results."""
+    """Draws the return over the training clock and over the steps, with a circle at the first
+    evaluation that meets all five results."""
     try:
         import matplotlib
     except ImportError as error:
@@ -319,13 +319,13 @@ def plot(runs: dict[tuple[Method, int], list[Record]], path: Path) -> None:
         color = f"C{METHODS.index(method)}"
         label = _NAMES[method] if method not in axes[0].get_legend_handles_labels()[1] else None
         for axis, key, scale in zip(axes, ("train_seconds", "steps"), (1.0, 1e-6), strict=True):
-            across = [scale * record[key] for record in run]
+            abscissa = [scale * record[key] for record in run]
             returns = [record["return"] for record in run]
             named = axis.get_legend_handles_labels()[1]
-            axis.plot(across, returns, color=color, label=None if label in named else label)
+            axis.plot(abscissa, returns, color=color, label=None if label in named else label)
             solved = next((i for i, record in enumerate(run) if record["passed"]), None)
             if solved is not None:
-                axis.plot(across[solved], returns[solved], "o", color=color, mec="black")
+                axis.plot(abscissa[solved], returns[solved], "o", color=color, mec="black")
     axes[0].set(xscale="log", xlabel="training clock, s", ylabel="mean return of an evaluation")
     axes[1].set(xlabel="environment steps, M")
     axes[0].set_title("circle: first evaluation that meets all five results", fontsize="medium")
@@ -337,7 +337,7 @@ def plot(runs: dict[tuple[Method, int], list[Record]], path: Path) -> None:
 
 
 class _Background:
-    """A value that a thread computes. Not a pool, which would hold up the end of the process."""
+    """A value that a daemon thread computes; a pool would delay the end of the process."""
 
     def __init__(self, compute):
         self._thread = threading.Thread(target=self._run, args=(compute,), daemon=True)

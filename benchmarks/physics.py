@@ -1,10 +1,10 @@
-"""Physics steps per second of the engines over batch sizes, measured side by side in one run.
+"""Physics steps per second of the engines at several batch sizes, measured in turns.
 
     python benchmarks/physics.py --batch-sizes 512 4096 --engines fused mjx c
 
 One measurement is a program of `--control-steps` control steps (10 physics steps each) under
-random actions. The engines take turns, and the fastest of the repeats counts, as other work on
-the machine only ever slows one down.
+random actions. The engines take turns. The fastest of the repeats counts, as other work on the
+machine can only slow a repeat down.
 """
 
 import os
@@ -36,9 +36,9 @@ class Command(StrictModel):
     batch_sizes: tuple[Annotated[int, Field(ge=1)], ...] = (512, 4096, 32768)
     """Numbers of environments."""
     engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
-    """fused, mjx, and c: MuJoCo's C engine on all processor cores."""
+    """Engines; c is MuJoCo's C engine on all processor cores."""
     control_steps: Annotated[int, Field(ge=1)] = 50
-    """Control steps in one measurement of the fused engine; the others, far slower, do 2."""
+    """Control steps in one measurement of the fused engine; the slower engines do 2."""
     repeats: Annotated[int, Field(ge=1)] = 5
     """Measurements of each engine."""
     out: Path = Path("benchmarks/results")
@@ -46,18 +46,18 @@ class Command(StrictModel):
 
 
 def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
-    """A compiled run of a JAX engine, and the seconds that it took to compile."""
+    """A compiled program of a JAX engine, and its compile time in seconds."""
     env = BounceBall(EnvConfig(physics=engine))
-    at_minor = {"in_axes": -1, "out_axes": -1}
+    batch_last = {"in_axes": -1, "out_axes": -1}
 
     def control_step(physics, key):
         actions = jax.random.uniform(key, (env.action_size, batch), minval=-1.0, maxval=1.0)
-        targets = jax.vmap(env.servo_targets, **at_minor)(physics, actions)
+        targets = jax.vmap(env.servo_targets, **batch_last)(physics, actions)
         advance = jax.vmap(
             lambda state, ctrl: env.engine.step(
                 PhysicsParameters(), state, ctrl, env.config.num_substeps
             ),
-            **at_minor,
+            **batch_last,
         )
         return advance(physics, targets), None
 
@@ -73,7 +73,7 @@ def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[
 
 
 def c_program(batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
-    """A run of the C engine on all cores."""
+    """A program of the C engine on all cores."""
     env = BounceBall()
     model, threads = env.mj_model, os.cpu_count() or 1
     rng = np.random.default_rng(0)
@@ -92,7 +92,7 @@ def c_program(batch: int, control_steps: int) -> tuple[Callable[[], None], float
 
 
 def measure(command: Command) -> list[dict]:
-    """One record a batch size and engine."""
+    """One record for each batch size and engine."""
     records = []
     for batch in command.batch_sizes:
         programs = {}
@@ -122,7 +122,7 @@ def measure(command: Command) -> list[dict]:
 
 
 def table(records: list[dict]) -> str:
-    """Steps per second by batch size and engine, and how many times faster fused is."""
+    """Steps per second by batch size and engine, and the speedup of fused over each engine."""
     rows = []
     for batch in dict.fromkeys(r["batch"] for r in records):
         at_batch = {r["engine"]: r for r in records if r["batch"] == batch}

@@ -1,11 +1,11 @@
-"""What more seeds and more devices cost: trainings side by side, and environments over devices.
+"""Scaling of the training with the number of seeds and the number of devices.
 
     python benchmarks/scaling.py --num-seeds 1 4 16 --num-devices 1 2 4
 
-Seeds: the time of one block of training with S seeds in one program, against that with one.
-Devices: environment steps per second on D devices with `--num-envs` environments on each, against
-one device. The hyperparameters are the preset's. The compiled block alone is timed, and the fastest
-of the repeats counts, as other work on the machine only ever slows one down.
+Seeds: the time of one block of training with S seeds in one program, relative to one seed.
+Devices: environment steps per second on D devices with `--num-envs` environments on each, relative
+to one device. The hyperparameters come from the preset. Only the compiled block is timed. The
+fastest of the repeats counts, as other work on the machine can only slow a repeat down.
 """
 
 import sys
@@ -40,7 +40,7 @@ class Command(StrictModel):
     num_envs: Annotated[int, Field(ge=1)] = 4096
     """Environments on each device."""
     num_minibatches: Annotated[int, Field(ge=1)] | None = None
-    """Minibatches of one epoch; left out, the preset's."""
+    """Minibatches in an epoch. The default is the preset's."""
     iterations: Annotated[int, Field(ge=1)] = 8
     """Iterations in one measured block."""
     repeats: Annotated[int, Field(ge=1)] = 8
@@ -90,7 +90,7 @@ def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
 
 
 def table(records: list[dict]) -> str:
-    """Seconds a block and steps per second, against the first row's."""
+    """Milliseconds per block and steps per second, absolute and relative to the first row."""
     first = records[0]
     rows = [
         [

@@ -1,7 +1,7 @@
 """skrl's PPO in JAX on this environment, for `jax_vs_torch.py`.
 
-Hyperparameters as in `bounce_mjx.torch.skrl`, except that skrl's JAX side clips the gradients of
-the policy and of the value network each, and has a learning rate for each.
+The hyperparameters are those of `adapters/torch/skrl_ppo.py`, except that skrl's JAX side clips the
+gradients of each network separately and has a learning rate for each network.
 """
 
 from typing import Any
@@ -26,8 +26,8 @@ from bounce_mjx.task.env import BounceBall
 
 
 class SkrlJaxLearner:
-    """skrl's agent, stepped as its trainers step it but with the terminal observations at an end,
-    from which it then bootstraps time-outs."""
+    """skrl's agent, stepped as its trainers do, but with the terminal observation at an episode's
+    end, from which it then bootstraps a time-out."""
 
     def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
         skrl.config.jax.key = seed
@@ -72,7 +72,7 @@ class SkrlJaxLearner:
         self.agent.init()
         self.agent.enable_training_mode(True)
 
-        def see(observation: jax.Array, metrics: dict[str, jax.Array]) -> jax.Array:
+        def add_metrics(observation: jax.Array, metrics: dict[str, jax.Array]) -> jax.Array:
             extra = [metrics[name][:, None] for name in config.critic_metrics]
             return jnp.concatenate([observation, *extra], axis=-1)
 
@@ -88,8 +88,8 @@ class SkrlJaxLearner:
             return (
                 state,
                 key,
-                see(result.observation, state.env.metrics),
-                see(result.final_observation, result.metrics),
+                add_metrics(result.observation, state.env.metrics),
+                add_metrics(result.final_observation, result.metrics),
                 config.reward_scale * result.reward[:, None],
                 result.terminated[:, None],
                 result.truncated[:, None],
@@ -98,7 +98,7 @@ class SkrlJaxLearner:
         key, self._key = jax.random.split(jax.random.PRNGKey(seed))
         self._env_state = jax.jit(start)(key)
         self._step_env = jax.jit(step)
-        self._states = see(vector.observe(self._env_state), self._env_state.env.metrics)
+        self._states = add_metrics(vector.observe(self._env_state), self._env_state.env.metrics)
         self._iteration = 0
 
     def learn(self, iterations: int) -> None:
@@ -137,7 +137,7 @@ class SkrlJaxLearner:
                 self.agent.post_interaction(**clock)
 
     def policy(self) -> Policy:
-        """The policy as it acts now, without its noise."""
+        """The present policy, without its noise."""
         params = self.agent.policy.state_dict.params["params"]
         depth = len(self.config.hidden_layers)
         hidden = {f"hidden_{i}": params[f"Dense_{i}"] for i in range(depth)}

@@ -2,11 +2,11 @@
 
     python benchmarks/sweep.py --trials 20 --seeds 8 --storage runs/sweep.db
 
-A trial's value is the share of the five results that its evaluations met, over all evaluations and
-seeds: it rewards learning early as well as staying good. The study lies in the storage's file: the
-same command goes on with a search that was stopped, and runs a trial that was cut off again (so one
-process at a time). Needs optuna (the extra `sweep`). Evaluations use the training's evaluation
-seed, never that of `python -m bounce_mjx.eval`.
+A trial's value is the share of results met, over all evaluations and seeds: it rewards learning
+early as well as staying good. The storage file holds the study. The same command continues an
+interrupted search and repeats an interrupted trial, so run only one process at a time. Needs optuna
+(the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of
+`bounce-mjx eval`.
 """
 
 import sys
@@ -37,7 +37,7 @@ try:
 except ImportError:
     optuna = None
 
-# Range of each hyperparameter that is searched, and whether in equal ratios.
+# Range of each hyperparameter, and whether its scale is logarithmic.
 SPACE = {
     "max_learning_rate": (1e-3, 1e-2, True),
     "decay_steps": (5e6, 5e7, True),
@@ -52,9 +52,9 @@ class Command(StrictModel):
     """The command line."""
 
     config: Path | None = None
-    """YAML file with all that is not searched; left out: the preset of the device at hand."""
+    """YAML file with the fixed settings. The default is the preset of the device."""
     trials: Annotated[int, Field(ge=1)] = 20
-    """Trials in all, those of earlier calls included."""
+    """Total number of trials, with the trials of earlier calls."""
     seeds: Annotated[int, Field(ge=1)] = 8
     """Seeds of each trial."""
     steps: Annotated[int, Field(ge=1)] = 20_000_000
@@ -68,7 +68,7 @@ class Command(StrictModel):
 
 
 def search(command: Command, base: TrainConfig) -> "optuna.Study":
-    """Goes on with the study until it has its trials.
+    """Continues the study until it has all its trials.
 
     Raises:
       UserError: the storage cannot be used.
@@ -91,11 +91,11 @@ def search(command: Command, base: TrainConfig) -> "optuna.Study":
     study.sampler = optuna.samplers.TPESampler(seed=done)
     study.pruner = optuna.pruners.MedianPruner(n_startup_trials=5)
     if not study.trials:
-        # The search starts from what is used today.
+        # The search starts from the preset.
         study.enqueue_trial({name: getattr(base.ppo, name) for name in SPACE})
-    for cut_off in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
-        study.tell(cut_off.number, state=optuna.trial.TrialState.FAIL)
-        study.enqueue_trial(cut_off.params)
+    for interrupted in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
+        study.tell(interrupted.number, state=optuna.trial.TrialState.FAIL)
+        study.enqueue_trial(interrupted.params)
 
     def count(study: "optuna.Study", _) -> None:
         if len(study.get_trials(deepcopy=False, states=finished)) >= command.trials:
@@ -107,7 +107,7 @@ def search(command: Command, base: TrainConfig) -> "optuna.Study":
 
 
 def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> float:
-    """Trains the population of one trial, and values it."""
+    """Trains the population of one trial; returns the trial's value."""
     chosen = {
         name: trial.suggest_float(name, low, high, log=log)
         for name, (low, high, log) in SPACE.items()
@@ -150,7 +150,7 @@ def share_met(report: Report) -> float:
 
 
 def table(study: "optuna.Study", seeds: int) -> str:
-    """The complete trials, the best first."""
+    """The completed trials, best first."""
     complete = study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
     complete.sort(key=lambda trial: -trial.value)
     rows = [

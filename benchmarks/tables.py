@@ -1,4 +1,4 @@
-"""What the benchmarks share: the device's name, and results as JSON and as a Markdown table."""
+"""Shared by the benchmarks: the device's name, and results as JSON and as a Markdown table."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def device_name() -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, its columns padded to be read as text too."""
+    """A Markdown table with padded columns, so that it also reads well as text."""
     cells = [list(header), *[list(row) for row in rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     lines = [

@@ -2,8 +2,8 @@
 
     python benchmarks/train.py --seeds 0 1 2 3 4 --engines fused mjx mujoco
 
-Each training is a process of its own with an empty compilation cache: `train_jax.py
---stop-when-solved`, as a user would start it. Words after `--` go to it.
+Each training is a separate process with an empty compilation cache: `train_jax.py
+--stop-when-solved`, as a user would start it, with the flags after `--`.
 """
 
 import json
@@ -34,7 +34,7 @@ class Command(StrictModel):
     engines: tuple[Literal["fused", "mjx", "mujoco"], ...] = ("fused", "mujoco")
     """Engines on which each trained policy is evaluated, 1,024 episodes each."""
     stop_when_solved: bool = True
-    """End a training at its first passing evaluation; else it goes on to total_steps."""
+    """End a training at its first evaluation that meets all results, or else at total_steps."""
     out: Path = Path("benchmarks/results")
     """Folder for train.json and train.md."""
 
@@ -72,14 +72,14 @@ def evaluate_on(run: str, engine: str, folder: Path) -> dict:
         stderr=subprocess.PIPE,
         text=True,
     )
-    # 1 says that a result failed, which is a measurement too.
+    # Status 1 is a failed result, which is a valid measurement.
     if finished.returncode not in (0, 1):
         raise UserError(f"the evaluation on {engine} failed: {finished.stderr[-500:]}")
     return json.loads(out.read_text(encoding="utf-8"))
 
 
 def later_passes(record: dict) -> list[bool]:
-    """Whether each evaluation after the first that passed did so too."""
+    """For each evaluation after the first pass, whether it passed too."""
     solved = record["solved_steps"] or float("inf")
     return [e["passed"] for e in record["evaluations"] if e["steps"] > solved]
 

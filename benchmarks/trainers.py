@@ -1,18 +1,19 @@
 """The trainers that `jax_vs_torch.py` compares, each as one function.
 
-Each trains on the environment of the config until `on_block` says that it is enough. `on_block`
-gets the environment steps done, the seconds that the block took, and the policy.
+Each trains on the config's environment until `on_block` returns True. `on_block` receives the
+number of environment steps so far, the block's time in seconds, and the policy.
 
-For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of `torch/rsl_rl.py`,
-`torch/skrl.py` and `skrl_jax.py`. For brax, on the fused and on the mjx physics:
+For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of
+`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the
+fused and on the mjx physics:
 
 | PPOConfig                         | brax                                             |
 |-----------------------------------|--------------------------------------------------|
-| networks, normalisation, critic_metrics, and all that is not named below | the same  |
-| value_cost                        | doubled, as brax halves it: the same             |
-| learning_rate, its limits, target_kl | the same; steered by 1.5 (here 1.1)           |
+| all settings that are not below   | the same                                         |
+| value_cost                        | the same; doubled, as brax halves it             |
+| learning_rate, its limits, target_kl | the same; adapted by 1.5 (here 1.1)           |
 | decay_steps                       | none                                             |
-| advantages                        | from the values of each minibatch's own network  |
+| advantages                        | recomputed by the current network for each minibatch |
 | resets                            | each environment always to its own first state   |
 """
 
@@ -42,13 +43,13 @@ Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]
 
 
 class OnBlock(Protocol):
-    """What a trainer calls."""
+    """Callbacks of a trainer."""
 
     def prepare(self) -> None:
-        """Called once, when no work of Python's delays the trainer's own compilation."""
+        """Called once before the first block, when it does not delay the trainer's own tracing."""
 
     def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
-        """Called after every block; whether it is enough."""
+        """Called after every block; returns whether the training may end."""
 
 
 def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
@@ -68,14 +69,14 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
         on_block.prepare()
         state = jax.block_until_ready(compiled_init.result()(key))
         run_block = compiled_run.result()
-    steps, enough = 0, False
-    while not enough:
+    steps, ended = 0, False
+    while not ended:
         started = time.perf_counter()
         state, _ = jax.block_until_ready(run_block(state))
         seconds = time.perf_counter() - started
         steps += iterations * config.ppo.batch_steps
-        # A copy, as the next block takes the memory of the state.
-        enough = on_block(steps, seconds, jax.tree.map(jnp.copy, policy_of(state)))
+        # A copy, as the next block reuses the memory of the state.
+        ended = on_block(steps, seconds, jax.tree.map(jnp.copy, policy_of(state)))
 
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
@@ -97,19 +98,19 @@ def train_skrl_jax(config: TrainConfig, on_block: OnBlock) -> None:
 def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
     on_block.prepare()
     iterations = block_iterations(config)
-    steps, enough = 0, False
-    while not enough:
+    steps, ended = 0, False
+    while not ended:
         started = time.perf_counter()
         learner.learn(iterations)
         # Reading the policy waits until the device has computed it.
         policy = jax.block_until_ready(learner.policy())
         seconds = time.perf_counter() - started
         steps += iterations * config.ppo.batch_steps
-        enough = on_block(steps, seconds, policy)
+        ended = on_block(steps, seconds, policy)
 
 
-class _Enough(Exception):
-    """Ends brax's training, which has no other way out."""
+class _TrainingEnded(Exception):
+    """Ends brax's training, which cannot be stopped otherwise."""
 
 
 class CriticObservation(Wrapper):
@@ -120,12 +121,12 @@ class CriticObservation(Wrapper):
         self._names = critic_metrics
 
     def reset(self, rng: jax.Array) -> State:
-        return self._see(self.env.reset(rng))
+        return self._observe(self.env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._see(self.env.step(state.replace(obs=state.obs["state"]), action))
+        return self._observe(self.env.step(state.replace(obs=state.obs["state"]), action))
 
-    def _see(self, state: State) -> State:
+    def _observe(self, state: State) -> State:
         extra = [state.metrics[name][None] for name in self._names]
         return state.replace(
             obs={"state": state.obs, "critic": jnp.concatenate([state.obs, *extra])}
@@ -150,7 +151,7 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
             statistics = params[0]
             policy = Policy(_normalizer(statistics, "state"), params[1])
             if on_block(steps, seconds, policy):
-                raise _Enough
+                raise _TrainingEnded
         started = time.perf_counter()
 
     def networks(_, action_size: int, preprocess_observations_fn):
@@ -189,7 +190,7 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
                 policy_params_fn=on_params,
                 seed=config.seed,
             )
-    except _Enough:
+    except _TrainingEnded:
         pass
 
 

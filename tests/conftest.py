@@ -1,4 +1,4 @@
-"""Tests of what is optional are left out where it is missing, but for CI, where nothing may be."""
+"""Tests of optional packages are skipped where a package is missing; CI must have all of them."""
 
 import importlib.util
 import os
@@ -15,7 +15,7 @@ collect_ignore = ["test_torch.py", "test_torch_train.py"] if OPTIONAL and not HA
 
 
 def pytest_report_header() -> list[str]:
-    return [f"left out, as PyTorch is missing: {name}" for name in collect_ignore]
+    return [f"skipped, as PyTorch is missing: {name}" for name in collect_ignore]
 
 
 @pytest.fixture(scope="session")

@@ -1,22 +1,19 @@
-"""`BounceBall`: observation, resets, actions, bounces, ends, faults, and brax's own tools on it."""
+"""`BounceBall`: observation, resets, actions, bounces, ends, faults, and its derivative."""
 
 import functools
-import subprocess
-import sys
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from brax.envs.wrappers import training
-from brax.training.agents.ppo import networks as brax_networks
-from brax.training.agents.ppo import train as brax_ppo
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.adapters.brax import pmap_support
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task.env import TaskState, update_task
+from bounce_mjx.task.observation import OBSERVATION
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
@@ -143,6 +140,31 @@ def test_observation_entries(entries, read, walked, model):
     expected = np.array(read(mj_data(model, walked.pipeline_state.physics)))
     assert np.all(np.abs(expected) > 1e-4), "too small to tell from zero"
     np.testing.assert_allclose(walked.obs[entries], expected, rtol=0, atol=1e-6)
+
+
+def test_layout_names_the_parts_of_the_observation(walked, model):
+    """Its slices are the entries above; the true state has the same values under the same names."""
+    assert OBSERVATION.size == 29
+    kinematics = BounceBall().kinematics(walked.pipeline_state)._asdict()
+    assert [*kinematics, "target_height"] == [part.name for part in OBSERVATION.parts]
+    for name, value in kinematics.items():
+        np.testing.assert_array_equal(walked.obs[OBSERVATION[name]], value, err_msg=name)
+    np.testing.assert_array_equal(
+        walked.obs[OBSERVATION["target_height"]], walked.pipeline_state.task.target_height
+    )
+
+
+def test_task_page_has_the_layout():
+    page = (Path(__file__).parent.parent / "docs/task.md").read_text(encoding="utf-8")
+    table = page.split("## Observation")[1].split("##")[0]
+    rows = re.findall(
+        r"^\| (\d+)(?:-(\d+))? \| .* \| `(\w+)` \| .* \| (.*?) ?\|$", table, re.MULTILINE
+    )
+    found = [(name, int(last or first) + 1 - int(first), unit) for first, last, name, unit in rows]
+    assert found == [tuple(part) for part in OBSERVATION.parts]
+    assert [int(first) for first, *_ in rows] == [
+        OBSERVATION[p.name].start for p in OBSERVATION.parts
+    ]
 
 
 def test_observation_ends_with_the_target_height(walked):
@@ -310,7 +332,7 @@ def episodes(reset, step):
     return transitions
 
 
-def test_reward_is_the_sum_of_the_fifteen_metrics(episodes):
+def test_reward_is_the_sum_of_its_terms(episodes):
     names = {f"reward/{name}" for name in REFERENCE_WEIGHTS}
     for _, _, after in episodes:
         terms = {name: v for name, v in after.metrics.items() if name.startswith("reward/")}
@@ -609,123 +631,39 @@ def test_fault_leaves_the_rest_of_the_batch_alone(env):
     np.testing.assert_array_equal(actual.metrics["non_finite"], [0, 0, 1, 0, 0])
 
 
-# brax
+# Derivative
 
 
-@pytest.fixture(scope="module")
-def brax_episode(env):
-    """Four environments in brax's own training wrappers, over two time-outs of 3 steps."""
-    wrapped = training.wrap(env, episode_length=3)
-    # brax reads the batch off the shape of keys of the old kind.
-    states = [jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(8), 4))]
-    wrapped_step = jax.jit(wrapped.step)
-    actions = jax.random.uniform(jax.random.key(9), (6, 4, 6), minval=-1.0)
-    for action in actions:
-        states.append(wrapped_step(states[-1], action))
-    return states, actions
+def test_gradient_through_steps_with_a_contact_equals_finite_differences():
+    """The sum of the rewards of five steps, in which the ball hits the paddle, along a direction
+    of the actions; by central differences of the fourth order."""
+    with jax.enable_x64(True):
+        env = BounceBall()
+        state = env.reset(jax.random.key(0))
+        paddle = env.kinematics(state.pipeline_state).paddle_position
+        physics = with_ball(state.pipeline_state.physics, paddle + jnp.array([0.01, 0.0, 0.04]))
+        physics = physics._replace(qvel=physics.qvel.at[8].set(-1.5))
+        state = with_physics(state, physics)
+        rng = np.random.default_rng(0)
+        actions, direction = (jnp.array(rng.uniform(-0.5, 0.5, (5, 6))) for _ in range(2))
 
+        def total(actions):
+            after, rewards = jax.lax.scan(
+                lambda state, action: (lambda s: (s, s.reward))(env.step(state, action)),
+                state,
+                actions,
+            )
+            return rewards.sum(), after.metrics["n_bounces"]
 
-def test_brax_episode_wrapper_truncates(brax_episode):
-    states, _ = brax_episode
-    for i, state in enumerate(states[1:], start=1):
-        timed_out = float(i % 3 == 0)
-        np.testing.assert_array_equal(state.done, timed_out)
-        np.testing.assert_array_equal(state.info["truncation"], timed_out)
-
-
-def test_brax_vmap_wrapper_equals_single_steps(brax_episode, step):
-    states, actions = brax_episode
-    for i in range(4):
-        single = jax.tree.map(lambda x, i=i: x[i], states[0]).replace(info={})
-        for t in range(2):
-            single = step(single, actions[t, i])
-            np.testing.assert_allclose(states[t + 1].obs[i], single.obs, rtol=1e-5, atol=1e-5)
-            np.testing.assert_allclose(states[t + 1].reward[i], single.reward, rtol=1e-4)
-
-
-def test_brax_ppo_trains(env):
-    params_at = {}
-    with pmap_support.device_put_replicated():
-        make_policy, trained, metrics = brax_ppo.train(
-            env,
-            num_timesteps=2000,
-            num_envs=8,
-            episode_length=50,
-            unroll_length=5,
-            batch_size=8,
-            num_minibatches=2,
-            num_updates_per_batch=2,
-            normalize_observations=True,
-            run_evals=False,
-            max_devices_per_host=1,
-            network_factory=functools.partial(
-                brax_networks.make_ppo_networks,
-                policy_hidden_layer_sizes=(8,),
-                value_hidden_layer_sizes=(8,),
-            ),
-            policy_params_fn=lambda step, _, params: params_at.update({step: params}),
+        (_, bounces), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(actions)
+        assert bounces == 1.0
+        evaluate, step = jax.jit(lambda actions: total(actions)[0]), 1e-4
+        near, far = (
+            evaluate(actions + i * step * direction) - evaluate(actions - i * step * direction)
+            for i in (1.0, 2.0)
         )
-    assert all_finite(trained) and all_finite(metrics)
-    _, *fresh_networks = params_at[0]
-    normalizer, *networks = trained
-    assert normalizer.mean.shape == (29,)
-    for before, after in zip(
-        jax.tree.leaves(fresh_networks), jax.tree.leaves(networks), strict=True
-    ):
-        assert before.shape == after.shape
-        assert np.any(np.asarray(before) != np.asarray(after))
-    action, _ = make_policy(trained, deterministic=True)(jnp.zeros(29), jax.random.key(0))
-    assert action.shape == (6,) and all_finite(action)
-
-
-def test_device_put_replicated_is_there_only_within(monkeypatch):
-    # Where jax still had the function it would be left alone: the next test.
-    monkeypatch.delattr(jax, "device_put_replicated", raising=False)
-    with pytest.raises(KeyError), pmap_support.device_put_replicated():
-        assert jax.device_put_replicated is pmap_support.replicate
-        raise KeyError
-    assert not hasattr(jax, "device_put_replicated")
-
-
-def test_device_put_replicated_of_jax_is_left_alone(monkeypatch):
-    own = object()
-    monkeypatch.setattr(jax, "device_put_replicated", own, raising=False)
-    with pmap_support.device_put_replicated():
-        assert jax.device_put_replicated is own
-    assert jax.device_put_replicated is own
-
-
-def test_replicate_copies_arrays_numbers_and_keys():
-    tree = {"a": np.arange(3, dtype=np.int8), "b": 2.5, "key": jax.random.key(3)}
-    copies = pmap_support.replicate(tree, jax.local_devices()[:1])
-    assert copies["a"].dtype == jnp.int8
-    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
-    np.testing.assert_array_equal(copies["b"], [2.5])
-    assert jnp.issubdtype(copies["key"].dtype, jax.dtypes.prng_key)
-    assert copies["key"].shape == (1,)
-    np.testing.assert_array_equal(
-        jax.random.key_data(copies["key"])[0], jax.random.key_data(tree["key"])
-    )
-
-
-def test_replicate_asks_for_a_device():
-    with pytest.raises(ValueError, match="at least one"):
-        pmap_support.replicate(jnp.zeros(2), [])
-
-
-def test_replicate_puts_one_copy_on_each_device():
-    # The number of CPU devices is fixed when jax starts: hence the process.
-    program = """
-import jax, numpy as np
-jax.config.update("jax_platforms", "cpu")
-jax.config.update("jax_num_cpu_devices", 2)
-from bounce_mjx.adapters.brax import pmap_support
-copies = pmap_support.replicate(np.arange(3.0), jax.devices())
-assert copies.shape == (2, 3), copies.shape
-for i, shard in enumerate(sorted(copies.addressable_shards, key=lambda s: s.index[0].start)):
-    assert shard.device == jax.devices()[i], shard
-    assert np.array_equal(shard.data, [[0.0, 1.0, 2.0]]), shard
-assert jax.pmap(lambda x: jax.lax.psum(x, "d"), "d")(copies)[1, 2] == 4.0
-"""
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+        expected = (8.0 * near - far) / (12.0 * step)
+        actual = jnp.vdot(gradient, direction)
+    assert np.isfinite(gradient).all() and (np.abs(gradient) > 0.0).all()
+    print(actual, expected, abs(actual / expected - 1))
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)

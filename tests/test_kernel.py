@@ -64,7 +64,7 @@ def batched(env: BounceBall) -> Step:
 
 
 def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
-    """Every number of the world given, the batch last, but for a gravity that all share."""
+    """Every number of the world given, the batch last; all environments share the gravity."""
     drawn = random_parameters(env.mj_model, batch, seed=0)
     drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
     return drawn._replace(gravity=jnp.array([0.5, -0.5, -9.0]))
@@ -104,7 +104,7 @@ def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     traced.clear()
     jax.make_jaxpr(batched(env))(*moving(env, 4))
     assert not traced
-    # What was traced here calls the list above.
+    # The cached trace calls the list above.
     dynamics._substeps.cache_clear()
 
 

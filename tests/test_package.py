@@ -1,6 +1,7 @@
 """The wheel: what is in it, and that it works where there is no source checkout."""
 
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -48,6 +49,95 @@ def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
+
+
+def test_import_is_light(tmp_path: Path) -> None:
+    """The package leaves JAX for its first use, and the environment needs none of what trainers,
+    other engines, viewers and adapters need."""
+    script = """
+import sys
+import bounce_mjx
+print("jax" in sys.modules)
+env = bounce_mjx.BounceBall(bounce_mjx.EnvConfig())
+heavy = "brax mujoco.mjx trimesh scipy networkx numba flax optax orbax matplotlib gymnasium torch"
+print(env.backend, *(name for name in heavy.split() if name in sys.modules))
+print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines() == ["False", "fused", "BounceBall EnvConfig"], done.stderr
+
+
+def test_trainer_needs_neither_brax_nor_mjx(tmp_path: Path) -> None:
+    script = """
+import sys
+import bounce_mjx.commands.eval, bounce_mjx.commands.play, bounce_mjx.commands.train
+from bounce_mjx.training import job
+print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.modules))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.stdout == "\n", done.stdout + done.stderr
+
+
+def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
+    """A copy of the package with one more term, added at the end of the others in rewards.py: the
+    config, the metrics, the reward, the viewer's bars and the report's figure have it."""
+    copy = tmp_path / "src" / "bounce_mjx"
+    shutil.copytree(CHECKOUT / "src" / "bounce_mjx", copy)
+    for folder in ("mjcf", "configs"):
+        shutil.copytree(CHECKOUT / folder, tmp_path / folder)
+    rewards = copy / "task" / "rewards.py"
+    term = """
+class SpinReward(StrictModel):
+    weight: Finite = -0.5
+    offset: Finite = 3.0
+
+
+@term(SpinReward)
+def spin(config: SpinReward, inputs: RewardInputs, geometry: Geometry) -> jax.Array:
+    return geometry.vz - config.offset
+
+
+class SharedRewardConfig(StrictModel):
+"""
+    source = rewards.read_text(encoding="utf-8")
+    assert source.count("class SharedRewardConfig(StrictModel):\n") == 1
+    source = source.replace("class SharedRewardConfig(StrictModel):\n", term)
+    rewards.write_text(source, encoding="utf-8")
+    script = """
+import jax
+import numpy as np
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.reports.curves import Curve, Group, RunCurves
+from bounce_mjx.reports.figures import image, rewards_figure
+from bounce_mjx.viewers.browser import reward_bars
+from bounce_mjx.task.rewards import TERM_NAMES
+env = BounceBall(EnvConfig(reward={"spin": {"offset": 4.0}}))
+state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.numpy.zeros(6))
+terms = {k: v for k, v in state.metrics.items() if k.startswith("reward/")}
+print(bool(abs(sum(terms.values()) - state.reward) < 1e-4), len(terms) == len(TERM_NAMES))
+expected = -0.5 * (state.pipeline_state.physics.qvel[8] - 4.0)
+print(bool(abs(terms["reward/spin"] - expected) < 1e-5))
+print(reward_bars(np.arange(len(TERM_NAMES))).count("spin"))
+curve = Curve(np.arange(3), np.arange(3.0))
+run = RunCurves("run", {f"reward/{name}": curve for name in TERM_NAMES}, None)
+figure = rewards_figure([Group("group", [run])])
+titles = [axes.get_title() for axes in figure.axes]
+print([title.replace(" ", "_") for title in titles] == list(TERM_NAMES), titles[-1])
+print(len(image(figure, "png")) > 1000)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "src")},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["True True", "True", "1", "True spin", "True"]
 
 
 def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:

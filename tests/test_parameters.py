@@ -24,7 +24,7 @@ from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
 from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import SHAPES, direct_solref
-from bounce_mjx.robot.model import find_addresses, load_model
+from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
 from test_physics import (
     DT,
     ONE_STEP,
@@ -407,11 +407,21 @@ def test_c_evaluation_carries_the_whole_state(name):
         assert after.act is None
 
 
-@pytest.mark.parametrize("name", STATEFUL)
-def test_c_evaluation_takes_stateful_models(networks, untrained, tmp_path, name):
-    """An evaluation of a few steps: activations start where the servos rest."""
-    mjcf = tmp_path / "stateful.xml"
-    mjcf.write_text(XML.replace(*STATEFUL[name], 1))
+def test_c_evaluation_takes_a_delayed_sensor(networks, untrained, tmp_path):
+    """An evaluation of a few steps."""
+    mjcf = tmp_path / "delayed.xml"
+    mjcf.write_text(XML.replace(*STATEFUL["delayed sensor"], 1))
     env = BounceBall(EnvConfig(mjcf=mjcf, episode_seconds=0.1))
     statistics = make_mujoco_evaluator(env, networks, 2)(untrained, jax.random.PRNGKey(0))
     np.testing.assert_array_equal(statistics.steps, 10)
+
+
+def test_filtered_servos_start_at_rest():
+    """With a gear too: the activations are the actuators' lengths, so that no servo pulls."""
+    model = edited('<position kp="20000"', '<position timeconst="0.02" gear="-2" kp="20000"')
+    data = mujoco.MjData(model)
+    data.qpos[:6] = np.linspace(-1.0, 1.0, 6)
+    data.act[:] = resting_activations(model, [jnp.asarray(x) for x in data.qpos])
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, 0.0, atol=0.01)
+    assert resting_activations(load_model(None, 0.001), list(data.qpos)) is None

@@ -97,7 +97,7 @@ def paddle_frame(mj_model: mujoco.MjModel, angles: np.ndarray) -> tuple[np.ndarr
 
 def random_states(mj_model: mujoco.MjModel, count: int, seed: int) -> tuple[States, np.ndarray]:
     """Arm states in a wide range with the ball at the paddle; and the ball's centre [N, 3] in the
-    paddle's frame: in turn around it, inside it, beside an edge or a corner, over a face."""
+    paddle's frame: in turn around it, inside it, near an edge or a corner, over a face."""
     rng = np.random.default_rng(seed)
     qpos, qvel = np.zeros((count, mj_model.nq)), np.zeros((count, mj_model.nv))
     qpos[:, :6] = rng.uniform(-np.pi, np.pi, (count, 6))
@@ -315,7 +315,7 @@ def test_mjx_multiplies_in_full_precision(mj_model):
 
 @pytest.mark.parametrize("ball", ["bouncing", "falling"])
 def test_float32_drift(mj_model, fused_step, record_property, ball):
-    """Free-running float32 against MuJoCo's float64, 2 s, on and beside the paddle."""
+    """Free-running float32 against MuJoCo's float64, 2 s, on the paddle and next to it."""
     rng = np.random.default_rng(3)
     start = bouncing_states(mj_model, rng)
     if ball == "falling":
@@ -338,7 +338,7 @@ def test_float32_drift(mj_model, fused_step, record_property, ball):
             f"ball {np.median(balls):.1e} (median) {balls.max():.1e} (worst) m"
         )
         assert joints < 1e-3
-        # Each bounce amplifies an error, so that only the typical one says something.
+        # Each bounce amplifies an error: only the median is meaningful.
         assert (np.median(balls) if ball == "bouncing" else balls.max()) < 1e-3
     assert state.qpos.dtype == np.float32
     assert contacts > 200 if ball == "bouncing" else contacts == 0
@@ -407,7 +407,7 @@ def test_supported_models_step_as_mujoco_does(mj_model, name):
     assert np.sum(contacts) >= 40
     assert_same_step(uncompiled_step(model, in_order), expected)
 
-    # The edit reached the simulation, or else left it alone.
+    # The edit changes the simulation, or an equivalent one leaves it as it is.
     shipped, _ = c_step(mj_model, states)
     change = np.max(np.abs(expected.qvel - reordered(find_addresses(model), shipped).qvel))
     assert (change > 1e-3) == (name in SUPPORTED)
@@ -598,11 +598,11 @@ def test_restitution(mj_model, fused_step, record_property, speed):
     for _ in range(40):
         paddle = np.array([paddle_frame(mj_model, q)[0] for q in np.asarray(state.qpos[:, :6])])
         gap = (np.asarray(state.qpos[:, 6:9]) - paddle) @ normal - HALF_SIZE[2] - RADIUS
-        # A step moves by its new velocity: the difference quotient is the paddle's velocity, and
-        # in free flight the velocity is that of half a step before the position.
+        # A step moves by its new velocity: the difference quotient is the paddle's velocity, and in
+        # free flight the velocity belongs to a time half a step before the position.
         velocity = np.asarray(state.qvel[:, 6:9]) - (paddle - before) / DT
         relative = velocity @ normal - 0.5 * 9.81 * DT
-        # What gravity does between the surfaces' touching and here is no part of the impact.
+        # Gravity's work between the first touch and this position is no part of the impact.
         speeds.append(np.sign(relative) * np.sqrt(relative**2 + 2.0 * 9.81 * np.maximum(gap, 0.0)))
         gaps.append(gap)
         before = paddle

@@ -17,6 +17,7 @@ from tensorboardX import SummaryWriter
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.recording import Recording
@@ -35,7 +36,7 @@ from bounce_mjx.runs.config import TrainConfig, load_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.rewards import TERM_NAMES
-from bounce_mjx.training import report as report_command
+from bounce_mjx.training import report as training_report
 
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
@@ -310,7 +311,7 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
     def fail(*_):
         raise RuntimeError("no\nfonts")
 
-    monkeypatch.setattr(report_command, "write_report", fail)
+    monkeypatch.setattr(training_report, "write_report", fail)
     train_command.main([*TINY, "--total-steps", "128", "--log-dir", str(tmp_path)])
     (run,) = tmp_path.iterdir()
     assert json.loads((run / "results.json").read_text())["trained_steps"] == 128

@@ -1,6 +1,7 @@
 """What a training survives: an end between any two steps, signals, full disks, numbers that are
 not finite. Going on leads to the very state of a training that nothing happened to."""
 
+import concurrent.futures
 import contextlib
 import io
 import json
@@ -29,33 +30,52 @@ from tensorboardX import SummaryWriter
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import Report, Result, judge
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import best_checkpoint, latest_checkpoint
-from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_record
+from bounce_mjx.runs.lock import lock_run
+from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training.console import Reporter
+from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.signals import StopRequest
-from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, job
+from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Compiled programs are kept: in this process by their config, for others in a cache."""
-    compile_programs, kept = training_job.compile_programs, {}
+    compile_training, compile_evaluator, kept = PPOTrainer.compile, Evaluators._compile, {}
 
-    def compile_once(config, *args):
-        *args, beside = args
-        key = config.model_copy(update={"total_steps": 0, "eval_every": 0, "log_dir": None})
-        if repr(key) not in kept:
-            kept[repr(key)] = compile_programs(config, *args)
-        beside()
-        return kept[repr(key)]
+    def key(config: TrainConfig, *rest: object) -> str:
+        varied = {"total_steps": 0, "eval_every": 0, "log_dir": None, "screening_episodes": 0}
+        return repr((config.model_copy(update=varied), *rest))
+
+    def compile_training_once(trainer: PPOTrainer, pool: concurrent.futures.Executor):
+        name = key(trainer._config)
+        if name not in kept:
+            compile_training(trainer, pool).result()
+            kept[name] = trainer._run, trainer._init
+        trainer._run, trainer._init = kept[name]
+        return trainer._run
+
+    def compile_evaluator_once(evaluators: Evaluators, *args: int):
+        name = key(evaluators._config, *args)
+        if name not in kept:
+            kept[name] = compile_evaluator(evaluators, *args)
+        return kept[name]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_job, "compile_programs", compile_once)
+        patch.setattr(PPOTrainer, "compile", compile_training_once)
+        patch.setattr(Evaluators, "_compile", compile_evaluator_once)
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
@@ -206,7 +226,7 @@ def test_edited_config_is_refused_by_name(run: Path, capfd, key: str, old: str, 
 
 def resume_command(said: str) -> list[str]:
     """The arguments in the command that a stopped training prints."""
-    return shlex.split(re.search(r"go on with: python train_jax\.py (.+)", said)[1])
+    return shlex.split(re.search(r"go on with: bounce-mjx train (.+)", said)[1])
 
 
 @pytest.mark.slow
@@ -337,6 +357,144 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     assert logged == sorted(set(logged))
 
 
+# One writer
+
+
+def test_a_run_in_use_is_not_resumed(run: Path, capfd) -> None:
+    before = contents(run)
+    with lock_run(run), pytest.raises(SystemExit) as exit_info:
+        resume(run, "--total-steps", str(STEPS))
+    assert exit_info.value.code == 2
+    assert re.fullmatch(
+        rf"error: {run} is in use by another training; .+\n", capfd.readouterr().err
+    )
+    assert contents(run) == before
+
+
+def test_a_lock_ends_with_its_process(run: Path, straight: Path) -> None:
+    code = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from bounce_mjx.runs.lock import lock_run\n"
+        "with lock_run(Path(sys.argv[1])):\n"
+        "    print('locked', flush=True)\n"
+        "    time.sleep(100)\n"
+    )
+    command = [sys.executable, "-c", code, str(run)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "locked\n"
+        with pytest.raises(UserError, match="is in use"), lock_run(run):
+            pass
+        holder.kill()
+    resume(run, "--total-steps", str(STEPS))
+    assert_same_training(run, straight)
+
+
+def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
+    refusals = []
+
+    def run_block(trainer: PPOTrainer, run_block=PPOTrainer.run):
+        with pytest.raises(UserError, match="is in use") as refused, lock_run(run):
+            pass
+        refusals.append(refused)
+        return run_block(trainer)
+
+    monkeypatch.setattr(PPOTrainer, "run", run_block)
+    resume(run, "--total-steps", str(STEPS))
+    assert len(refusals) == 2
+    with lock_run(run):
+        pass
+    assert not list(run.glob(".lock"))
+
+
+# Paths
+
+
+def test_a_path_may_have_square_brackets(tmp_path: Path, straight: Path, capfd) -> None:
+    log_dir = tmp_path / "[/x]" / "exp[lr]"
+    run = train(log_dir, STEPS // 2)
+    assert capfd.readouterr().out.count(str(run)) == 4
+    resume(run, "--total-steps", str(STEPS))
+    assert_same_training(run, straight)
+
+
+# What is measured
+
+
+def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
+    results = json.loads((straight / "results.json").read_text())
+    assert results["fresh_resets"] is True
+    config = load_run_config(straight)
+    selected = read_record(best_checkpoint(straight)).progress["best"]
+    env = BounceBall(config.env)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    evaluate = make_evaluator(env, networks, config.eval_episodes)
+    policy = load_policy(best_checkpoint(straight), config)
+
+    def mean_return(seed: int) -> float:
+        key = jax.random.split(jax.random.PRNGKey(np.uint32(seed)))[0]
+        return judge(env, evaluate(policy, key)).details["mean_return"]
+
+    assert selected["details"]["mean_return"] == pytest.approx(mean_return(config.eval_seed))
+    fresh = mean_return(config.eval_seed + 2**31)
+    assert results["details"]["mean_return"] == pytest.approx(fresh)
+    assert fresh != pytest.approx(mean_return(config.eval_seed))
+
+
+def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:
+    run = train(tmp_path, STEPS, "--screening-episodes", "2")
+    said = capfd.readouterr().out
+    assert said.count("screening (2 episodes) at") == 2 and "evaluation at" not in said
+    assert [e["screening"] for e in evaluations(run)] == [True, True]
+    tags = EventAccumulator(str(run)).Reload().Tags()["scalars"]
+    assert "screening/stable" in tags and "results/stable" not in tags
+    # The end reports all episodes.
+    results = json.loads((run / "results.json").read_text())
+    assert (results["screening"], results["details"]["episodes"]) == (False, 4)
+
+
+def test_a_screening_is_never_better_than_a_full_evaluation() -> None:
+    def report(passed: bool, mean_return: float, screening: bool) -> Report:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", passed)
+        details = {"mean_return": mean_return, "episodes": 2.0}
+        return Report((result,), details, screening=screening)
+
+    progress = Progress()
+    assert progress.improves(report(False, 5.0, True), 1)
+    assert progress.improves(report(False, 1.0, False), 2)
+    assert not progress.improves(report(False, 9.0, True), 3)
+    stored = Progress.from_dict(
+        json.loads(json.dumps(progress.model_dump())) | {"best": None}, Path()
+    )
+    assert progress.best_steps == 2
+    assert [e.screening for e in stored.evaluations] == [True, False, True]
+
+
+def test_the_time_left_is_never_negative() -> None:
+    shown = io.StringIO()
+    config = TrainConfig(total_steps=100)
+    names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
+    metrics = {name: np.ones((1, 1)) for name in names} | {"task/non_finite": np.zeros((1, 1))}
+    Reporter([], Console(file=shown, width=200), config, 0).block(128, 1.0, metrics)
+    assert ", 0 s left" in shown.getvalue()
+
+
+def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> None:
+    """Even if the process dies right after the save: a second SIGTERM does not wait."""
+    logged = []
+    save = CheckpointWriter.save
+
+    def save_and_look(writer, names, steps, *rest, **named):
+        if "latest" in names:
+            points = EventAccumulator(str(run)).Reload().Scalars("loss/value")
+            logged.append((steps, points[-1].step))
+        save(writer, names, steps, *rest, **named)
+
+    monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
+    resume(run, "--total-steps", str(2 * STEPS))
+    assert logged == [(256, 256), (384, 384), (512, 512)]
+
+
 # Full disks
 
 
@@ -431,28 +589,26 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
 # Numbers that are not finite
 
 
-def diverge_at(monkeypatch, iteration: int) -> None:
-    """Spoils the parameters of every training before that iteration."""
-    compile_programs = training_job.compile_programs
+def change_state(monkeypatch, iteration: int, change: Callable) -> None:
+    """Changes the state of every training before that iteration."""
+    run = PPOTrainer.run
 
-    def compile_spoilt(*args):
-        programs = compile_programs(*args)
+    def run_changed(trainer: PPOTrainer):
+        if trainer.state.iteration == iteration - 1:
+            trainer.state = change(trainer.state)
+        return run(trainer)
 
-        def run(state):
-            if state.iteration == iteration - 1:
-                params = jax.tree.map(lambda x: x * jnp.nan, state.params.policy)
-                state = state._replace(params=state.params._replace(policy=params))
-            return programs.run(state)
-
-        return programs._replace(run=run)
-
-    monkeypatch.setattr(training_job, "compile_programs", compile_spoilt)
+    monkeypatch.setattr(PPOTrainer, "run", run_changed)
 
 
 def test_divergence_ends_the_training_and_keeps_the_last_good_state(
     run: Path, half: Path, monkeypatch, capfd
 ) -> None:
-    diverge_at(monkeypatch, 4)
+    def spoil(state):
+        params = jax.tree.map(lambda x: x * jnp.nan, state.params.policy)
+        return state._replace(params=state.params._replace(policy=params))
+
+    change_state(monkeypatch, 4, spoil)
     with pytest.raises(SystemExit) as exit_info:
         resume(run, "--total-steps", "100000")
     assert exit_info.value.code == 2
@@ -495,23 +651,14 @@ def test_no_fault_where_all_is_finite() -> None:
 def test_state_that_is_not_finite_is_reset_told_and_stays_alone(
     run: Path, straight: Path, monkeypatch, capfd
 ) -> None:
-    compile_programs = training_job.compile_programs
+    def spoil(state):
+        physics = state.env.env.pipeline_state.physics
+        broken = physics._replace(qvel=physics.qvel.at[2, 5].set(jnp.nan))
+        pipeline = state.env.env.pipeline_state._replace(physics=broken)
+        env = state.env.env.replace(pipeline_state=pipeline)
+        return state._replace(env=state.env._replace(env=env))
 
-    def compile_spoilt(*args):
-        programs = compile_programs(*args)
-
-        def run(state):
-            if state.iteration == 2:
-                physics = state.env.env.pipeline_state.physics
-                broken = physics._replace(qvel=physics.qvel.at[2, 5].set(jnp.nan))
-                pipeline = state.env.env.pipeline_state._replace(physics=broken)
-                env = state.env.env.replace(pipeline_state=pipeline)
-                state = state._replace(env=state.env._replace(env=env))
-            return programs.run(state)
-
-        return programs._replace(run=run)
-
-    monkeypatch.setattr(training_job, "compile_programs", compile_spoilt)
+    change_state(monkeypatch, 3, spoil)
     resume(run, "--total-steps", str(STEPS))
     assert "1 environment had a state that was not finite, and was reset" in capfd.readouterr().out
     counts = EventAccumulator(str(run)).Reload().Scalars("task/non_finite")

@@ -1,10 +1,9 @@
-"""Gymnasium, brax and MuJoCo Playground know the environment, and their own checks pass."""
+"""Gymnasium and MuJoCo Playground know the environment, and their own checks pass."""
 
 import subprocess
 import sys
 import warnings
 
-import brax.envs
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
-import bounce_mjx
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers import offscreen
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
@@ -85,7 +84,7 @@ def test_single_environment_truncates_and_reports(single):
     *_, (_, reward, terminated, truncated, info) = episode(single, 0, EPISODE_STEPS)
     assert truncated and not terminated
     terms = [value for name, value in info.items() if name.startswith("reward/")]
-    assert len(terms) == 15
+    assert len(terms) == len(TERM_NAMES)
     assert sum(terms) == pytest.approx(float(reward), rel=1e-4)
 
 
@@ -152,16 +151,6 @@ def test_wrong_settings_are_told_in_a_sentence():
         gymnasium.make_vec(ENV_ID, num_envs=2, render_mode="human")
 
 
-def test_brax_makes_the_environment():
-    env = brax.envs.get_environment("bounce_ball")
-    assert isinstance(env, bounce_mjx.BounceBall)
-    config = bounce_mjx.EnvConfig(target_height_range=(0.7, 0.7))
-    wrapped = brax.envs.create("bounce_ball", episode_length=5, batch_size=2, config=config)
-    state = jax.jit(wrapped.reset)(jax.random.PRNGKey(0))
-    assert state.obs.shape == (2, 29)
-    np.testing.assert_allclose(state.obs[:, 28], 0.7, rtol=1e-6)
-
-
 def test_playground_loads_the_environment(monkeypatch):
     pytest.importorskip("mujoco_playground")
     from mujoco_playground import manipulation, registry, wrapper
@@ -193,3 +182,20 @@ def test_playground_loads_the_environment(monkeypatch):
     state = step(state, actions)
     assert state.done.tolist() == [1.0, 1.0]
     np.testing.assert_allclose(state.obs, start.obs, atol=1e-6)
+
+
+def test_randomization_by_playground_is_refused():
+    """It replaces an MJX model that no step uses, so the randomised worlds would all be equal."""
+    pytest.importorskip("mujoco_playground")
+    from mujoco_playground import wrapper
+
+    from bounce_mjx.adapters.playground import PlaygroundBounceBall
+
+    env = PlaygroundBounceBall()
+    randomized = wrapper.wrap_for_brax_training(
+        env,
+        randomization_fn=lambda model: (model, jax.tree.map(lambda _: None, model)),
+    )
+    with pytest.raises(UserError, match="randomization_fn .* no effect"):
+        randomized.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    assert env.mjx_model.nq == env.mj_model.nq

@@ -31,7 +31,7 @@ from bounce_mjx.runs.folders import (
     runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts
-from bounce_mjx.training import job as training
+from bounce_mjx.training.ppo_trainer import PPOTrainer
 from tiny_runs import STEPS, TINY, arrays, job
 
 # As many environments as eight devices can share.
@@ -204,19 +204,20 @@ def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, monkeypatch, capsys):
-    compile_programs = training.compile_programs
+    run_block = PPOTrainer.run
 
-    def spoilt(*args):
-        programs = compile_programs(*args)
+    def spoilt(trainer: PPOTrainer):
+        if int(trainer.state.iteration[0]) == 2:
+            rates = trainer.state.learning_rate.at[1].set(jnp.nan)
+            trainer.state = trainer.state._replace(learning_rate=rates)
+        return run_block(trainer)
 
-        def run(state):
-            spoil = jnp.ones(SEEDS).at[1].set(jnp.nan) if int(state.iteration[0]) == 2 else 1.0
-            return programs.run(state._replace(learning_rate=state.learning_rate * spoil))
-
-        return programs._replace(run=run)
-
-    monkeypatch.setattr(training, "compile_programs", spoilt)
-    run = train(tmp_path / "runs", "--num-seeds", str(SEEDS))
+    monkeypatch.setattr(PPOTrainer, "run", spoilt)
+    run = train(tmp_path / "runs", "--num-seeds", str(SEEDS), "--total-steps", "384")
+    best = best_checkpoint(run / "seed_001").steps
+    # It stays diverged in a training that goes on.
+    train_command.main(["--resume", str(run), "--total-steps", str(2 * STEPS), "--no-report"])
+    assert best_checkpoint(run / "seed_001").steps == best
     said = capsys.readouterr().out
     assert re.search(r"seed 1 diverged: .* was the first that was not finite, at iteration 3", said)
     ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))

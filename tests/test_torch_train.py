@@ -1,18 +1,30 @@
 """train_torch.py: what it leaves behind, and that the rest of the package can use it."""
 
 import json
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 import torch
+from jax.experimental.compilation_cache import compilation_cache
 
+from bounce_mjx.adapters.torch.trainer import TorchTrainer
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands import train_torch as torch_train
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import judge
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import load_config
-from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint, latest_checkpoint
 from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.task.env import BounceBall
+from tiny_runs import arrays
 
 SCRIPT = Path(__file__).parent.parent / "train_torch.py"
 TINY = (
@@ -33,17 +45,41 @@ sys.meta_path.insert(0, NoTorch())
 """
 
 
-@pytest.fixture(scope="module", params=("rsl_rl", "skrl"))
-def run(request, tmp_path_factory) -> Path:
-    """The folder of a run of each library."""
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once(tmp_path_factory) -> Iterator[None]:
+    """Compiled programs are kept in a cache of this module."""
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = [getattr(jax.config, name) for name in names]
+    with pytest.MonkeyPatch.context() as patch:
+        # The command leaves the cache alone that the user has chosen.
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("user")))
+        for name, value in zip(names, (str(tmp_path_factory.mktemp("cache")), 0.0), strict=True):
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+        yield
+    for name, value in zip(names, before, strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def train(log_dir: Path, library: str, *flags: str) -> Path:
+    """The folder of a new run."""
     torch.set_num_threads(1)
-    log_dir = tmp_path_factory.mktemp(request.param)
-    library = ["--library", request.param]
-    torch_train.main(
-        [*TINY, *library, "--log-dir", str(log_dir), "--target-height-range", ".3", ".8"]
-    )
+    height = ["--target-height-range", ".3", ".8"]
+    torch_train.main([*TINY, "--library", library, *height, "--log-dir", str(log_dir), *flags])
     (folder,) = log_dir.iterdir()
     return folder
+
+
+@pytest.fixture(scope="module", params=("rsl_rl", "skrl"))
+def library(request) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def run(library, tmp_path_factory) -> Path:
+    """The folder of a run of each library."""
+    return train(tmp_path_factory.mktemp(library), library)
 
 
 def test_run_folder_is_that_of_the_trainer_in_jax(run):
@@ -77,15 +113,73 @@ def test_best_policy_is_the_one_that_was_judged(run):
     checkpoint = find_checkpoint(run, run)
     results = json.loads((run / "results.json").read_text(encoding="utf-8"))
     assert checkpoint.steps == results["best_steps"]
-    evaluate = torch_train.make_evaluation(config, torch_train.BounceBall(config.env))
-    report = evaluate(load_policy(checkpoint, config))
+    env = BounceBall(config.env)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    evaluate = make_evaluator(env, networks, config.eval_episodes)
+    key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed + 2**31)))[0]
+    report = judge(env, evaluate(load_policy(checkpoint, config), key))
     for again, stored in zip(report.results, results["results"], strict=True):
         assert again.value == pytest.approx(stored["value"], rel=1e-4)
 
 
+def test_run_has_a_report(run):
+    assert "of 5 results met" in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_resumed_run_is_the_same_as_an_uninterrupted_one(run, library, tmp_path):
+    half = train(tmp_path / "half", library, "--total-steps", "128", "--no-report")
+    # Without --library, which the run knows.
+    torch_train.main(["--resume", str(half), "--total-steps", "256", "--no-report"])
+    ours, theirs = (arrays(latest_checkpoint(folder)) for folder in (half, run))
+    assert ours.keys() == theirs.keys()
+    for name, expected in theirs.items():
+        np.testing.assert_array_equal(ours[name], expected, err_msg=name)
+    assert int(ours["iteration"]) == 4
+    both = [json.loads((folder / "results.json").read_text()) for folder in (half, run)]
+    assert both[0]["evaluations"] == both[1]["evaluations"]
+    assert both[0]["results"] == both[1]["results"]
+
+
+def test_a_seed_is_trained_as_alone_and_its_divergence_stays(
+    run, library, tmp_path, monkeypatch, capfd
+):
+    run_block = TorchTrainer.run
+
+    def spoilt(trainer: TorchTrainer):
+        if trainer.learners[1].iteration == 2:
+            with torch.no_grad():
+                trainer.learners[1]._parameters()[0].fill_(torch.nan)
+        return run_block(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TorchTrainer, "run", spoilt)
+        seeds = train(tmp_path, library, "--num-seeds", "2", "--no-report")
+    said = capfd.readouterr().out
+    assert re.search(r"seed 1 diverged: .* was the first that was not finite, at iteration 3", said)
+    together, alone = (arrays(latest_checkpoint(folder)) for folder in (seeds, run))
+    for name, expected in alone.items():
+        np.testing.assert_array_equal(together[name][0], expected, err_msg=name)
+
+    torch_train.main(["--resume", str(seeds), "--total-steps", "512", "--no-report"])
+    evaluated = [
+        [e["steps"] for e in json.loads((seeds / seed / "results.json").read_text())["evaluations"]]
+        for seed in ("seed_000", "seed_001")
+    ]
+    assert evaluated == [[128, 256, 384, 512], [128]]
+    assert best_checkpoint(seeds / "seed_001").steps == 128
+
+
+def test_run_of_another_library_is_not_resumed(run, library, capfd):
+    with pytest.raises(SystemExit):
+        train_command.main(["--resume", str(run), "--total-steps", "512"])
+    sentence = capfd.readouterr().err
+    assert f"was trained with {library}, not with jax" in sentence
+    assert f"bounce-mjx train-torch --library {library} --resume {run}" in sentence
+
+
 MISTAKES = {
     "library": ("--library tianshou", ("--library", "rsl_rl", "skrl", "tianshou")),
-    "near miss": ("--num-envz 3", ("did you mean --num-envs?", "train_torch.py --help")),
+    "near miss": ("--num-envz 3", ("did you mean --num-envs?", "bounce-mjx train-torch --help")),
     "rollout": ("--num-envs 8 --rollout-length 8 --num-minibatches 7", ("divisor of 64",)),
 }
 

@@ -8,7 +8,7 @@ from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
 
 
 class UserError(Exception):
-    """A mistake that the user can mend; its text is one sentence: what was given, what was
+    """A mistake that the user can correct; its text is one sentence: what was given, what was
     expected, what to do."""
 
 

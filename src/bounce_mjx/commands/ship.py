@@ -11,7 +11,6 @@ from typing import Annotated
 import jax
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
@@ -69,7 +68,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
     report, physics, _ = run_interruptible(
         evaluate_policy, policy, trained_with.env, trained_with.ppo
     )
-    console.print(results_table(report, escape(f"{checkpoint.folder}, {physics}")))
+    console.print(results_table(report, f"{checkpoint.folder}, {physics}"))
     console.print(details_line(report), highlight=False)
     if not report.passed:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")

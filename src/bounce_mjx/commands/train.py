@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from bounce_mjx.config.settings import whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import TrainingCommand, early_flag, run_command
@@ -51,13 +52,14 @@ def read_command(args: Sequence[str]) -> TrainCommand:
 def _join_hosts(args: Sequence[str]) -> None:
     """Joins the other hosts, which must come before JAX is asked for its devices."""
     address = early_flag(args, "--coordinator-address")
-    numbers = [early_flag(args, flag) for flag in ("--num-processes", "--process-id")]
-    timeout = early_flag(args, "--host-timeout") or str(hosts.DEFAULT_TIMEOUT)
+    words = [early_flag(args, f) for f in ("--num-processes", "--process-id", "--host-timeout")]
+    try:
+        numbers = [None if word is None else int(whole_number(word)) for word in words]
+    except ValueError:
+        # The parser refuses the flag by name.
+        return
+    *numbers, timeout = numbers
     distributed = early_flag(args, "--distributed")
-    wanted = distributed is not None and distributed.lower() not in ("false", "no", "0")
-    # The parser refuses all other words, by name.
-    readable = all(word is None or word.isdecimal() for word in (*numbers, timeout))
-    if readable and (wanted or any(word is not None for word in (address, *numbers))):
-        hosts.join(
-            address, *[None if word is None else int(word) for word in numbers], float(timeout)
-        )
+    wanted = distributed is not None and distributed.lower() != "false"
+    if wanted or any(value is not None for value in (address, *numbers)):
+        hosts.join(address, *numbers, timeout or hosts.DEFAULT_TIMEOUT)

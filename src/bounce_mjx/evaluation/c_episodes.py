@@ -86,7 +86,7 @@ def full_states(mj_model: mujoco.MjModel, physics: PhysicsState) -> np.ndarray:
     mujoco.mj_getState(mj_model, mujoco.MjData(mj_model), fresh, _FULL_PHYSICS)
     coordinates = np.concatenate(jax.tree.leaves(physics)).T
     states = np.tile(fresh, (len(coordinates), 1))
-    # Time comes first; then positions, velocities and activations; histories of sensors last.
+    # The order: time, positions, velocities, activations, histories of sensors.
     states[:, 1 : 1 + coordinates.shape[1]] = coordinates
     return states
 

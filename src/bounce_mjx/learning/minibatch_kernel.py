@@ -147,19 +147,25 @@ def _pad_last(x: jax.Array, size: int, value: float = 0.0) -> jax.Array:
 
 
 def loss_gradient(
-    config: PPOConfig, num_actions: int, params: PackedParams, batch: Batch, index: jax.Array
+    config: PPOConfig,
+    num_actions: int,
+    params: PackedParams,
+    batch: Batch,
+    index: jax.Array,
+    interpret: Any = None,
 ) -> tuple[PackedParams, dict[str, jax.Array]]:
     """Gradient of the loss of one minibatch without the entropy bonus, and its metrics.
 
     Args:
       index: of the minibatch [], int32.
+      interpret: parameters of Pallas' interpreter for GPU kernels, for tests on a processor.
 
     Returns:
       The gradient, undefined in the padding, and the means "loss/policy", "loss/value" and
       "policy/kl" [].
     """
     low = PackedParams(*(x.astype(jnp.bfloat16) for x in params))
-    hidden, output, metrics = _batched_call(config, num_actions)(
+    hidden, output, metrics = _batched_call(config, num_actions, interpret)(
         *batch, *low, params.output, index.astype(jnp.int32)
     )
     gradient = PackedParams(jnp.sum(hidden, axis=1), jnp.sum(output, axis=1))
@@ -168,12 +174,12 @@ def loss_gradient(
 
 
 @functools.lru_cache
-def _batched_call(config: PPOConfig, num_actions: int):
+def _batched_call(config: PPOConfig, num_actions: int, interpret: Any):
     """The kernel as a function that `jax.vmap` may batch, as of several seeds."""
 
     @jax.custom_batching.custom_vmap
     def call(*args: jax.Array):
-        return tuple(x[0] for x in _call(config, num_actions, [x[None] for x in args]))
+        return tuple(x[0] for x in _call(config, num_actions, interpret, [x[None] for x in args]))
 
     @call.def_vmap
     def batched(axis_size: int, in_batched: list[bool], *args: jax.Array):
@@ -181,17 +187,19 @@ def _batched_call(config: PPOConfig, num_actions: int):
             x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             for x, is_batched in zip(args, in_batched, strict=True)
         ]
-        return tuple(_call(config, num_actions, args)), (True,) * 3
+        return tuple(_call(config, num_actions, interpret, args)), (True,) * 3
 
     return call
 
 
-def _call(config: PPOConfig, num_actions: int, args: list[jax.Array]) -> list[jax.Array]:
+def _call(
+    config: PPOConfig, num_actions: int, interpret: Any, args: list[jax.Array]
+) -> tuple[jax.Array, ...]:
     """The kernel on several devices, each with its samples of every minibatch."""
     num_samples = args[0].shape[2]
 
     def run(*args: jax.Array) -> tuple[jax.Array, ...]:
-        return _run(config, num_actions, num_samples, *args)
+        return _run(config, num_actions, interpret, num_samples, *args)
 
     if jax.device_count() == 1:
         return run(*args)
@@ -223,6 +231,7 @@ def _call(config: PPOConfig, num_actions: int, args: list[jax.Array]) -> list[ja
 def _run(
     config: PPOConfig,
     num_actions: int,
+    interpret: Any,
     num_samples: int,
     inputs: jax.Array,
     action: jax.Array,
@@ -274,17 +283,25 @@ def _run(
         plgpu.copy_gmem_to_smem(output_ref.at[seed, network, pl.ds(0, width)], w3, barrier)
         plgpu.barrier_wait(barrier)
 
-        def matmul(a, b, rows: int, cols: int) -> jax.Array:
+        def matmul(a, b, rows: int, cols: int, flip_a=False, flip_b=False) -> jax.Array:
+            """Product [rows, cols] of two shared arrays, transposed where they are flipped."""
+            if interpret is not None:
+                a, b = (x[...].T if flip else x[...] for x, flip in ((a, flip_a), (b, flip_b)))
+                return jnp.dot(a, b, preferred_element_type=float32)
+            a, b = (
+                plgpu.transpose_ref(x, (1, 0)) if flip else x
+                for x, flip in ((a, flip_a), (b, flip_b))
+            )
+
             def run(accumulator):
                 plgpu.wgmma(accumulator, a, b)
                 return accumulator[...]
 
             return pl.run_scoped(run, plgpu.ACC((rows, cols), float32))
 
-        def transposed(ref):
-            return plgpu.transpose_ref(ref, (1, 0))
-
         def load(ref, kind=layout) -> jax.Array:
+            if interpret is not None:
+                return ref[...]
             return plgpu.load(ref, (), layout=kind, optimized=False)
 
         def store(ref, value: jax.Array) -> None:
@@ -329,7 +346,10 @@ def _run(
         by_log_prob = each_column(
             jnp.where(gain <= clipped_gain, gain, jnp.zeros_like(gain)) * -mean_of
         )
-        column = plgpu.broadcasted_iota(jnp.int32, (TILE, NUM_OUTPUTS), 1, layout=layout)
+        if interpret is not None:
+            column = jax.lax.broadcasted_iota(jnp.int32, (TILE, NUM_OUTPUTS), 1)
+        else:
+            column = plgpu.broadcasted_iota(jnp.int32, (TILE, NUM_OUTPUTS), 1, layout=layout)
         error = jnp.where(column == 0, result - each_column(target), jnp.zeros_like(result))
         is_policy = network == 0
         by_result = jnp.where(
@@ -348,14 +368,15 @@ def _run(
         of_output = output_gradient_ref.at[seed, network, tile]
         of_output[output_bias] = jnp.sum(by_result, axis=0)
         of_output[noise_row] = jnp.sum(by_log_prob * (deviation * deviation - 1.0), axis=0)
-        of_output[pl.ds(0, width)] = matmul(transposed(h2), out_gradient, width, NUM_OUTPUTS)
-        gradient = matmul(out_gradient, transposed(w3), TILE, width) * load(slope2).astype(float32)
+        of_output[pl.ds(0, width)] = matmul(h2, out_gradient, width, NUM_OUTPUTS, flip_a=True)
+        gradient = matmul(out_gradient, w3, TILE, width, flip_b=True)
+        gradient *= load(slope2).astype(float32)
         of_hidden[hidden_bias] = jnp.sum(gradient, axis=0)
         store(slope2, gradient)
-        of_hidden[second] = matmul(transposed(h1), slope2, width, width)
-        gradient = matmul(slope2, transposed(w2), TILE, width) * load(slope1).astype(float32)
+        of_hidden[second] = matmul(h1, slope2, width, width, flip_a=True)
+        gradient = matmul(slope2, w2, TILE, width, flip_b=True) * load(slope1).astype(float32)
         store(slope1, gradient)
-        of_hidden[first] = matmul(transposed(x), slope1, NUM_INPUTS, width)
+        of_hidden[first] = matmul(x, slope1, NUM_INPUTS, width, flip_a=True)
 
     # Operands of one product need the same swizzle, which their narrowest dimension bounds.
     wide = (plgpu.TilingTransform((8, 64)), plgpu.SwizzleTransform(128))
@@ -387,5 +408,6 @@ def _run(
         compiler_params=plgpu.CompilerParams(
             approx_math=True, lowering_semantics=plgpu.LoweringSemantics.Lane
         ),
+        interpret=interpret,
     )
     return tuple(run(inputs, action, scalars, hidden, output, exact_output, index))

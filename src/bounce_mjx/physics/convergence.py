@@ -10,7 +10,7 @@ from bounce_mjx.robot.model import find_addresses
 
 _SETTINGS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance")
 _NUM_BOUNCES, _NUM_STEPS = 8, 30
-# Float32 resolves the speeds of the arm and the ball no finer (m/s, rad/s).
+# The resolution of the arm's and the ball's speeds in float32 (m/s, rad/s).
 _MAX_ERROR = 1e-5
 
 
@@ -53,22 +53,24 @@ def _with_settings(
 def _largest_error(mj_model: mujoco.MjModel, converged: mujoco.MjModel) -> float:
     """Largest difference of a velocity (m/s, rad/s) after one step, over the steps of some bounces
     with a moving arm."""
-    at = find_addresses(mj_model)
+    addresses = find_addresses(mj_model)
     rng = np.random.default_rng(0)
-    half_size = mj_model.geom_size[at.paddle_geom]
+    half_size = mj_model.geom_size[addresses.paddle_geom]
     axis = np.argmin(half_size)
-    gear = mj_model.actuator_gear[list(at.actuators), 0]
+    gear = mj_model.actuator_gear[list(addresses.actuators), 0]
     errors = []
     for _ in range(_NUM_BOUNCES):
         truth, data = mujoco.MjData(converged), mujoco.MjData(mj_model)
-        truth.qpos[at.arm_qpos,] += rng.uniform(-0.5, 0.5, len(at.arm_qpos))
-        truth.qvel[at.arm_qvel,] = rng.uniform(-1.0, 1.0, len(at.arm_qvel))
-        truth.ctrl[at.actuators,] = gear * truth.qpos[at.arm_qpos,]
+        truth.qpos[addresses.arm_qpos,] += rng.uniform(-0.5, 0.5, len(addresses.arm_qpos))
+        truth.qvel[addresses.arm_qvel,] = rng.uniform(-1.0, 1.0, len(addresses.arm_qvel))
+        truth.ctrl[addresses.actuators,] = gear * truth.qpos[addresses.arm_qpos,]
         mujoco.mj_kinematics(converged, truth)
-        normal = truth.geom_xmat[at.paddle_geom].reshape(3, 3)[:, axis]
-        distance = half_size[axis] + 1.05 * mj_model.geom_size[at.ball_geom, 0]
-        truth.qpos[at.ball_qpos[:3],] = truth.geom_xpos[at.paddle_geom] + distance * normal
-        truth.qvel[at.ball_qvel[:3],] = -rng.uniform(0.5, 4.0) * normal
+        normal = truth.geom_xmat[addresses.paddle_geom].reshape(3, 3)[:, axis]
+        distance = half_size[axis] + 1.05 * mj_model.geom_size[addresses.ball_geom, 0]
+        truth.qpos[addresses.ball_qpos[:3],] = (
+            truth.geom_xpos[addresses.paddle_geom] + distance * normal
+        )
+        truth.qvel[addresses.ball_qvel[:3],] = -rng.uniform(0.5, 4.0) * normal
         data.ctrl[:] = truth.ctrl
         for _ in range(_NUM_STEPS):
             # The solver's warm start stays its own.

@@ -39,7 +39,7 @@ def read_model(mj_model: mujoco.MjModel) -> MjxModel:
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
     """A feature of the model that MJX does not compute; None if it computes all.
 
-    MJX refuses some features itself, and ignores others, which are named here.
+    MJX itself refuses some features. It ignores others silently; they are named here.
     """
     m = mj_model
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
@@ -118,6 +118,6 @@ def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
 
 
 def _full_precision() -> contextlib.AbstractContextManager:
-    """Keeps MJX's matrix products in float32: the default on a GPU is tf32, whose three digits
-    make the ball bounce wrong."""
+    """Keeps MJX's matrix products in float32. The default on a GPU, tf32, has three digits, and the
+    ball bounces wrong."""
     return jax.default_matmul_precision("highest")

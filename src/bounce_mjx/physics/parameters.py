@@ -93,15 +93,15 @@ def edited_fields(
     NumPy's numbers give NumPy's arrays, for MuJoCo's C engine; traced ones give JAX's, for MJX.
 
     `body_invweight0`, which scales the contact's softness, follows the ball's mass; the last
-    link's share, a thousandth of the sum, stays that of the unedited model.
+    link's share, a thousandth of the sum, stays as it is in the unedited model.
     """
-    m, at, p = mj_model, find_addresses(mj_model), parameters
+    m, addresses, p = mj_model, find_addresses(mj_model), parameters
     links, dofs, servos = (
-        m.jnt_bodyid[at.arm_joints,],
-        np.array(at.arm_qvel),
-        np.array(at.actuators),
+        m.jnt_bodyid[addresses.arm_joints,],
+        np.array(addresses.arm_qvel),
+        np.array(addresses.actuators),
     )
-    ball, ball_geom, paddle = at.ball_body, at.ball_geom, at.paddle_geom
+    ball, ball_geom, paddle = addresses.ball_body, addresses.ball_geom, addresses.paddle_geom
     fields: dict[str, Array] = {}
 
     def current(field: str) -> Array:
@@ -124,8 +124,8 @@ def edited_fields(
         put("body_invweight0", (ball, 1), current("body_invweight0")[ball, 1] / ratio)
     if p.ball_mass is not None or p.ball_radius is not None:
         # MuJoCo keeps the inertia matrix of a body that moves alone, the ball, in the model.
-        put("dof_M0", np.array(at.ball_qvel[:3]), current("body_mass")[ball])
-        put("dof_M0", np.array(at.ball_qvel[3:]), current("body_inertia")[ball])
+        put("dof_M0", np.array(addresses.ball_qvel[:3]), current("body_mass")[ball])
+        put("dof_M0", np.array(addresses.ball_qvel[3:]), current("body_inertia")[ball])
     if p.contact_stiffness is not None or p.contact_damping is not None:
         stiffness, damping = direct_solref(m)
         pair = _contact_pair(m)
@@ -187,10 +187,10 @@ def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
 
 def _contact_pair(mj_model: mujoco.MjModel) -> int:
     """Index of the pair of the ball and the paddle."""
-    at = find_addresses(mj_model)
+    addresses = find_addresses(mj_model)
     for pair in range(mj_model.npair):
         geoms = {int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair])}
-        if geoms == {at.ball_geom, at.paddle_geom}:
+        if geoms == {addresses.ball_geom, addresses.paddle_geom}:
             return pair
     raise UserError(
         "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness and "

@@ -1,4 +1,4 @@
-"""The simulated robot: the MJCF file, the names it must have, and where their data lie."""
+"""The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
 import os
@@ -36,7 +36,7 @@ _DERIVED_FIELDS = frozenset(
 
 
 class Addresses(NamedTuple):
-    """Where the named parts lie in the model's arrays."""
+    """Indices of the named parts in the model's arrays."""
 
     arm_joints: tuple[int, ...]
     """Ids of Joint1..Joint6."""
@@ -61,12 +61,12 @@ def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> muj
     Args:
       mjcf: the file; None for the project's own robot.
       physics_dt: physics time step, s.
-      visual: False leaves out textures and geoms that are only there for pictures, which take most
-        of a model's memory.
+      visual: False drops the textures and geoms that only pictures need; they take most of a
+        model's memory.
 
     Raises:
-      UserError: the file is missing, is no MJCF, lacks a name that the task needs, drives a joint
-        by something else than a position servo, or has a number that cannot be simulated.
+      UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
+        without a position servo, or has a number that cannot be simulated.
     """
     path = mjcf or resource_path("mjcf/bounce_ball.xml")
     if not os.path.isfile(path):
@@ -77,7 +77,7 @@ def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> muj
         mj_model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); mend it") from error
+        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
     try:
         _check_numbers(mj_model)
         _check_servos(mj_model, find_addresses(mj_model))
@@ -94,7 +94,7 @@ def _check_numbers(mj_model: mujoco.MjModel) -> None:
         raise UserError(f"the timestep {step}; give a positive number of seconds")
     fields = [(mj_model, name) for name in _physical_fields(mj_model)]
     fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
-    # A derived number is not finite because of one in the file, which the message must name.
+    # Derived numbers come last: the message must name the number in the file.
     for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
         values = np.asarray(getattr(owner, name))
         if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
@@ -102,14 +102,14 @@ def _check_numbers(mj_model: mujoco.MjModel) -> None:
             raise UserError(f"the number {value} in {name}; give finite numbers")
 
 
-def _check_servos(mj_model: mujoco.MjModel, at: Addresses) -> None:
+def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Refuses actuators whose control is not the position that they drive their joint to."""
     plain_or_filtered = (
         mujoco.mjtDyn.mjDYN_NONE,
         mujoco.mjtDyn.mjDYN_FILTER,
         mujoco.mjtDyn.mjDYN_FILTEREXACT,
     )
-    for name, actuator in zip(JOINT_NAMES, at.actuators, strict=True):
+    for name, actuator in zip(JOINT_NAMES, addresses.actuators, strict=True):
         is_position_servo = (
             mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
             and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -183,8 +183,7 @@ def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> 
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
-    """A hash of the numbers that a simulation depends on; pictures' colours and markers are not
-    among them."""
+    """A hash of the numbers that a simulation depends on; colours and markers do not enter it."""
     digest = hashlib.blake2b()
     for owner, names in (
         (mj_model, _physical_fields(mj_model)),
@@ -196,15 +195,15 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
 
 
 def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
-    """Checks that a model still is the one whose `fingerprint` is given.
+    """Checks a model against its `fingerprint` from before.
 
     Raises:
-      UserError: the model was edited, which no engine that was built from it would notice.
+      UserError: the model was edited, and the engines built from it would ignore the edit.
     """
     if fingerprint(mj_model) != built_from:
         raise UserError(
-            "env.mj_model was edited after the environment had been built, which does not reach "
-            "its physics; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
+            "env.mj_model was edited after the environment had been built, and the physics would "
+            "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
         )
 
 
@@ -215,7 +214,7 @@ def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
-    """The ball's geom that the contact pair names, or else its first one."""
+    """The ball's geom in the contact pair; without a pair, its first geom."""
     of_ball = {
         int(geom)
         for pair in range(mj_model.npair)

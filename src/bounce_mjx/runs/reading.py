@@ -9,7 +9,6 @@ import os
 from typing import Any
 
 import jax
-import numpy as np
 import pydantic
 import tensorstore
 
@@ -52,8 +51,7 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
         return Policy(init_normalizer(OBSERVATION.size), params)
 
     read_record(checkpoint)
-    # A policy acts in single and in double precision, whichever it was trained in.
-    return _read_arrays(checkpoint, "policy", jax.eval_shape(initial_policy), "same_kind")
+    return _read_arrays(checkpoint, "policy", jax.eval_shape(initial_policy))
 
 
 def load_training_state(
@@ -70,7 +68,7 @@ def load_training_state(
             "policy; give a run that bounce-mjx train made"
         )
     record = read_record(checkpoint)
-    return _read_arrays(checkpoint, "training", template, "no"), record.progress
+    return _read_arrays(checkpoint, "training", template), record.progress
 
 
 def read_record(checkpoint: Checkpoint) -> Record:
@@ -93,12 +91,9 @@ def read_record(checkpoint: Checkpoint) -> Record:
     return record
 
 
-def _read_arrays(checkpoint: Checkpoint, item: str, template: Any, casting: str) -> Any:
-    """An item of a checkpoint in the structure of `template`.
-
-    Args:
-      casting: how the stored types may differ from the template's (see `numpy.can_cast`).
-    """
+def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
+    """An item of a checkpoint in the structure of `template`, whose arrays have exactly its shapes
+    and types."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     wanted = {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in leaves}
     # Not read by orbax, whose readers print tracebacks from their threads where a file is damaged.
@@ -117,7 +112,7 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any, casting: str)
         }
         stored = {name: array.result() for name, array in opening.items()}
         for name, array in stored.items():
-            _check_array(name, array, wanted[name], casting)
+            _check_array(name, array, wanted[name])
         reading = [array.read() for array in stored.values()]
         arrays = [array.result() for array in reading]
     # A damaged file raises many types; all of them mean the same here.
@@ -129,13 +124,10 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any, casting: str)
     return jax.tree_util.tree_unflatten(tree, typed)
 
 
-def _check_array(
-    name: str, array: tensorstore.TensorStore, wanted: jax.ShapeDtypeStruct, casting: str
-) -> None:
+def _check_array(name: str, array: tensorstore.TensorStore, wanted: jax.ShapeDtypeStruct) -> None:
     """ValueError for an array of another kind, or one that takes more memory than its size."""
     has, needs = (f"{x.dtype.name}{list(x.shape)}" for x in (array, wanted))
-    same_type = np.can_cast(array.dtype.numpy_dtype, wanted.dtype, casting)
-    if array.shape != wanted.shape or not same_type:
+    if has != needs:
         raise ValueError(f"its {name} is {has} where {needs} is needed")
     # The memory of a chunk is taken before its bytes are looked at.
     chunk = array.chunk_layout.read_chunk.shape or ()

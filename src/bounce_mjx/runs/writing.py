@@ -2,6 +2,7 @@
 killed leaves the checkpoint before."""
 
 import concurrent.futures
+import logging
 import os
 import re
 import shutil
@@ -155,6 +156,8 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
         ocp.PyTreeCheckpointHandler(multiprocessing_options=only_here),
         multiprocessing_options=only_here,
     )
+    # It warns of the folder below, once a save.
+    logging.getLogger("absl").setLevel(logging.ERROR)
     for name, tree in items.items():
         leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
         # Named like the leaves of the template that reads them.
@@ -164,6 +167,10 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
         nested = traverse_util.unflatten_dict(arrays, sep=".")
         path = os.path.abspath(folder / name)
         checkpointer.save(path, args=ocp.args.PyTreeSave(nested))
+        # orbax looks for its own files by a pattern, and finds none in a path with brackets.
+        if not Path(path, "manifest.ocdbt").exists():
+            for file in Path(path, f"ocdbt.process_{jax.process_index()}").iterdir():
+                file.rename(Path(path, file.name))
 
 
 def _remove_leftovers(folder: Path) -> None:

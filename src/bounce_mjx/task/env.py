@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Engine, PhysicsParameters, PhysicsState, make_engine
 from bounce_mjx.robot.model import (
     JOINT_NAMES,
@@ -106,6 +107,18 @@ class BounceBall:
     def unwrapped(self) -> "BounceBall":
         """The environment itself, as there is no wrapper around it."""
         return self
+
+    @property
+    def sys(self) -> None:
+        """brax's system, which its domain randomisation edits; there is none here.
+
+        Raises:
+          UserError: always.
+        """
+        raise UserError(
+            "brax's randomization_fn changes brax's own physics, which this environment does not "
+            "use, so it would have no effect; give BounceBall a function randomize instead"
+        )
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""

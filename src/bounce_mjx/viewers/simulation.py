@@ -103,8 +103,8 @@ class Simulation:
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
     """A recording [T, N, ...] at another rate.
 
-    Positions are interpolated in time, but not across a reset; the other values are those of the
-    last control step.
+    Positions are interpolated in time, but not across a reset; other values come from the last
+    control step.
 
     Args:
       dt: time between the frames of the recording, s.

@@ -91,7 +91,7 @@ def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
 def bias_force(
     links: Sequence[Link], pose: Pose, v: Sequence[Scalar], gravity: Vec3
 ) -> list[Scalar]:
-    """Joint torques (N m) that gravity, Coriolis and centrifugal effects ask for at zero joint
+    """Joint torques (N m) that balance gravity, Coriolis and centrifugal effects at zero joint
     acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
     omega, alpha, acceleration = ZERO3, ZERO3, scale(gravity, -1.0)
     forces, moments = [], []
@@ -156,8 +156,8 @@ def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Ve
 
 
 def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
-    """Lower Cholesky factor of a symmetric positive definite matrix; its diagonal comes as its
-    reciprocal, in the second value."""
+    """Lower Cholesky factor of a symmetric positive definite matrix, and the reciprocals of its
+    diagonal."""
     n = len(matrix)
     lower: SquareMatrix = [[0.0] * n for _ in range(n)]
     inverse_diagonal = []
@@ -199,7 +199,8 @@ def solve_upper(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar
 
 
 def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
-    """A force and its moment about the link's origin, seen in the parent's frame about its own."""
+    """A force and its moment about the link's origin, both transformed to the parent's frame; the
+    resulting moment is about the parent's origin."""
     force = matvec(rotation, force)
     return force, vadd(matvec(rotation, moment), cross(link.offset, force))
 

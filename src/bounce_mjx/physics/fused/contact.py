@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.fused.scalars import Mat3, Scalar, Vec3, dot, matvec, transpose, vsub
 
-# MuJoCo's mjMINVAL: a centre closer to the box than this counts as inside it.
+# MuJoCo's mjMINVAL: a centre closer to the box counts as inside it.
 _MIN_DISTANCE = 1e-15
 
 
@@ -33,7 +33,7 @@ class ContactModel:
     paddle_inverse_weight: float
     """Translational inverse inertia of the paddle's body at the reference pose, 1/kg."""
     ball_inverse_weight: Scalar
-    """That of the ball, 1/kg."""
+    """Translational inverse inertia of the ball, 1/kg."""
 
 
 class Contact(NamedTuple):
@@ -94,7 +94,7 @@ def normal_force(
 
     Args:
       normal_velocity: velocity of the sphere relative to the box along the normal, m/s.
-      free_acceleration: the same acceleration without the contact, m/s^2.
+      free_acceleration: acceleration along the normal without the contact, m/s^2.
       inverse_inertia: J M^-1 J^T of the contact, 1/kg.
     """
     d = impedance(model, contact.distance)

@@ -21,7 +21,7 @@ from bounce_mjx.physics.state import PhysicsState
 
 
 class Motion(NamedTuple):
-    """What a substep changes, one scalar a coordinate."""
+    """The coordinates that a substep changes, one scalar each."""
 
     q: tuple[Scalar, ...]
     v: tuple[Scalar, ...]
@@ -39,34 +39,36 @@ def step(
     """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu].
 
     The parameters that are given enter the program as inputs; the others fold as constants. The
-    coordinates go through the loop as scalars. The ball's spin is constant, as the only
-    contact is frictionless and goes through its centre; so its orientation turns once, by the
-    angle of the whole interval.
+    coordinates go through the loop as scalars. The ball's spin is constant, because the
+    only contact is frictionless and its force goes through the centre; so the orientation turns
+    once, by the angle of the whole interval.
     """
-    at = model.addresses
+    addresses = model.addresses
     motion = Motion(
-        q=tuple(state.qpos[i] for i in at.arm_qpos),
-        v=tuple(state.qvel[i] for i in at.arm_qvel),
-        ball_position=tuple(state.qpos[i] for i in at.ball_qpos[:3]),
-        ball_velocity=tuple(state.qvel[i] for i in at.ball_qvel[:3]),
+        q=tuple(state.qpos[i] for i in addresses.arm_qpos),
+        v=tuple(state.qvel[i] for i in addresses.arm_qvel),
+        ball_position=tuple(state.qpos[i] for i in addresses.ball_qpos[:3]),
+        ball_velocity=tuple(state.qvel[i] for i in addresses.ball_qvel[:3]),
     )
     leaves, tree = jax.tree.flatten(motion)
     numbers, given = jax.tree.flatten(as_scalars(parameters, state.qpos.dtype))
     advance = elementwise(_substeps(model, given, num_substeps), num_results=len(leaves))
-    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in at.actuators), *numbers))
+    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in addresses.actuators), *numbers))
     quaternion = turn(
-        tuple(state.qpos[i] for i in at.ball_qpos[3:]),
-        tuple(state.qvel[i] for i in at.ball_qvel[3:]),
+        tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
+        tuple(state.qvel[i] for i in addresses.ball_qvel[3:]),
         num_substeps * model.dt,
     )
 
     qpos = [state.qpos[i] for i in range(model.nq)]
     qvel = [state.qvel[i] for i in range(model.nv)]
     positions = (*motion.q, *motion.ball_position, *quaternion)
-    for i, value in zip(at.arm_qpos + at.ball_qpos, positions, strict=True):
+    for i, value in zip(addresses.arm_qpos + addresses.ball_qpos, positions, strict=True):
         qpos[i] = value
     for i, value in zip(
-        at.arm_qvel + at.ball_qvel[:3], (*motion.v, *motion.ball_velocity), strict=True
+        addresses.arm_qvel + addresses.ball_qvel[:3],
+        (*motion.v, *motion.ball_velocity),
+        strict=True,
     ):
         qvel[i] = value
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
@@ -95,8 +97,8 @@ def as_scalars(parameters: PhysicsParameters, dtype: jnp.dtype) -> PhysicsParame
 def _substeps(
     model: FusedModel, given: jax.tree_util.PyTreeDef, num_substeps: int
 ) -> Callable[..., tuple[Scalar, ...]]:
-    """Physics steps as a function of scalars: those of a `Motion`, the servo targets, and those of
-    the `given` structure of parameters.
+    """Physics steps as a function of scalars: a flat `Motion`, the servo targets, and the flat
+    parameters of the structure `given`.
 
     The cache and the inline jit let JAX trace this long function once for all the programs that
     have it; each trace takes some tenths of a second.

@@ -57,18 +57,18 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
       UnsupportedModelError: the model has a feature outside the fused engine's kind; the text
         names it.
     """
-    at = find_addresses(mj_model)
-    check_supported(mj_model, at)
+    addresses = find_addresses(mj_model)
+    check_supported(mj_model, addresses)
     return FusedModel(
         dt=float(mj_model.opt.timestep),
         gravity=_floats(mj_model.opt.gravity),
-        links=tuple(_read_link(mj_model, joint) for joint in at.arm_joints),
-        servos=tuple(_read_servo(mj_model, actuator) for actuator in at.actuators),
-        paddle_origin=_floats(mj_model.geom_pos[at.paddle_geom]),
-        paddle_rotation=_rotation(mj_model.geom_quat[at.paddle_geom]),
-        ball_mass=float(mj_model.body_mass[at.ball_body]),
-        contact=_read_contact(mj_model, at),
-        addresses=at,
+        links=tuple(_read_link(mj_model, joint) for joint in addresses.arm_joints),
+        servos=tuple(_read_servo(mj_model, actuator) for actuator in addresses.actuators),
+        paddle_origin=_floats(mj_model.geom_pos[addresses.paddle_geom]),
+        paddle_rotation=_rotation(mj_model.geom_quat[addresses.paddle_geom]),
+        ball_mass=float(mj_model.body_mass[addresses.ball_body]),
+        contact=_read_contact(mj_model, addresses),
+        addresses=addresses,
         nq=mj_model.nq,
         nv=mj_model.nv,
     )
@@ -191,7 +191,7 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
     )
 
 
-def _read_contact(mj_model: mujoco.MjModel, at: Addresses) -> ContactModel:
+def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactModel:
     solref, solimp = mj_model.pair_solref[0], mj_model.pair_solimp[0]
     # The limits that MuJoCo's engine puts on solimp (mjMINIMP, mjMAXIMP).
     dmin, dmax, midpoint = np.clip(solimp[[0, 1, 3]], 1e-4, 1.0 - 1e-4)
@@ -203,11 +203,11 @@ def _read_contact(mj_model: mujoco.MjModel, at: Addresses) -> ContactModel:
     else:
         stiffness, damping = -solref[0] / dmax**2, -solref[1] / dmax
     power = max(1.0, float(solimp[4]))
-    paddle_body = mj_model.geom_bodyid[at.paddle_geom]
+    paddle_body = mj_model.geom_bodyid[addresses.paddle_geom]
     weights = mj_model.body_invweight0
     return ContactModel(
-        radius=float(mj_model.geom_size[at.ball_geom, 0]),
-        half_size=_floats(mj_model.geom_size[at.paddle_geom]),
+        radius=float(mj_model.geom_size[addresses.ball_geom, 0]),
+        half_size=_floats(mj_model.geom_size[addresses.paddle_geom]),
         stiffness=float(stiffness),
         damping=float(damping),
         solimp=(
@@ -218,5 +218,5 @@ def _read_contact(mj_model: mujoco.MjModel, at: Addresses) -> ContactModel:
             int(power) if power.is_integer() else power,
         ),
         paddle_inverse_weight=float(weights[paddle_body, 0]),
-        ball_inverse_weight=float(weights[at.ball_body, 0]),
+        ball_inverse_weight=float(weights[addresses.ball_body, 0]),
     )

@@ -1,9 +1,9 @@
 """Three-dimensional algebra on scalars, folded at trace time.
 
-A scalar is a Python float (known while tracing) or a JAX array (known when running). The products
-with 0 and 1 that a robot's fixed rotations bring vanish here, so that what XLA gets is
-straight-line arithmetic without them. The operations are those of `jax.lax`, which take a fraction
-of the time of `jax.numpy`'s to trace, and a physics step has thousands.
+A scalar is a Python float (known while tracing) or a JAX array (known when running). Products with
+the 0 and 1 of a robot's fixed rotations vanish here, so that XLA gets straight-line arithmetic
+without them. A physics step has thousands of operations: `jax.lax` traces them in a fraction of the
+time of `jax.numpy`.
 """
 
 import math
@@ -153,11 +153,11 @@ def quaternion_matrix(quaternion: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat3
     )
 
 
-# Half of pi in three parts, of which the first two have so few digits that their products with a
+# Half of pi as a sum of three parts. The first two have few digits, so that their products with a
 # small whole number are exact.
 _HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-# Minimax polynomials for an angle x in [-pi/4, pi/4]: sine / x - 1 and cosine - 1 + x^2 / 2, in
-# powers of x^2 from the first and from the second.
+# Minimax polynomials for an angle x in [-pi/4, pi/4], in powers of x^2: sine / x - 1 starts at the
+# first power, cosine - 1 + x^2 / 2 at the second.
 _SINE = (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4)
 _COSINE = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 
@@ -165,9 +165,9 @@ _COSINE = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine of an angle (rad).
 
-    In float32 by the method of sinf and cosf in Moshier's Cephes library: to 1e-7 up to 1000 rad.
-    XLA calls a function for each element on a processor and takes a slow path for large angles
-    on a GPU; of the physics step that was two thirds of the time.
+    In float32 by the method of sinf and cosf in Moshier's Cephes library: accurate to 1e-7 up to
+    1000 rad. XLA's own ones call a function for each element on a CPU and take a slow path for
+    large angles on a GPU, which was two thirds of the time of a physics step.
     """
     if angle.dtype != jnp.float32:
         return jnp.sin(angle), jnp.cos(angle)
@@ -181,13 +181,13 @@ def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     quadrant = lax.convert_element_type(quarters, jnp.int32)
     odd = lax.ne(lax.bitwise_and(quadrant, 1), 0)
     sine, cosine = lax.select(odd, cosine, sine), lax.select(odd, sine, cosine)
-    lower = lax.ne(lax.bitwise_and(quadrant, 2), 0)
-    left = lax.ne(lax.bitwise_and(lax.add(quadrant, 1), 2), 0)
-    return lax.select(lower, neg(sine), sine), lax.select(left, neg(cosine), cosine)
+    lower_half = lax.ne(lax.bitwise_and(quadrant, 2), 0)
+    left_half = lax.ne(lax.bitwise_and(lax.add(quadrant, 1), 2), 0)
+    return lax.select(lower_half, neg(sine), sine), lax.select(left_half, neg(cosine), cosine)
 
 
 def polynomial(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
-    """Value at x of the polynomial with these coefficients, from that of x^0 on (Horner)."""
+    """Value at x of the polynomial with these coefficients, lowest power first (Horner)."""
     value: Scalar = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         value = add(coefficient, mul(x, value))

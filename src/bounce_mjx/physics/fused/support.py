@@ -19,15 +19,15 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
     return None
 
 
-def check_supported(mj_model: mujoco.MjModel, at: Addresses) -> None:
+def check_supported(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Checks that the fused engine computes every feature of a model.
 
     Raises:
       UnsupportedModelError: it does not; the text names the feature.
     """
     _check_options(mj_model)
-    _check_bodies(mj_model, at)
-    _check_constraints(mj_model, at)
+    _check_bodies(mj_model, addresses)
+    _check_constraints(mj_model, addresses)
     _check_actuators(mj_model)
 
 
@@ -42,7 +42,7 @@ _HARMLESS_DISABLED = frozenset(
     "autoreset nativeccd island multiccd".split()
 )
 _HARMLESS_ENABLED = frozenset(("energy", "fwdinv", "invdiscrete"))
-# MuJoCo's mjMINVAL: an impedance of no greater width is the mean of dmin and dmax.
+# MuJoCo's mjMINVAL: without a greater width, the impedance is the mean of dmin and dmax.
 _MIN_WIDTH = 1e-15
 
 
@@ -72,21 +72,29 @@ def _flags(bits: int, kind: type) -> set[str]:
     }
 
 
-def _check_bodies(m: mujoco.MjModel, at: Addresses) -> None:
-    bodies = [int(m.jnt_bodyid[joint]) for joint in at.arm_joints]
-    _require(m.njnt == len(at.arm_joints) + 1, "joints other than Joint1..Joint6 and the ball's")
+def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
+    bodies = [int(m.jnt_bodyid[joint]) for joint in addresses.arm_joints]
+    _require(
+        m.njnt == len(addresses.arm_joints) + 1, "joints other than Joint1..Joint6 and the ball's"
+    )
     _require(m.nbody == len(bodies) + 2, "bodies other than the six links and the ball")
     hinge = mujoco.mjtJoint.mjJNT_HINGE
-    _require(all(m.jnt_type[j] == hinge for j in at.arm_joints), "arm joints that are not hinges")
-    _require(not np.any(m.jnt_pos[at.arm_joints,]), "a joint away from its body's origin (pos)")
+    _require(
+        all(m.jnt_type[j] == hinge for j in addresses.arm_joints), "arm joints that are not hinges"
+    )
+    _require(
+        not np.any(m.jnt_pos[addresses.arm_joints,]), "a joint away from its body's origin (pos)"
+    )
     parents = [0, *bodies[:-1]]
     _require(
         all(m.body_parentid[b] == p for b, p in zip(bodies, parents, strict=True)),
         "an arm that is not one serial chain of Joint1..Joint6",
     )
-    _require(m.geom_bodyid[at.paddle_geom] == bodies[-1], "a paddle that is not on the last link")
+    _require(
+        m.geom_bodyid[addresses.paddle_geom] == bodies[-1], "a paddle that is not on the last link"
+    )
     box = mujoco.mjtGeom.mjGEOM_BOX
-    _require(m.geom_type[at.paddle_geom] == box, "a paddle that is not a box")
+    _require(m.geom_type[addresses.paddle_geom] == box, "a paddle that is not a box")
     _require(not np.any(m.body_gravcomp), "gravity compensation (gravcomp)")
     nonlinear = np.any(m.jnt_stiffnesspoly)
     _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
@@ -94,26 +102,29 @@ def _check_bodies(m: mujoco.MjModel, at: Addresses) -> None:
     _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
     _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
-    inertia = m.body_inertia[at.ball_body]
+    inertia = m.body_inertia[addresses.ball_body]
     plain_ball = (
-        m.geom_type[at.ball_geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+        m.geom_type[addresses.ball_geom] == mujoco.mjtGeom.mjGEOM_SPHERE
         and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
-        and not np.any(m.body_ipos[at.ball_body])
-        and not np.any(m.geom_pos[at.ball_geom])
-        and not np.any(m.dof_damping.reshape(m.nv, -1)[at.ball_qvel,])
-        and not np.any(m.dof_armature[at.ball_qvel,])
+        and not np.any(m.body_ipos[addresses.ball_body])
+        and not np.any(m.geom_pos[addresses.ball_geom])
+        and not np.any(m.dof_damping.reshape(m.nv, -1)[addresses.ball_qvel,])
+        and not np.any(m.dof_armature[addresses.ball_qvel,])
     )
     _require(plain_ball, "a ball that is not one undamped homogeneous sphere")
 
 
-def _check_constraints(m: mujoco.MjModel, at: Addresses) -> None:
+def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
     _require(m.neq == 0, "equality constraints")
     _require(m.ntendon == 0, "tendons")
     colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
     _require(not np.any(colliding), "contacts by contype and conaffinity (only the one pair)")
     _require(m.npair == 1, "other than one contact pair")
     pair = {int(m.pair_geom1[0]), int(m.pair_geom2[0])}
-    _require(pair == {at.paddle_geom, at.ball_geom}, "a pair other than of the ball and the paddle")
+    _require(
+        pair == {addresses.paddle_geom, addresses.ball_geom},
+        "a pair other than of the ball and the paddle",
+    )
     _require(m.pair_dim[0] == 1, f"a pair with friction (condim {m.pair_dim[0]}; only condim 1)")
     _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(m.pair_adhesion[0] == 0.0, "adhesion")
