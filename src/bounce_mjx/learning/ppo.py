@@ -15,7 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.gpu import has_kernels
+from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.learning import minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig

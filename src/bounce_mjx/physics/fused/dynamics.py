@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
-from bounce_mjx.physics.fused.kernel import elementwise
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
 from bounce_mjx.physics.parameters import PhysicsParameters

@@ -9,17 +9,22 @@ than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.custom_partitioning import custom_partitioning
 
-from bounce_mjx.gpu import has_kernels
+from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
 ElementwiseFunction = Callable[..., Arrays]
+Tree = Any
 
 # Environments in a block: the 128 threads of a warpgroup, with which Mosaic GPU computes.
 _BLOCK = 128
@@ -61,6 +66,84 @@ def elementwise(
         return (call if float32 and (interpret or has_kernels()) else function)(*args)
 
     return chosen
+
+
+def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Callable[..., Tree]:
+    """The same function of pytrees of small arrays, with one GPU kernel for its batches.
+
+    Where a batch of it, made by `jax.vmap`, runs on a GPU, a thread computes one element. The
+    function stays as it is where there are no kernels, for float64, and where it does what has no
+    form for scalars (`scalars.as_scalars`).
+
+    Args:
+      interpret: runs the kernel in Pallas' interpreter on any device, for tests.
+    """
+
+    def wrapped(*args: Tree) -> Tree:
+        leaves, tree = jax.tree.flatten(args)
+        types = {x.dtype for x in leaves}
+        if not (interpret or has_kernels()) or not types <= _KERNEL_TYPES:
+            return function(*args)
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+        result_tree = []
+
+        def flat_function(*leaves: jax.Array) -> list[jax.Array]:
+            results, structure = jax.tree.flatten(function(*tree.unflatten(leaves)))
+            result_tree.append(structure)
+            return results
+
+        try:
+            scalar_function = as_scalars(flat_function, shapes)
+        except UnsupportedOperation:
+            return function(*args)
+        if not set(scalar_function.dtypes) <= _KERNEL_TYPES:
+            return function(*args)
+
+        scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
+        used = list(itertools.compress(scalars, scalar_function.used))
+
+        def on_floats(*floats: jax.Array) -> Arrays:
+            given = iter(floats)
+            every = [
+                _from_float(next(given), x.dtype) if needed else np.zeros((), x.dtype)
+                for x, needed in zip(scalars, scalar_function.used, strict=True)
+            ]
+            results = scalar_function.call(*every)
+            shape = floats[0].shape
+            return tuple(jnp.broadcast_to(_to_float(x), shape) for x in results)
+
+        num_results = len(scalar_function.dtypes)
+        floats = elementwise(on_floats, num_results, interpret)(*map(_to_float, used))
+        results = [
+            _from_float(x, dtype) for x, dtype in zip(floats, scalar_function.dtypes, strict=True)
+        ]
+        arrays = [
+            jnp.stack([results[i] for i in positions.flat]).reshape(positions.shape)
+            if positions.ndim
+            else results[int(positions)]
+            for positions in scalar_function.positions
+        ]
+        return result_tree[-1].unflatten(arrays)
+
+    return wrapped
+
+
+_KERNEL_TYPES = {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32), jnp.dtype(jnp.bool_)}
+
+
+def _to_float(x: jax.Array) -> jax.Array:
+    """A number of a kernel's type as float32; an integer keeps its bits."""
+    x = jnp.asarray(x)
+    if x.dtype == jnp.int32:
+        return jax.lax.bitcast_convert_type(x, jnp.float32)
+    return x.astype(jnp.float32)
+
+
+def _from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """The inverse of `_to_float`."""
+    if dtype == jnp.int32:
+        return jax.lax.bitcast_convert_type(x, jnp.int32)
+    return x > 0.5 if dtype == jnp.bool_ else x
 
 
 def in_kernel(
