@@ -167,13 +167,15 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
         return [_each(_REWRITTEN[name], *_same_rank(args))]
     if name in _REDUCTIONS:
         return [_reduce(_REDUCTIONS[name], args[0], params["axes"])]
+    if name == "unstack":
+        return [np.asarray(x, object) for x in np.moveaxis(args[0], params["axis"], 0)]
     if name in _SHAPES:
         return [_SHAPES[name](*args, **params)]
     if name in _CALLS and _CALLS[name] in params:
         inner = params[_CALLS[name]]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         return _evaluate(closed.jaxpr, [_constant(c) for c in closed.consts], args)
-    if name == "scan" and params["length"] is not None:
+    if name == "scan":
         return _scan(equation, args)
     raise UnsupportedOperation(name)
 
@@ -195,12 +197,12 @@ def _reduce(operation: Callable[..., Scalar], array: Scalars, axes: Sequence[int
 
 def _scan(equation, args: list[Scalars]) -> list[Scalars]:
     """A loop whose carry is scalars and which neither reads nor writes arrays step by step."""
-    params = equation.params
-    num_consts, num_carry = params["num_consts"], params["num_carry"]
-    if len(args) != num_consts + num_carry or len(equation.outvars) != num_carry:
+    inner, num_carry = equation.params["jaxpr"], len(equation.outvars)
+    outside = [v.aval.shape for v in (*equation.invars, *equation.outvars)]
+    if outside != [a.shape for a in (*inner.in_avals, *inner.out_avals)]:
         raise UnsupportedOperation("scan over arrays")
+    num_consts = len(args) - num_carry
     consts, carry = args[:num_consts], args[num_consts:]
-    inner = params["jaxpr"]
     flat = [x for a in carry for x in a.flat]
     shape = np.broadcast_shapes(*(jnp.shape(x) for x in flat))
 
@@ -211,7 +213,7 @@ def _scan(equation, args: list[Scalars]) -> list[Scalars]:
         return tuple(jnp.broadcast_to(x, shape) for out in outs for x in out.flat)
 
     start = tuple(jnp.broadcast_to(x, shape) for x in flat)
-    end = iter(lax.fori_loop(0, params["length"], body, start))
+    end = iter(lax.fori_loop(0, equation.params["length"], body, start))
     return [_filled(a.shape, end) for a in carry]
 
 
@@ -269,6 +271,7 @@ _SHAPES: dict[str, Callable[..., Scalars]] = {
     "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
     "rev": lambda x, *, dimensions, **_: np.flip(x, dimensions),
     "slice": _slice,
+    "stack": lambda *xs, axis: np.stack(xs, axis),
     "squeeze": lambda x, *, dimensions, **_: x.squeeze(tuple(dimensions)),
     "transpose": lambda x, *, permutation, **_: x.transpose(permutation),
 }
