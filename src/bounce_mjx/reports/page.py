@@ -92,10 +92,11 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
         [
             f"{e['steps']:,}",
             *[figure_text(e[name]) for name in names],
-            "pass" if e["passed"] else "-",
+            "pass" if e["passed"] else "screening" if e.get("screening") else "-",
         ]
         for e in results["evaluations"]
     ]
+    resets = ", on resets that no evaluation before had seen" if results["fresh_resets"] else ""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -109,7 +110,7 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
 {html.escape(results["device"])}. The best of {len(evaluations)} evaluations, after
 {results["best_steps"]:,} of {results["trained_steps"]:,} environment steps:
-{html.escape(details_line(report))}.</p>
+{html.escape(details_line(report))}{resets}.</p>
 {_results(report)}
 {pictures}
 <h2>Where the time went</h2>
