@@ -180,6 +180,7 @@ def test_brax_sac_trains_and_evaluates(env):
     assert action.shape == (6,) and all_finite((action, trained))
 
 
+@pytest.mark.slow
 def test_brax_apg_learns(env):
     """Gradients through the physics and the reward raise the return."""
     (_, trained, _), history = train(
@@ -196,7 +197,6 @@ def test_brax_apg_learns(env):
     assert all_finite(trained)
     first, last = (metrics["eval/episode_reward"] for metrics in history)
     assert_evaluated(history[-1])
-    print(first, last)
     assert last > first
 
 

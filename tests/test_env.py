@@ -665,5 +665,4 @@ def test_gradient_through_steps_with_a_contact_equals_finite_differences():
         expected = (8.0 * near - far) / (12.0 * step)
         actual = jnp.vdot(gradient, direction)
     assert np.isfinite(gradient).all() and (np.abs(gradient) > 0.0).all()
-    print(actual, expected, abs(actual / expected - 1))
     np.testing.assert_allclose(actual, expected, rtol=1e-6)

@@ -1,6 +1,7 @@
 """A run so small that a test can make one, and a process that makes one."""
 
 import contextlib
+import functools
 import os
 import subprocess
 import sys
@@ -11,7 +12,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import traverse_util
 
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.folders import Checkpoint
@@ -31,7 +31,9 @@ def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     check_integrity(checkpoint.folder)
     with ocp.StandardCheckpointer() as checkpointer:
         tree = checkpointer.restore((checkpoint.folder / "training").absolute())
-    return jax.tree.map(np.asarray, traverse_util.flatten_dict(tree, sep="."))
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    name = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {name(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:
