@@ -1,7 +1,7 @@
 """The fused engine's step, unrolled into scalar arithmetic while tracing.
 
 Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physics step into a few
-loops; on a GPU all physics steps of a control step are one kernel (`kernel.py`).
+loops; on a GPU all physics steps of a control step are one kernel (`gpu/elementwise.py`).
 """
 
 import functools
