@@ -162,7 +162,6 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
         leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
         # Named like the leaves of the template that reads them.
         names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
-        # Counters in brax's states turn their numpy array into JAX's as they are built.
         arrays = {key: np.asarray(leaf) for key, (_, leaf) in zip(names, leaves, strict=True)}
         nested = traverse_util.unflatten_dict(arrays, sep=".")
         path = os.path.abspath(folder / name)
