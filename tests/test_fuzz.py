@@ -251,7 +251,7 @@ def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
         lambda: parse(
             eval_command.EvalCommand,
             args,
-            prog="python -m bounce_mjx.eval",
+            prog="bounce-mjx eval",
             description="Measures.",
         ),
     )

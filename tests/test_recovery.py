@@ -137,7 +137,7 @@ def test_checkpoint_holds_all_that_training_goes_on_from(straight: Path) -> None
         "params.policy",
         "params.value",
         "optimizer",
-        "normalizer",
+        "statistics",
         "env.env",
         "env.clock",
     ):
@@ -173,11 +173,19 @@ def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight
     assert_same_training(run, straight)
 
 
-def test_replaced_checkpoint_counts_until_the_new_one_is_there(run: Path, straight: Path) -> None:
-    # As after a crash between the two renames.
+@pytest.mark.parametrize("moment", ["before the manifest", "before the renaming"])
+def test_a_checkpoint_counts_until_the_next_is_complete(
+    run: Path, straight: Path, moment: str
+) -> None:
+    # As after a crash while a checkpoint was replaced by another of the same steps.
     latest = latest_checkpoint(run).folder
-    latest.rename(latest.with_name(latest.name + ".replaced"))
-    (latest.with_name(latest.name + ".partial")).mkdir()
+    partial = latest.with_name(latest.name + ".partial")
+    shutil.copytree(latest, partial)
+    if moment == "before the manifest":
+        (partial / "manifest.json").unlink()
+    else:
+        latest.rename(latest.with_name(latest.name + ".discarded"))
+        assert latest_checkpoint(run).folder == partial
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
     assert [p.name for p in latest.parent.iterdir()] == [str(STEPS)]
@@ -448,6 +456,8 @@ def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:
     assert [e["screening"] for e in evaluations(run)] == [True, True]
     tags = EventAccumulator(str(run)).Reload().Tags()["scalars"]
     assert "screening/stable" in tags and "results/stable" not in tags
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert page.count(">screening</td>") == 2
     # The end reports all episodes.
     results = json.loads((run / "results.json").read_text())
     assert (results["screening"], results["details"]["episodes"]) == (False, 4)

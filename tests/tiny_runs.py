@@ -1,6 +1,7 @@
 """A run so small that a test can make one, and a process that makes one."""
 
 import contextlib
+import functools
 import os
 import subprocess
 import sys
@@ -11,7 +12,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import traverse_util
 
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.folders import Checkpoint
@@ -31,7 +31,9 @@ def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     check_integrity(checkpoint.folder)
     with ocp.StandardCheckpointer() as checkpointer:
         tree = checkpointer.restore((checkpoint.folder / "training").absolute())
-    return jax.tree.map(np.asarray, traverse_util.flatten_dict(tree, sep="."))
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    name = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {name(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:
@@ -42,11 +44,11 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 class Job:
     """A process of train_jax.py."""
 
-    def __init__(self, log: Path, args: list[str]):
+    def __init__(self, log: Path, args: list[str], program: list[str]):
         self._log = log
         with log.open("wb") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-u", str(TRAIN_SCRIPT), *args],
+                [sys.executable, "-u", *program, *args],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=os.environ | {"PYTHONUNBUFFERED": "1"},
@@ -71,9 +73,11 @@ class Job:
 
 
 @contextlib.contextmanager
-def job(log: Path, *args: object) -> Iterator[Job]:
-    """Starts `train_jax.py args`, and leaves no process behind."""
-    started = Job(log, [str(arg) for arg in args])
+def job(log: Path, *args: object, code: str | None = None) -> Iterator[Job]:
+    """Starts `train_jax.py args`, or Python code with these arguments, and leaves no process
+    behind."""
+    program = [str(TRAIN_SCRIPT)] if code is None else ["-c", code]
+    started = Job(log, [str(arg) for arg in args], program)
     try:
         yield started
     finally:

@@ -31,13 +31,12 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
-from bounce_mjx.runs.files import write_atomically
+from bounce_mjx.runs.files import MANIFEST_FILE, PARTIAL, write_atomically
 from bounce_mjx.runs.progress import load_results
 
 CheckpointName = Literal["latest", "best"]
 PRETRAINED = "pretrained"
 CHECKPOINTS = "checkpoints"
-REPLACED = ".replaced"
 
 
 class Checkpoint(NamedTuple):
@@ -127,8 +126,10 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
     """
     path = newest_run(log_dir) if path is None else path
     run, absolute = find_run(path), Path(os.path.abspath(path))
-    if absolute.parent.parent.name == CHECKPOINTS and _steps(absolute.name) is not None:
-        return Checkpoint(run, absolute, int(absolute.name))
+    if absolute.parent.parent.name == CHECKPOINTS:
+        for steps, folder in stored_checkpoints(absolute.parent).items():
+            if folder == absolute:
+                return Checkpoint(run, folder, steps)
     if absolute == Path(os.path.abspath(run)):
         run = _best_seed(run)
         absolute = Path(os.path.abspath(run))
@@ -179,17 +180,16 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
-    """The checkpoints in a folder by their steps; a partial one has another name."""
-    # A process killed while it replaces a checkpoint may leave only the replaced one: it counts
-    # unless its successor follows it in this order.
-    paths = sorted(folder.glob("*"), key=lambda path: not path.name.endswith(REPLACED))
-    found = {_steps(path.name.removesuffix(REPLACED)): path for path in paths if path.is_dir()}
-    return {steps: path for steps, path in found.items() if steps is not None}
-
-
-def _steps(name: str) -> int | None:
-    """The steps in the name of a checkpoint's folder; None for another name."""
-    return int(name) if name.isascii() and name.isdecimal() else None
+    """The checkpoints in a folder by their steps."""
+    found = {}
+    # In this order, a checkpoint under its own name takes precedence.
+    for path in sorted(folder.glob("*"), reverse=True):
+        name = path.name.removesuffix(PARTIAL)
+        # The manifest is written last: a process may be killed between that and the renaming.
+        complete = name == path.name or (path / MANIFEST_FILE).is_file()
+        if name.isascii() and name.isdecimal() and path.is_dir() and complete:
+            found[int(name)] = path
+    return found
 
 
 def _best_seed(run: Path) -> Path:

@@ -1,5 +1,5 @@
-"""Checkpoints are written under another name, brought to the disk, and renamed: a process that is
-killed leaves the checkpoint before."""
+"""Checkpoints are written under another name and brought to the disk, the manifest last; only then
+the older ones are removed. A process that is killed leaves one or the other whole."""
 
 import concurrent.futures
 import logging
@@ -12,13 +12,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax import traverse_util
 
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
-from bounce_mjx.runs.folders import CHECKPOINTS, REPLACED, CheckpointName, stored_checkpoints
+from bounce_mjx.runs.folders import CHECKPOINTS, CheckpointName, stored_checkpoints
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import RECORD_FILE
 
@@ -27,7 +26,7 @@ _DISCARDED = ".discarded"
 
 class CheckpointWriter:
     """Saves the latest and the best checkpoint of a run, each replacing the one before, and the
-    run's results, in a thread beside the training.
+    run's results, in a thread while the training goes on.
 
     What cannot be saved is kept until it can, or until something newer takes its place.
     """
@@ -100,40 +99,34 @@ class CheckpointWriter:
             folder = self._run / CHECKPOINTS / name / str(steps)
             _write_checkpoint(folder, items, record)
             del self._pending[name]
-            for other in stored_checkpoints(folder.parent).values():
-                if other != folder:
-                    # Renamed first, so that it is at no moment there in part.
-                    shutil.rmtree(other.rename(other.with_name(other.name + _DISCARDED)))
         if self._results is not None:
             write_atomically(self._run / RESULTS_FILE, self._results)
             self._results = None
 
 
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
-    """Writes a checkpoint, in place of the one that may be there.
+    """Writes a checkpoint in place of all others in its parent folder.
 
     Args:
       items: pytrees of numpy arrays by name.
       record: the text of run.json.
 
     Raises:
-      OSError: it could not be written; nothing of it is left, and the one before still is there.
+      OSError: it could not be written; nothing of it is left, and the others are as they were.
     """
     partial = folder.with_name(folder.name + PARTIAL)
-    replaced = folder.with_name(folder.name + REPLACED)
     _remove_leftovers(folder.parent)
+    others = stored_checkpoints(folder.parent).values()
     try:
         partial.mkdir(parents=True)
         _check_room(partial, sum(leaf.nbytes for leaf in jax.tree.leaves(items)))
         _save_arrays(partial, items)
         (partial / RECORD_FILE).write_text(record, encoding="utf-8")
-        seal(partial)
-        for path in (*partial.rglob("*"), partial):
+        for path in partial.rglob("*"):
             sync(path)
-        if folder.exists():
-            folder.rename(replaced)
-        partial.rename(folder)
-        sync(folder.parent)
+        seal(partial)
+        for path in (partial, folder.parent):
+            sync(path)
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
         # tensorstore reports a full disk as a ValueError.
@@ -141,11 +134,16 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
         if number is None:
             raise
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
-    shutil.rmtree(replaced, ignore_errors=True)
+    # From here on the checkpoint counts, so the others may go.
+    for other in others:
+        # Renamed first, so that it is at no moment there in part.
+        shutil.rmtree(other.rename(other.with_name(other.name + _DISCARDED)))
+    partial.rename(folder)
+    sync(folder.parent)
 
 
 def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
-    """Writes each item with orbax, on this host alone, as nested dictionaries of arrays."""
+    """Writes each item with orbax, on this host alone."""
     # It takes a third of a second to import, and only writing needs it.
     import orbax.checkpoint as ocp
 
@@ -159,26 +157,21 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
     # It warns of the folder below, once a save.
     logging.getLogger("absl").setLevel(logging.ERROR)
     for name, tree in items.items():
-        leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-        # Named like the leaves of the template that reads them.
-        names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
-        arrays = {key: np.asarray(leaf) for key, (_, leaf) in zip(names, leaves, strict=True)}
-        nested = traverse_util.unflatten_dict(arrays, sep=".")
-        path = os.path.abspath(folder / name)
-        checkpointer.save(path, args=ocp.args.PyTreeSave(nested))
+        path = Path(os.path.abspath(folder / name))
+        checkpointer.save(path, args=ocp.args.PyTreeSave(tree))
         # orbax looks for its own files by a pattern, and finds none in a path with brackets.
-        if not Path(path, "manifest.ocdbt").exists():
-            for file in Path(path, f"ocdbt.process_{jax.process_index()}").iterdir():
-                file.rename(Path(path, file.name))
+        if not (path / "manifest.ocdbt").exists():
+            for file in (path / f"ocdbt.process_{jax.process_index()}").iterdir():
+                file.rename(path / file.name)
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Removes the parts that a killed process left in a folder of checkpoints."""
-    for path in stored_checkpoints(folder).values():
-        if path.name.endswith(REPLACED):
-            path.rename(path.with_name(path.name.removesuffix(REPLACED)))
+    """Removes what a killed process left incomplete in a folder of checkpoints."""
+    complete = stored_checkpoints(folder).values()
     for path in folder.glob("*"):
-        if path.name.endswith((PARTIAL, REPLACED, _DISCARDED)):
+        if path.name.endswith(PARTIAL) and path in complete:
+            path.rename(path.with_name(path.name.removesuffix(PARTIAL)))
+        elif path.name.endswith((PARTIAL, _DISCARDED)):
             shutil.rmtree(path, ignore_errors=True)
 
 
