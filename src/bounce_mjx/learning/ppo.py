@@ -114,8 +114,8 @@ class Trainer(NamedTuple):
     init: Callable[[jax.Array], TrainingState]
     """key -> state; consumes the key."""
     run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
-    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is that of
-    `first_fault`."""
+    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is the
+    result of `first_fault`."""
 
 
 def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
@@ -290,7 +290,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
 
-        # Gradients and parameters as one array: one kernel clips and one makes a step of Adam.
+        # All parameters are one array, so that clipping is one kernel and Adam another.
         flat_params, unravel = ravel_pytree(state.params)
 
         def minibatch(carry, chosen):
@@ -312,8 +312,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             size = config.batch_steps // groups
             order = jax.vmap(lambda key: jax.random.permutation(key, size))(keys)
             order = order.reshape((groups, config.num_minibatches, -1))
-            # The advantages of all minibatches are measured at once: on several devices each
-            # measurement is a message, and there is one more in every minibatch anyhow.
+            # Mean and deviation of all minibatches at once: on several devices each reduction is a
+            # message, and every minibatch already has one for its gradient.
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
             chosen = (
                 jnp.moveaxis(order, 1, 0),
@@ -358,8 +358,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
 
 def population(trainer: Trainer) -> Trainer:
-    """The trainer of S independent trainings at once: keys [S, 2] -> states, their arrays with S
-    as the first axis; metrics are [S, I]."""
+    """A trainer of S independent trainings: keys [S, 2] -> states with S as the first axis of every
+    array; metrics are [S, I]."""
     return Trainer(
         jax.vmap(trainer.init),
         lambda states, num_iterations: jax.vmap(lambda state: trainer.run(state, num_iterations))(
@@ -369,11 +369,11 @@ def population(trainer: Trainer) -> Trainer:
 
 
 def num_groups(config: PPOConfig) -> int:
-    """Number of equal groups that the environments are dealt into, a power of two.
+    """Number of equal groups of environments, a power of two.
 
-    Samples are shuffled within their group, and every minibatch takes as many from each. So a
-    device that holds whole groups shuffles its own samples alone, and as the groups do not depend
-    on the devices, neither does the training.
+    Samples are shuffled within their group, and every minibatch takes equally many from each group.
+    So a device with whole groups shuffles only its own samples; and the training does not depend on
+    the number of devices, as the groups do not.
     """
     groups = max(_MIN_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
