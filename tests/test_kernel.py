@@ -15,7 +15,7 @@ import pytest
 from bounce_mjx import BounceBall
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics, kernel
-from test_parameters import random_parameters
+from random_worlds import random_parameters
 
 # No multiple of a block.
 BATCH = 70

@@ -456,6 +456,8 @@ def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:
     assert [e["screening"] for e in evaluations(run)] == [True, True]
     tags = EventAccumulator(str(run)).Reload().Tags()["scalars"]
     assert "screening/stable" in tags and "results/stable" not in tags
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert page.count(">screening</td>") == 2
     # The end reports all episodes.
     results = json.loads((run / "results.json").read_text())
     assert (results["screening"], results["details"]["episodes"]) == (False, 4)

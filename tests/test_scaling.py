@@ -5,9 +5,11 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,6 +33,7 @@ from bounce_mjx.runs.folders import (
     runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts
+from bounce_mjx.training.peers import Peers
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from tiny_runs import STEPS, TINY, arrays, job
 
@@ -301,6 +304,20 @@ def free_port() -> int:
         return server.getsockname()[1]
 
 
+SLOW_TO_COMPILE = """
+import sys, time
+from bounce_mjx.commands.train import main
+from bounce_mjx.training.peers import Peers
+from bounce_mjx.training.ppo_trainer import PPOTrainer
+compile = PPOTrainer.compile
+def slow(*args):
+    time.sleep(35)
+    return compile(*args)
+PPOTrainer.compile = slow
+main(sys.argv[1:])
+"""
+
+
 @pytest.mark.slow
 def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
@@ -320,11 +337,28 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     assert len(list(run.glob("events.*"))) == 1
     assert_alike(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
+    # The leader has its programs from the cache, the other one compiles them for longer than JAX's
+    # exchange between devices waits; then the other one dies.
+    flags = ["--resume", run, "--total-steps", 10**9, "--num-processes", "2", "--no-report"]
+    flags += ["--coordinator-address", f"127.0.0.1:{free_port()}"]
+    with (
+        job(tmp_path / "log2", *flags, "--process-id", 0) as leader,
+        job(tmp_path / "log3", *flags, "--process-id", 1, code=SLOW_TO_COMPILE) as follower,
+    ):
+        leader.wait_until_said("evaluation at")
+        follower.process.kill()
+        assert leader.wait() == 2, leader.said
+    (sentence,) = (line for line in leader.said.splitlines() if "error" in line)
+    assert re.match(r"error: process 1 \(on .+\) of this training has ended", sentence)
+    assert f"bounce-mjx train --resume {run} on every host" in sentence
+    assert f"the last checkpoint is {run}/checkpoints/latest/" in sentence
+    assert "Traceback" not in leader.said
+
     # What two processes saved, one goes on from.
     monkeypatch.delenv("XLA_FLAGS")
-    before = arrays(latest_checkpoint(run))
-    train_command.main(["--resume", str(run), "--total-steps", str(3 * STEPS), "--no-report"])
-    assert latest_checkpoint(run).steps == 3 * STEPS
+    before, steps = arrays(latest_checkpoint(run)), latest_checkpoint(run).steps
+    train_command.main(["--resume", str(run), "--total-steps", str(steps + 128), "--no-report"])
+    assert latest_checkpoint(run).steps == steps + 128
     assert_trained(run, before)
 
 
@@ -334,6 +368,93 @@ def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
         UserError, match="--num-processes needs --coordinator-address, --process-id"
     ):
         hosts.join(num_processes=2)
+
+
+PEER = """
+import sys, time
+from bounce_mjx.training.peers import Address, Peers
+import os
+index, port, token = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+peers = Peers(index, 3, 2.0, lambda: "start it again", os._exit)
+if index == 0:
+    address, server = peers.listen()
+    print("address", *address, flush=True)
+    peers.accept(server, address.token)
+else:
+    peers.connect("127.0.0.1", Address(port, token))
+print("values", peers.exchange({"from": index}), flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["dead", "silent"])
+def test_the_death_of_a_process_ends_the_others_with_a_sentence(tmp_path: Path, lost, how):
+    with contextlib.ExitStack() as stack:
+        processes = [stack.enter_context(job(tmp_path / "0", 0, 0, "", code=PEER))]
+        processes[0].wait_until_said("\n")
+        _, port, token = processes[0].said.split()
+        for i in (1, 2):
+            peer = job(tmp_path / str(i), i, port, token, code=PEER)
+            processes.append(stack.enter_context(peer))
+        for process in processes:
+            process.wait_until_said("values")
+            assert "values [{'from': 0}, {'from': 1}, {'from': 2}]" in process.said
+        processes[lost].process.send_signal(how)
+        for i, process in enumerate(processes):
+            if i != lost:
+                assert process.wait() == 2
+                last = process.said.splitlines()[-1]
+                assert re.fullmatch(
+                    rf"error: process {lost} (\(on .+\) )?of this training has ended or no longer "
+                    "answers; see its output, then start it again",
+                    last,
+                )
+
+
+def test_a_stranger_is_no_process_of_the_training():
+    peers = Peers(0, 2, 5.0, lambda: "", os._exit)
+    address, server = peers.listen()
+    accepting = threading.Thread(target=peers.accept, args=(server, address.token))
+    accepting.start()
+    for words in (b"GET / HTTP/1.0\r\n\r\n", b'{"token": "guess", "index": 1, "host": "me"}\n'):
+        with socket.create_connection(("127.0.0.1", address.port)) as stranger:
+            stranger.sendall(words)
+            assert stranger.recv(1) == b""
+    assert accepting.is_alive()
+    other = Peers(1, 2, 5.0, lambda: "", os._exit)
+    other.connect("127.0.0.1", address)
+    accepting.join()
+    other.close()
+    peers.close()
+
+
+@pytest.mark.parametrize(
+    ("flags", "joined"),
+    [
+        ("--coordinator-address a:1 --num-processes 2 --process-id 1", ("a:1", 2, 1, 300)),
+        ("--coordinator_address=a:1 --num_processes 2 --process_id=1", ("a:1", 2, 1, 300)),
+        ("--coordinator-address a:1 --num_processes 2e0 --process_id 0", ("a:1", 2, 0, 300)),
+        ("--distributed --host_timeout 7", (None, None, None, 7)),
+        ("--distributed=true", (None, None, None, 300)),
+        ("--distributed=false", None),
+        ("--num-processes many --process-id 0", None),
+        ("--num-envs 8", None),
+    ],
+)
+def test_hosts_are_joined_for_every_spelling_of_the_flags(monkeypatch, flags: str, joined):
+    calls = []
+    monkeypatch.setattr(hosts, "join", lambda *args: calls.append(args))
+    train_command._join_hosts(flags.split())
+    assert calls == ([] if joined is None else [joined])
+
+
+@pytest.mark.parametrize("process_id", [0, 1])
+def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path, process_id: int):
+    flags = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num_processes", 2]
+    with job(tmp_path / "log", *flags, "--process_id", process_id, "--host-timeout", 2) as alone:
+        assert alone.wait() == 2
+    assert re.fullmatch(r"error: .+ did not find each other at .+ within 2 s; .+\n", alone.said)
 
 
 def test_distributed_without_a_launcher_is_one_sentence(tmp_path: Path):

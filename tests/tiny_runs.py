@@ -44,11 +44,11 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 class Job:
     """A process of train_jax.py."""
 
-    def __init__(self, log: Path, args: list[str]):
+    def __init__(self, log: Path, args: list[str], program: list[str]):
         self._log = log
         with log.open("wb") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-u", str(TRAIN_SCRIPT), *args],
+                [sys.executable, "-u", *program, *args],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=os.environ | {"PYTHONUNBUFFERED": "1"},
@@ -73,9 +73,11 @@ class Job:
 
 
 @contextlib.contextmanager
-def job(log: Path, *args: object) -> Iterator[Job]:
-    """Starts `train_jax.py args`, and leaves no process behind."""
-    started = Job(log, [str(arg) for arg in args])
+def job(log: Path, *args: object, code: str | None = None) -> Iterator[Job]:
+    """Starts `train_jax.py args`, or Python code with these arguments, and leaves no process
+    behind."""
+    program = [str(TRAIN_SCRIPT)] if code is None else ["-c", code]
+    started = Job(log, [str(arg) for arg in args], program)
     try:
         yield started
     finally:

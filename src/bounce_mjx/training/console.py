@@ -1,4 +1,4 @@
-"""What a training shows and writes while it runs: the progress line and the TensorBoard log."""
+"""Output of a running training: the progress line and the TensorBoard log."""
 
 import math
 import typing
@@ -17,7 +17,7 @@ if typing.TYPE_CHECKING:
 
 
 class Reporter:
-    """Shows a progress bar on a terminal, a line a block elsewhere, and logs to TensorBoard."""
+    """Shows a progress bar on a terminal or else a line per block, and logs to TensorBoard."""
 
     def __init__(
         self,
@@ -28,7 +28,7 @@ class Reporter:
     ):
         """
         Args:
-          logs: one a seed; none in a process that writes nothing.
+          logs: one per seed; none in a process that writes nothing.
         """
         self._console = console
         self._logs = logs
@@ -63,12 +63,12 @@ class Reporter:
         """Reports a block of iterations.
 
         Args:
-          steps: environment steps done so far, of each seed.
-          seconds: what the block took.
-          metrics: each [seeds, iterations]; a value that is not a number is left out.
+          steps: environment steps of each seed so far.
+          seconds: duration of the block.
+          metrics: each [seeds, iterations]; NaN is ignored.
         """
         means = {name: _finite_mean(values) for name, values in metrics.items()}
-        # A count, where a mean would hide one event in many iterations.
+        # A sum: a mean would hide one event in many iterations.
         non_finite = np.sum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
         for name, of_seeds in means.items():
@@ -109,7 +109,7 @@ class Reporter:
         problem: str | None,
         meanwhile: str = "the training goes on, and saves at its next evaluation",
     ) -> None:
-        """Tells once why the last save failed, and once when there is no such problem any more."""
+        """Prints why the last save failed, and later that saving works again, once each."""
         sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
         if sentence != self._saving_problem:
             self.say(sentence or "the state is saved again")
@@ -121,8 +121,8 @@ class Reporter:
         """Reports an evaluation.
 
         Args:
-          reports: one a seed.
-          healthy: whether each seed has not diverged.
+          reports: one per seed.
+          healthy: false for a seed that diverged.
         """
         for log, report, sound in zip(self._logs, reports, healthy, strict=False):
             if not sound:
@@ -155,7 +155,7 @@ def say(console: Console, line: str) -> None:
 
 
 def _finite_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the finite values of each row; not a number where there is none."""
+    """Mean of the finite values of each row; NaN where there is none."""
     finite = np.isfinite(values)
     number = finite.sum(axis=1)
     total = np.where(finite, values, 0.0).sum(axis=1)

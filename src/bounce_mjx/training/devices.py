@@ -1,7 +1,7 @@
-"""Training on several devices: one mesh, on which the environments or the seeds are divided.
+"""Training on several devices: a mesh that divides the environments or the seeds.
 
 The program is the same on any number of devices: arrays of environments are sharded along their
-batch, all else is replicated, and XLA adds the reductions of gradients and statistics.
+batch, all other arrays are replicated, and XLA adds the reductions of gradients and statistics.
 """
 
 import jax
@@ -21,8 +21,8 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
       num_devices: None for one, and on several hosts for all.
 
     Raises:
-      UserError: there are fewer, or the environments (one seed) or the seeds (several) cannot be
-        divided among them, or a device of another host is left out.
+      UserError: there are fewer devices, or the environments (one seed) or the seeds (several)
+        cannot be divided among them, or a device of some host would be unused.
     """
     devices = jax.devices()
     if num_devices is None:
@@ -34,8 +34,7 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
         )
     if jax.process_count() > 1 and num_devices < len(devices):
         raise UserError(
-            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; leave "
-            "it out"
+            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; omit it"
         )
     groups = num_groups(config)
     if num_seeds > 1 and num_seeds % num_devices:
@@ -53,16 +52,16 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Sharding of what every device holds whole."""
+    """Sharding of arrays that every device holds in full."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> TrainingState:
-    """Shardings of a training state: of several seeds, each device holds some whole; of one, each
-    device holds some environments and all the rest.
+    """Shardings of a training state. With several seeds each device holds some of them; with one
+    seed each device holds some environments and everything else.
 
     Args:
-      state: the state or its shapes; of several seeds, with the seeds as the first axis.
+      state: the state or its shapes; with several seeds, they are the first axis.
     """
     if num_seeds > 1:
         return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)

@@ -20,12 +20,12 @@ def open_log(
     """Opens a TensorBoard log in a run's folder.
 
     Args:
-      first_step: that from which a run is resumed; what was logged later is taken back.
-      suffix: of the file's name, which otherwise is that of any log opened in the same second.
-      config: of the run, to be logged as text.
+      first_step: the step at which a resumed run goes on; TensorBoard drops all later points.
+      suffix: of the file's name; two logs opened in the same second need different ones.
+      config: the run's config, to be logged as text.
     """
-    # tensorboardX imports PyTorch where that is installed, which takes seconds; this way they
-    # pass beside the compilation.
+    # Here, as tensorboardX imports PyTorch where it is installed: the seconds that this takes pass
+    # during the compilation.
     from tensorboardX import SummaryWriter
     from tensorboardX.record_writer import register_writer_factory
 
@@ -46,7 +46,7 @@ _LOG_PREFIX = "bounce_mjx"
 
 
 class _LogFiles:
-    """How tensorboardX opens the files of a log."""
+    """Opens the files of a log for tensorboardX."""
 
     def directory_check(self, path: str) -> None:
         Path(path.removeprefix(f"{_LOG_PREFIX}:")).mkdir(parents=True, exist_ok=True)
@@ -56,8 +56,11 @@ class _LogFiles:
 
 
 class _LogFile:
-    """A file that keeps what a full disk does not take until it does. With an ordinary one, the
-    thread of tensorboardX would end, and with it, in silence, the training."""
+    """A file that keeps its data in memory while the disk is full, and writes it later.
+
+    An ordinary file would raise in tensorboardX's thread: the thread would end, its queue would
+    fill up, and the training would hang without a message.
+    """
 
     def __init__(self, path: Path):
         self._path = path

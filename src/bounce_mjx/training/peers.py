@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 # A process that fails on its own prints its own reason within this time.
 _GRACE_SECONDS = 1.0
@@ -56,6 +56,7 @@ class Peers:
         self._index, self._count, self._timeout = index, count, timeout
         self._advice, self._end_process = advice, end_process
         self._sockets: dict[int, socket.socket] = {}
+        self._lines: dict[int, TextIO] = {}
         self._names: dict[int, str] = {}
         self._received: dict[int, queue.Queue] = {}
         self._sending = threading.Lock()
@@ -82,15 +83,19 @@ class Peers:
                 server.settimeout(max(0.01, deadline - time.monotonic()))
                 connection, _ = server.accept()
                 connection.settimeout(_CONNECT_SECONDS)
+                lines = connection.makefile("r")
                 try:
-                    hello = json.loads(connection.makefile("r").readline(1000))
+                    hello = json.loads(lines.readline(1000))
                     if not secrets.compare_digest(hello["token"], token):
                         raise ValueError
                     index, name = int(hello["index"]), str(hello["host"])
                 except (OSError, ValueError, KeyError, TypeError):
+                    lines.close()
                     connection.close()
                     continue
                 self._sockets[index], self._names[index] = connection, name
+                # The reader is kept, as it may have read beyond the first line.
+                self._lines[index] = lines
         self._start()
 
     def connect(self, host: str, address: Address) -> None:
@@ -101,6 +106,7 @@ class Peers:
         """
         connection = socket.create_connection((host, address.port), _CONNECT_SECONDS)
         self._sockets[0], self._names[0] = connection, host
+        self._lines[0] = connection.makefile("r")
         hello = {"token": address.token, "index": self._index, "host": socket.gethostname()}
         self._send(0, hello)
         self._start()
@@ -144,7 +150,7 @@ class Peers:
         for i, connection in self._sockets.items():
             connection.settimeout(self._timeout)
             self._received[i] = queue.Queue()
-            threading.Thread(target=self._receive, args=(i, connection), daemon=True).start()
+            threading.Thread(target=self._receive, args=(i,), daemon=True).start()
         threading.Thread(target=self._beat, daemon=True).start()
 
     def _beat(self) -> None:
@@ -157,10 +163,10 @@ class Peers:
         with self._sending, contextlib.suppress(OSError):
             self._sockets[index].sendall((json.dumps(message) + "\n").encode())
 
-    def _receive(self, index: int, connection: socket.socket) -> None:
+    def _receive(self, index: int) -> None:
         lost = index
-        with contextlib.suppress(OSError, ValueError), connection.makefile("r") as lines:
-            for line in lines:
+        with contextlib.suppress(OSError, ValueError):
+            for line in self._lines[index]:
                 message = json.loads(line)
                 if "value" in message:
                     self._received[index].put(message["value"])

@@ -1,4 +1,4 @@
-"""The report that a training leaves when it ends."""
+"""The report of a finished training."""
 
 from pathlib import Path
 
@@ -10,12 +10,11 @@ from bounce_mjx.training.log import open_log
 
 
 def report_training(run: Path, report: Report, steps: int) -> Path:
-    """Writes the report of a training that has just ended, and its picture of the evaluation into
-    the TensorBoard log.
+    """Writes the report of a finished training, and the figure of its final evaluation into the
+    TensorBoard log.
 
     Args:
-      report: of the best checkpoint; its recording is missing if the run was resumed and none of
-        the new evaluations was the best.
+      report: of the best checkpoint; without a recording in a training of several seeds.
       steps: environment steps at the best checkpoint.
 
     Returns:
@@ -26,7 +25,7 @@ def report_training(run: Path, report: Report, steps: int) -> Path:
     """
     recording = report.recording or record_checkpoint(find_checkpoint(run, run))
     page, evaluation = write_report(run, recording)
-    # A file of its own, as that of the training is closed.
+    # A new file, as the log of the training is closed.
     with open_log(run, suffix=".report") as log:
         log.add_image("evaluation", pixels(evaluation), steps, dataformats="HWC")
     return page

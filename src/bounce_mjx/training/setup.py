@@ -1,4 +1,4 @@
-"""How JAX is set up for a command."""
+"""JAX's settings in a command."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,10 @@ import jax
 
 
 def set_up_jax() -> None:
-    """Sets JAX up for a command, unless the user has.
+    """Sets JAX up for a command; the user's environment variables have priority.
 
-    Compiled programs are kept in the user's cache folder, so that a second start is quick
-    (`JAX_COMPILATION_CACHE_DIR` chooses another).
+    Compiled programs are cached in the user's cache folder, so that a second start is quick
+    (`JAX_COMPILATION_CACHE_DIR` names another folder).
     """
     set_up_gpu()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -19,11 +19,11 @@ def set_up_jax() -> None:
 
 
 def set_up_gpu() -> None:
-    """Makes JAX start sooner on a GPU, unless the user has set it up; on a CPU nothing changes.
+    """Makes JAX start sooner on a GPU; the user's environment variables have priority.
 
-    Of the memory only what is needed is taken, as taking three quarters at once, JAX's way, costs
-    a second (`XLA_PYTHON_CLIENT_PREALLOCATE=true`). Random numbers come from a kernel of JAX's own
-    instead of XLA's: the same numbers, with a second less to compile
+    Memory is allocated as needed: JAX's default, three quarters at once, costs a second
+    (`XLA_PYTHON_CLIENT_PREALLOCATE=true`). Random numbers come from a kernel of JAX, where XLA
+    would compile one for a second; the numbers are the same
     (`JAX_THREEFRY_GPU_KERNEL_LOWERING=false`).
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -32,9 +32,9 @@ def set_up_gpu() -> None:
 
 
 def compiler_options() -> dict[str, bool | int | str]:
-    """Options of XLA for `jax.jit` that save time in compiling, of a program that runs as fast.
+    """Options of XLA for `jax.jit` that shorten the compilation and keep the program's speed.
 
-    On a GPU, XLA times several kernels for each matrix product. It need not check as well that
-    their results agree, which takes as long again.
+    On a GPU, XLA times several kernels for each matrix product. This skips its check that their
+    results agree, which doubles that time.
     """
     return {"xla_gpu_autotune_level": 1} if jax.default_backend() == "gpu" else {}

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request that the training answers when it can."""
+"""Ctrl-C and SIGTERM as a request, which the training answers at its next safe point."""
 
 import concurrent.futures
 import os
@@ -7,25 +7,25 @@ import threading
 import time
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-# Launchers hand a Ctrl-C on to a process that the terminal has already told.
+# Launchers forward a Ctrl-C to a process that has already got it from the terminal.
 _SAME_REQUEST_SECONDS = 0.5
 
 
 class StopRequest:
-    """While entered, the first SIGINT or SIGTERM only sets `requested`; the next ends the process
-    at once, as it would have without this."""
+    """While entered, the first SIGINT or SIGTERM only sets `requested`; the next one ends the
+    process at once."""
 
     def __init__(self):
-        self._at: float | None = None
+        self._requested_at: float | None = None
         self._previous = {}
 
     @property
     def requested(self) -> bool:
         """Whether a signal has come."""
-        return self._at is not None
+        return self._requested_at is not None
 
     def __enter__(self) -> "StopRequest":
-        # Python hands signals to the main thread, and lets only that one say to whom.
+        # Only the main thread may install signal handlers.
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._handle) for number in _SIGNALS}
         return self
@@ -42,8 +42,8 @@ class StopRequest:
         return False
 
     def _handle(self, number: int, _) -> None:
-        if self._at is None:
-            self._at = time.monotonic()
-        elif time.monotonic() - self._at > _SAME_REQUEST_SECONDS:
+        if self._requested_at is None:
+            self._requested_at = time.monotonic()
+        elif time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)

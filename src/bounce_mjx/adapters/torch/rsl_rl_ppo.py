@@ -1,4 +1,5 @@
-"""rsl_rl (5.x): the environment as its `VecEnv`, and its PPO with this project's hyperparameters.
+"""rsl_rl (5.x): the environment as a `VecEnv`, and rsl_rl's PPO with this project's
+hyperparameters.
 
 | here                    | rsl_rl                                                              |
 |-------------------------|---------------------------------------------------------------------|
@@ -11,7 +12,7 @@
 | target_kl               | `desired_kl`; 0 turns the steering off: the same                    |
 | factor of the steering  | 1.5 (here 1.1): fixed in rsl_rl                                     |
 | min, max and final_max_learning_rate, decay_steps | 1e-5 to 1e-2, no decay: fixed in rsl_rl   |
-| max_grad_norm           | of the actor and of the critic each (here of both together)         |
+| max_grad_norm           | for the actor and the critic separately (here together)             |
 | KL                      | exact for two Gaussians (here Schulman's estimate)                  |
 | minibatches             | shuffled once an iteration (here once an epoch)                     |
 | value at a time-out     | of the state before it (here of the last state)                     |
@@ -43,10 +44,10 @@ except ImportError as error:
 
 
 class RslRlVecEnv(VecEnv):
-    """B environments as rsl_rl's runners want them.
+    """B environments with the interface of rsl_rl's runners.
 
-    The observation groups are `policy` [B, 29] and `critic` [B, K], the metrics that only the
-    value network should see. `extras` holds `time_outs` [B] and `log`, means over the batch.
+    The observation groups are `policy` [B, N] and `critic` [B, K], the metrics for the value
+    network alone. `extras` holds `time_outs` [B] and `log`, means over the batch.
     """
 
     def __init__(self, env: TorchVectorEnv):
@@ -73,14 +74,14 @@ class RslRlVecEnv(VecEnv):
         return self._observations
 
     def set_observations(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> None:
-        """Replaces the current observations [B, 29] and critic metrics [B, K], after a new
+        """Replaces the current observations [B, N] and critic metrics [B, K], after a new
         `TorchVectorEnv.state`."""
         self._observations = self._groups(observation, critic_metrics)
 
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advances every environment under the actions [B, 6].
+        """Advances every environment under the actions [B, A].
 
         Returns:
           Observations, rewards [B], dones [B] (bool) and extras.
@@ -93,8 +94,8 @@ class RslRlVecEnv(VecEnv):
         return self._observations, result.reward, result.done, extras
 
     def terminal_observations(self) -> TensorDict:
-        """What the last step itself led to: where an episode ended, its last observations and not
-        the first of the next one."""
+        """Observations after the last step, before any reset: at an end, the last of the old
+        episode."""
         return self._groups(self._result.final_observation, self._result.final_critic_metrics)
 
     def step_metrics(self) -> torch.Tensor:
@@ -110,7 +111,7 @@ class RslRlVecEnv(VecEnv):
         )
 
 
-# Sums over the episodes that ended on a step, whose mean over steps says nothing.
+# Sums over the episodes that ended on a step; their mean over steps has no meaning.
 _SUMS = frozenset({"ended", "return", "length", "bounces", "apex_error", "bounced", "non_finite"})
 
 
@@ -125,8 +126,8 @@ class Network(MLPModel):
 
 
 class RslRlLearner(Learner):
-    """rsl_rl's PPO on its own storage, stepped by its runner's loop without the runner's log,
-    which would wait for the device at every step."""
+    """rsl_rl's PPO with its own storage, in the loop of its runner without the runner's log, which
+    would wait for the device at every step."""
 
     library = "rsl_rl"
 

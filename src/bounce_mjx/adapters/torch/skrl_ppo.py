@@ -1,12 +1,12 @@
-"""skrl (2.x): the environment as its `Wrapper`, and its PPO with this project's hyperparameters.
+"""skrl (2.x): the environment as a `Wrapper`, and skrl's PPO with this project's hyperparameters.
 
 | here                    | skrl                                                                |
 |-------------------------|---------------------------------------------------------------------|
 | num_envs, rollout_length, num_epochs, num_minibatches, discount, gae_lambda, clip_epsilon,      |
 | entropy_cost, value_cost, reward_scale, max_grad_norm, init_noise_std, hidden_layers,           |
 | critic_metrics, initial weights | the same                                                    |
-| normalisation           | the same formula; statistics taken in during the first epoch        |
-| value at a time-out     | of the last state: the same, as the learner hands it on             |
+| normalisation           | the same formula; the first epoch updates the statistics            |
+| value at a time-out     | of the last state: the same, as the learner passes it on            |
 | learning_rate, its limits, decay_steps | the same                                             |
 | target_kl               | steers once an epoch by 1.5 (here once a minibatch by 1.1)          |
 | advantages              | normalised over the whole rollout (here in each minibatch)          |
@@ -45,10 +45,10 @@ except ImportError as error:
 
 
 class SkrlEnv(Wrapper):
-    """B environments as skrl's trainers want them.
+    """B environments with the interface of skrl's trainers.
 
-    Rewards, terminated and truncated are [B, 1]; `state()` is what the value network sees, the
-    observation and the critic's metrics [B, 29 + K].
+    Rewards, terminated and truncated are [B, 1]; `state()` is the value network's input, the
+    observation and the critic metrics [B, N + K].
     """
 
     def __init__(self, env: TorchVectorEnv):
@@ -73,7 +73,7 @@ class SkrlEnv(Wrapper):
         return self._action_space
 
     def reset(self) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Starts every episode afresh."""
+        """Starts a new episode in every environment."""
         observation, critic_metrics = self._env.reset()
         self._states = torch.cat([observation, critic_metrics], dim=-1)
         return observation, {}
@@ -81,7 +81,7 @@ class SkrlEnv(Wrapper):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advances every environment under the actions [B, 6]."""
+        """Advances every environment under the actions [B, A]."""
         result = self._result = self._env.step(actions)
         self._states = torch.cat([result.observation, result.critic_metrics], dim=-1)
         return (
@@ -93,26 +93,26 @@ class SkrlEnv(Wrapper):
         )
 
     def state(self) -> torch.Tensor:
-        """What the value network sees [B, 29 + K]."""
+        """Inputs of the value network [B, N + K]."""
         return self._states
 
     def terminal_observations(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Observations and states that the last step itself led to: where an episode ended, its
-        last ones and not the first of the next one."""
+        """Observations and states after the last step, before any reset: at an end, the last ones
+        of the old episode."""
         result = self._result
         states = torch.cat([result.final_observation, result.final_critic_metrics], dim=-1)
         return result.final_observation, states
 
     def render(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing, as skrl asks for it at each step; see `bounce_mjx.gymnasium` for pictures."""
+        """Does nothing: skrl calls it at every step."""
 
     def close(self) -> None:
         """Nothing is held open."""
 
 
 class SkrlLearner(Learner):
-    """skrl's PPO, stepped as its trainers step it but with the terminal observations at an end,
-    from which it then bootstraps time-outs."""
+    """skrl's PPO in the loop of its trainers. It gets the terminal observations at an end, and so
+    bootstraps time-outs from them."""
 
     library = "skrl"
 
@@ -178,7 +178,7 @@ class SkrlLearner(Learner):
         self._observations, self._states = observations, states
 
     def _step(self) -> torch.Tensor:
-        """One step of every environment, and an update where it ends a rollout; its metrics."""
+        """One step of every environment, with an update at the end of a rollout; its metrics."""
         clock = {"timestep": 0, "timesteps": 0}
         self.agent.pre_interaction(**clock)
         with torch.no_grad():
