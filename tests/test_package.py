@@ -207,6 +207,9 @@ import jax
 from rich.console import Console
 from bounce_mjx import BounceBall
 from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)
