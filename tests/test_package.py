@@ -153,6 +153,13 @@ def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
 
 
+def test_wheel_has_the_console_script(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith("/entry_points.txt")]
+        text = archive.read(name).decode()
+    assert text.split() == ["[console_scripts]", "bounce-mjx", "=", "bounce_mjx.commands.main:main"]
+
+
 def test_installed_environment_runs(site: Path, tmp_path: Path) -> None:
     script = """
 import jax
