@@ -1,6 +1,5 @@
 """The GPU kernel of the fused physics, in Pallas' interpreter, against XLA's own program."""
 
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,9 +12,9 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
 from bounce_mjx.gpu import availability
 from bounce_mjx.gpu import elementwise as kernel
+from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics
 from random_worlds import random_parameters
 

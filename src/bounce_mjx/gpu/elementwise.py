@@ -82,7 +82,7 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
     def wrapped(*args: Tree) -> Tree:
         leaves, tree = jax.tree.flatten(args)
         types = {x.dtype for x in leaves}
-        if not (interpret or has_kernels()) or not types <= _KERNEL_TYPES:
+        if not (interpret or has_kernels()) or not types <= KERNEL_TYPES:
             return function(*args)
         shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
         result_tree = []
@@ -96,7 +96,7 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
             scalar_function = as_scalars(flat_function, shapes)
         except UnsupportedOperation:
             return function(*args)
-        if not set(scalar_function.dtypes) <= _KERNEL_TYPES:
+        if not set(scalar_function.dtypes) <= KERNEL_TYPES:
             return function(*args)
 
         scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
@@ -105,17 +105,17 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
         def on_floats(*floats: jax.Array) -> Arrays:
             given = iter(floats)
             every = [
-                _from_float(next(given), x.dtype) if needed else np.zeros((), x.dtype)
+                from_float(next(given), x.dtype) if needed else np.zeros((), x.dtype)
                 for x, needed in zip(scalars, scalar_function.used, strict=True)
             ]
             results = scalar_function.call(*every)
             shape = floats[0].shape
-            return tuple(jnp.broadcast_to(_to_float(x), shape) for x in results)
+            return tuple(jnp.broadcast_to(to_float(x), shape) for x in results)
 
         num_results = len(scalar_function.dtypes)
-        floats = elementwise(on_floats, num_results, interpret)(*map(_to_float, used))
+        floats = elementwise(on_floats, num_results, interpret)(*map(to_float, used))
         results = [
-            _from_float(x, dtype) for x, dtype in zip(floats, scalar_function.dtypes, strict=True)
+            from_float(x, dtype) for x, dtype in zip(floats, scalar_function.dtypes, strict=True)
         ]
         arrays = [
             jnp.stack([results[i] for i in positions.flat]).reshape(positions.shape)
@@ -128,10 +128,10 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
     return wrapped
 
 
-_KERNEL_TYPES = {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32), jnp.dtype(jnp.bool_)}
+KERNEL_TYPES = {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32), jnp.dtype(jnp.bool_)}
 
 
-def _to_float(x: jax.Array) -> jax.Array:
+def to_float(x: jax.Array) -> jax.Array:
     """A number of a kernel's type as float32; an integer keeps its bits."""
     x = jnp.asarray(x)
     if x.dtype == jnp.int32:
@@ -139,8 +139,8 @@ def _to_float(x: jax.Array) -> jax.Array:
     return x.astype(jnp.float32)
 
 
-def _from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """The inverse of `_to_float`."""
+def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """The inverse of `to_float`."""
     if dtype == jnp.int32:
         return jax.lax.bitcast_convert_type(x, jnp.int32)
     return x > 0.5 if dtype == jnp.bool_ else x
