@@ -1,6 +1,6 @@
-"""The seed document's fifteen reward terms, transcribed into float64 NumPy one formula at a time.
+"""The fifteen reward terms of the original specification in float64 NumPy, formula by formula.
 
-Independent of the package on purpose: every constant is written as the seed writes it.
+Independent of the package on purpose: every constant is written as in the specification.
 """
 
 import numpy as np
@@ -63,7 +63,7 @@ def reference_terms(
     r_out = -2.0 / (1 + exp(-(err_xy - 0.05) / 0.03))
 
     # 3. Velocity matching; a case's velocity counts as 0 where the case does not hold, which the
-    # seed leaves open: its smooth weights alone would let every case leak into the others.
+    # specification leaves open: its smooth weights alone would let every case leak into the others.
     dh = h_target - z_ball
     v_desired = 0.5
     v_up = np.where((v_z > 0) & (z_ball < h_target), sqrt(maximum(0, v_z**2 - 2 * g * dh)), 0.0)

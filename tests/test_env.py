@@ -348,7 +348,7 @@ def test_reset_and_step_report_the_same_metrics(episodes, reset):
 
 
 def test_reward_terms_follow_the_state(episodes, model):
-    """The terms by the seed's transcription, fed by MuJoCo's C engine and the given actions."""
+    """Against the specification's formulas on the state of MuJoCo's C engine."""
     rows = []
     for before, action, after in episodes:
         data = mj_data(model, after.pipeline_state.physics)

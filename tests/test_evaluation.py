@@ -197,7 +197,7 @@ def test_perfect_statistics_pass(env):
     assert report.details["mean_return"] == 20_000
     np.testing.assert_allclose(report.details["mean_apex_error_m"], 0.02, rtol=1e-6)
     np.testing.assert_allclose(report.details["mean_length_s"], 20.0)
-    assert report.score == (5, 20_000)
+    assert report.score == (True, 5, 20_000)
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def show(table) -> str:
 def test_fresh_statistics_fail_without_a_crash(env):
     report = judge(env, empty_statistics(4)._replace(running=jnp.zeros(4, bool)))
     assert [result.passed for result in report.results] == [False] * 5
-    assert report.score == (0, 0.0)
+    assert report.score == (True, 0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.training.command import config_of
 from tiny_runs import contents
 
 FLAGS = sorted(_flags(train_command.TrainCommand))
@@ -72,7 +73,7 @@ def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
 
 def assert_valid_run(command: train_command.TrainCommand) -> None:
     """Its config passes the validation again, and comes back from its file."""
-    config = train_command.config_of(command)
+    config = config_of(command)
     again = TrainConfig.model_validate(yaml.safe_load(dump_config(config)))
     assert again == config
 
@@ -251,7 +252,7 @@ def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
         lambda: parse(
             eval_command.EvalCommand,
             args,
-            prog="python -m bounce_mjx.eval",
+            prog="bounce-mjx eval",
             description="Measures.",
         ),
     )

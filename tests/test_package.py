@@ -72,7 +72,7 @@ print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
 def test_trainer_needs_neither_brax_nor_mjx(tmp_path: Path) -> None:
     script = """
 import sys
-import bounce_mjx.commands.eval, bounce_mjx.commands.play, bounce_mjx.commands.train
+import bounce_mjx.commands.eval, bounce_mjx.commands.train
 from bounce_mjx.training import job
 print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.modules))
 """
@@ -121,7 +121,7 @@ terms = {k: v for k, v in state.metrics.items() if k.startswith("reward/")}
 print(bool(abs(sum(terms.values()) - state.reward) < 1e-4), len(terms) == len(TERM_NAMES))
 expected = -0.5 * (state.pipeline_state.physics.qvel[8] - 4.0)
 print(bool(abs(terms["reward/spin"] - expected) < 1e-5))
-print(reward_bars(np.arange(len(TERM_NAMES))).count("spin"))
+print(reward_bars({name: 1.0 for name in TERM_NAMES}).count("spin"))
 curve = Curve(np.arange(3), np.arange(3.0))
 run = RunCurves("run", {f"reward/{name}": curve for name in TERM_NAMES}, None)
 figure = rewards_figure([Group("group", [run])])
@@ -151,6 +151,13 @@ def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
         expected |= {f"bounce_mjx/{p.relative_to(CHECKOUT)}" for p in data}
     assert expected <= names
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
+
+
+def test_wheel_has_the_console_script(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith("/entry_points.txt")]
+        text = archive.read(name).decode()
+    assert text.split() == ["[console_scripts]", "bounce-mjx", "=", "bounce_mjx.commands.main:main"]
 
 
 def test_installed_environment_runs(site: Path, tmp_path: Path) -> None:
@@ -200,6 +207,9 @@ import jax
 from rich.console import Console
 from bounce_mjx import BounceBall
 from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import load_policy
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)

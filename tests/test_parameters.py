@@ -23,8 +23,9 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
 from bounce_mjx.physics.fused.model import in_world
-from bounce_mjx.physics.parameters import SHAPES, direct_solref
+from bounce_mjx.physics.parameters import SHAPES
 from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
+from random_worlds import own_parameters, random_parameters
 from test_physics import (
     DT,
     ONE_STEP,
@@ -52,48 +53,6 @@ def float64():
 @pytest.fixture(scope="module")
 def mj_model() -> mujoco.MjModel:
     return load_model(None, EnvConfig().physics_dt)
-
-
-def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, all of them given."""
-    at = find_addresses(mj_model)
-    links = mj_model.jnt_bodyid[at.arm_joints,]
-    stiffness, damping = direct_solref(mj_model)
-    return PhysicsParameters(
-        ball_mass=mj_model.body_mass[at.ball_body],
-        ball_radius=mj_model.geom_size[at.ball_geom, 0],
-        contact_stiffness=np.array(stiffness),
-        contact_damping=np.array(damping),
-        servo_gain=mj_model.actuator_gainprm[at.actuators, 0],
-        servo_damping=-mj_model.actuator_biasprm[at.actuators, 2],
-        armature=mj_model.dof_armature[at.arm_qvel,],
-        damping=mj_model.dof_damping[at.arm_qvel,],
-        link_mass=mj_model.body_mass[links],
-        paddle_position=mj_model.geom_pos[at.paddle_geom],
-        paddle_rotation=mj_model.geom_quat[at.paddle_geom],
-        gravity=mj_model.opt.gravity,
-    )
-
-
-def random_parameters(mj_model: mujoco.MjModel, count: int, seed: int) -> PhysicsParameters:
-    """Worlds [N, ...] around the model's own one, every number drawn."""
-    rng = np.random.default_rng(seed)
-    own = own_parameters(mj_model)
-
-    def scaled(array: np.ndarray) -> np.ndarray:
-        return array * rng.uniform(0.7, 1.3, (count, *np.shape(array)))
-
-    def shifted(array: np.ndarray, size: float) -> np.ndarray:
-        return array + size * rng.uniform(-1.0, 1.0, (count, *np.shape(array)))
-
-    drawn = jax.tree.map(scaled, own)
-    quaternion = shifted(own.paddle_rotation, 0.05)
-    return drawn._replace(
-        damping=rng.uniform(0.0, 5.0, (count, 6)),
-        paddle_position=shifted(own.paddle_position, 0.01),
-        paddle_rotation=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        gravity=shifted(own.gravity, 1.0),
-    )
 
 
 def world(parameters: PhysicsParameters, i: int) -> PhysicsParameters:

@@ -316,7 +316,7 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
     (run,) = tmp_path.iterdir()
     assert json.loads((run / "results.json").read_text())["trained_steps"] == 128
     shown = capsys.readouterr().out
-    assert f"report: not drawn (no fonts); python -m bounce_mjx.report {run} draws it\n" in shown
+    assert f"report: not drawn (no fonts); draw it with: bounce-mjx report {run}\n" in shown
     assert shown.index("best checkpoint") < shown.index("report: not drawn")
 
 
@@ -339,13 +339,15 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert [event.step for event in tables] == [128, 256]
     results = load_results(trained)
     best = next(event for event in tables if event.step == results["best_steps"])
+    # results.json measures the best policy once more, on fresh resets.
+    (evaluation,) = [e for e in results["evaluations"] if e["steps"] == results["best_steps"]]
     rows = best.tensor_proto.string_val[0].decode().splitlines()
     assert {row.count("|") for row in rows} == {6}
     assert [row.split(" | ")[0].strip("| ") for row in rows[2:]] == [
         result["name"] for result in results["results"]
     ]
     assert [row.split(" | ")[2] for row in rows[2:]] == [
-        as_shown(result["value"]) for result in results["results"]
+        as_shown(evaluation[result["name"]]) for result in results["results"]
     ]
 
     assert tags["images"] == ["evaluation"]

@@ -55,7 +55,7 @@ def test_import_registers_whichever_comes_first():
         assert done.stdout.split() == [ENV_ID, "False"], done.stderr
 
 
-def test_spaces_are_those_of_the_seed(single, vectorised):
+def test_spaces_are_those_of_the_specification(single, vectorised):
     action, observation = single.action_space, single.observation_space
     assert action == gymnasium.spaces.Box(-1.0, 1.0, (6,))
     assert observation == gymnasium.spaces.Box(-np.inf, np.inf, (29,))

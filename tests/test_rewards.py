@@ -75,7 +75,7 @@ def stack(states: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def random_states(seed: int) -> dict[str, np.ndarray]:
-    """Draw `N_STATES` states on both sides of every condition and clip of the seed's formulas."""
+    """Draw `N_STATES` states on both sides of every condition and clip of the formulas."""
     rng = np.random.default_rng(seed)
 
     def offsets(low: float, high: float) -> np.ndarray:
@@ -207,7 +207,7 @@ def test_names_are_those_of_the_spec(random_comparison):
     assert set(package) == set(reference) == set(SPEC_NAMES)
 
 
-def test_weights_are_the_seeds():
+def test_weights_are_those_of_the_specification():
     config = EnvConfig().reward
     assert {name: getattr(config, name).weight for name in SPEC_NAMES} == REFERENCE_WEIGHTS
     assert config == RewardConfig()
@@ -217,7 +217,7 @@ E = math.exp
 HALF = math.exp(-0.5)  # a Gaussian one width from its centre
 
 
-# Each row: term, state, weight * term worked out from the seed's formula.
+# Each row: term, state, weight * term worked out from the specification's formula.
 PINNED = [
     # err_xy = 0: exp(0) = 1
     ("position", state(), 2.0),

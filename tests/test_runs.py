@@ -134,7 +134,8 @@ def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progres
     (tmp_path / "results.json").write_text(to_json(results_of(progress)))
     results = load_results(tmp_path)
     assert results["evaluations"] == [
-        {"steps": 64, "passed": False} | dict(zip(NAMES, [1.0, 2.0, None, 4.0, 5.0], strict=True))
+        {"steps": 64, "passed": False, "screening": False}
+        | dict(zip(NAMES, [1.0, 2.0, None, 4.0, 5.0], strict=True))
     ]
     assert Report.from_dict(results) == progress.best
     assert Progress.model_validate(json.loads(to_json(progress.model_dump()))) == progress

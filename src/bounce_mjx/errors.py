@@ -8,14 +8,14 @@ from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
 
 
 class UserError(Exception):
-    """A mistake that the user can correct; its text is one sentence: what was given, what was
-    expected, what to do."""
+    """A mistake that the user can correct; its text is one sentence: the given value, the
+    expected one, the remedy."""
 
 
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Turns a `UserError` into that sentence on stderr and exit status 2, without a traceback; and
-    Ctrl-C into the shell's status 130."""
+    """Reports a `UserError` as one sentence on stderr with exit status 2, and Ctrl-C as status 130;
+    neither with a traceback."""
     try:
         yield
     except UserError as error:
@@ -28,11 +28,11 @@ def exit_on_user_error() -> Iterator[None]:
 
 
 def _on_one_line(text: str) -> str:
-    """Text from a file or a flag may hold line breaks, or what a terminal would obey."""
+    """A text without the line breaks and terminal codes that a file or a flag may hold."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return shorten(line, 3000)
 
 
 def shorten(text: str, length: int = 100) -> str:
-    """A text of a user, as far as it fits into a sentence."""
+    """A user's text, cut to fit into a sentence."""
     return text if len(text) <= length else f"{text[: length - 3]}..."

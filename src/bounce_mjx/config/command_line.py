@@ -32,7 +32,7 @@ def parse(
     """Reads a command line into a config.
 
     Args:
-      default: values of the flags that are not given; the type's own if left out.
+      default: values of the flags that are not given. The default is the type's own values.
 
     Raises:
       UserError: a flag is unknown or has a bad value.
@@ -52,7 +52,7 @@ def parse(
                 description=description,
                 **({} if default is None else {"default": default}),
             )
-        # tyro hands on the errors of groups without a prefix, and puts the others into an event.
+        # tyro raises the errors of groups without a prefix, and reports the others as an event.
         except pydantic.ValidationError as error:
             raise UserError(f"{_bad_value(error, command_class)} (see {prog} --help)") from error
 
@@ -60,7 +60,7 @@ def parse(
 def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> list[str]:
     """A command line in tyro's spelling.
 
-    The rest is common in other programs: `--flag=false` for `--no-flag`, `1e6` for a whole number,
+    Other programs also take `--flag=false` for `--no-flag`, `1e6` for a whole number, and
     `256,256` for a list of two.
     """
     words: list[str] = []
@@ -121,13 +121,13 @@ def _mistake(
 
 
 def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:
-    """The first mistake of a validation error, told by the flag."""
+    """The first mistake of a validation error, named by its flag."""
     prefixes = {group.__name__: prefix for group, prefix in _groups(command_class)}
     return describe(error, command_class, lambda name: _flag(prefixes[error.title] + name))
 
 
 def _validation_error() -> pydantic.ValidationError | None:
-    """The one that tyro is handling; its event has only the text."""
+    """The validation error that tyro is handling; the event has only its text."""
     error = sys.exception()
     while error is not None and not isinstance(error, pydantic.ValidationError):
         error = error.__context__
@@ -135,7 +135,7 @@ def _validation_error() -> pydantic.ValidationError | None:
 
 
 def _given(args: Sequence[str], flag: str) -> str:
-    """What the command line gives a flag."""
+    """The value of a flag on the command line."""
     for i, word in enumerate(args):
         name, equals, value = word.partition("=")
         if name.replace("_", "-") == flag:

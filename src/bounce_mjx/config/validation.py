@@ -1,4 +1,4 @@
-"""Plain values turned into settings, with one sentence for a mistake."""
+"""Turns plain values into settings; a mistake is one sentence."""
 
 import difflib
 import reprlib
@@ -17,7 +17,7 @@ def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -
     """Builds a config from plain values.
 
     Args:
-      source: where the values come from, for the error.
+      source: origin of the values, for the error.
 
     Raises:
       UserError: a key is unknown or a value is out of range.
@@ -36,7 +36,7 @@ def describe(
     """The first mistake of a validation error as part of a sentence.
 
     Args:
-      spell: how to write the dotted name of a setting.
+      spell: writes the dotted name of a setting, such as a flag.
     """
     first = error.errors()[0]
     if first["type"] in ("extra_forbidden", "invalid_key"):
@@ -50,7 +50,7 @@ def describe(
 
 
 class _Repr(reprlib.Repr):
-    """Python's notation, cut short: a file can describe a value without an end."""
+    """Python's notation, cut short: a value from a file may have no end."""
 
     def __init__(self):
         super().__init__()
@@ -63,16 +63,16 @@ class _Repr(reprlib.Repr):
 
 
 def _quote(value: Any) -> str:
-    """A value of a user, as far as it fits into a sentence."""
+    """A user's value, cut to fit into a sentence."""
     return shorten(_Repr().repr(value))
 
 
 def _wanted(error: pydantic.ValidationError) -> str:
-    """What the first mistake should have been, after "must"."""
+    """The requirement that the first mistake violates, to follow "must"."""
     first = error.errors()[0]
     if first["type"] == "missing":
-        beside = [e["loc"] for e in error.errors() if e["loc"][:-1] == first["loc"][:-1]]
-        return f"have {beside[-1][-1] + 1} items"
+        missing = [e["loc"] for e in error.errors() if e["loc"][:-1] == first["loc"][:-1]]
+        return f"have {missing[-1][-1] + 1} items"
     limits = first.get("ctx", {})
     special = {
         "model_type": "be a group of keys and values",
@@ -86,15 +86,15 @@ def _wanted(error: pydantic.ValidationError) -> str:
 
 
 def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
-    """What to do about an unknown key."""
+    """Advice on an unknown key."""
     known = list(_dotted_keys(config_class))
     prefix = ".".join([*path[:-1], ""])
-    beside = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
+    siblings = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
     same_name = [key for key in known if key.split(".")[-1] == path[-1]]
-    near = difflib.get_close_matches(path[-1], beside, n=1)
+    near = difflib.get_close_matches(path[-1], siblings, n=1)
     if near or same_name:
         return f"did you mean {same_name[0] if same_name else prefix + near[0]}?"
-    return f"known keys here are {', '.join(sorted(beside))}"
+    return f"known keys here are {', '.join(sorted(siblings))}"
 
 
 def _dotted_keys(config_class: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The settings of the trainer."""
+"""Settings of the trainer."""
 
 from typing import Annotated, Literal
 
@@ -37,7 +37,7 @@ class PPOConfig(StrictModel):
     decay_steps: Steps = 20_000_000
     """Environment steps over which the upper limit goes down, in equal ratios."""
     target_kl: NonNegative = 0.01
-    """KL divergence of one update that the learning rate is steered to; 0 leaves it as it is."""
+    """KL divergence of one update to which the learning rate is steered; 0 keeps the rate."""
     discount: UnitInterval = 0.98
     """Discount factor of a control step."""
     gae_lambda: UnitInterval = 0.95
@@ -51,17 +51,17 @@ class PPOConfig(StrictModel):
     max_grad_norm: Positive = 1.0
     """Global norm to which a gradient is clipped."""
     reward_scale: Positive = 0.1
-    """Factor of the reward that the trainer sees."""
+    """Factor by which the trainer scales the reward."""
     init_noise_std: Positive = 0.4
     """Standard deviation of the action noise at the start."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy and of the value network."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type in which the training computes the hidden layers. Parameters, outputs, losses and the
-    optimizer are float32, and so is every evaluation. bfloat16 is faster on a GPU."""
+    """Type of the hidden layers during training; bfloat16 is faster on a GPU. Parameters, outputs,
+    losses, the optimizer and all evaluations are float32."""
     critic_metrics: tuple[str, ...] = ("n_bounces",)
-    """Metrics of the environment that the value network sees beside the observation. The reward
-    depends on the bounce count, which the observation lacks."""
+    """Metrics of the environment that are inputs of the value network, with the observation. The
+    reward depends on the bounce count, which the observation lacks."""
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):

@@ -31,8 +31,8 @@ class Packed:
 
 
 def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
-    """Means over each group of environments [G] of one step, and sums over the episodes in it that
-    ended on the step."""
+    """Metrics of one step over each group of environments [G]: means, and sums over the episodes
+    that ended on the step."""
     ended = result.terminated | result.truncated
     means = result.metrics | {"reward": result.reward}
     totals = {
@@ -55,8 +55,8 @@ def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
 
 
 def rollout_metrics(steps: Metrics) -> Metrics:
-    """Metrics of a rollout from those of its steps and groups [T, G]. Where no episode ended (or
-    no bounce happened), its means are not a number."""
+    """Metrics of a rollout from the metrics of its steps and groups [T, G]. Means over episodes are
+    NaN if none ended, means over bounces if there were none."""
     ended, bounced = jnp.sum(steps["ended"]), jnp.sum(steps["bounced"])
     rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
     return rewards | {

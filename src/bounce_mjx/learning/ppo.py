@@ -10,14 +10,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning import statistics
+from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.rows import Rows, Unpacked
+from bounce_mjx.learning import minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.gradients import MinibatchGradients
 from bounce_mjx.learning.metrics import Metrics, Packed, rollout_metrics, step_metrics
 from bounce_mjx.learning.policy import Policy, cast_hidden_layers, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
@@ -76,6 +80,19 @@ class Rollout(NamedTuple):
     """[T, B], bool."""
 
 
+class StepOfRollout(NamedTuple):
+    """One step of B environments, the batch last: the fields of `Rollout`."""
+
+    raw_inputs: jax.Array
+    """Before their normalisation [N + K, B]."""
+    action: jax.Array
+    """[A, B]."""
+    log_prob: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
 class Collection(NamedTuple):
     """A rollout with the states at its ends."""
 
@@ -114,8 +131,8 @@ class Trainer(NamedTuple):
     init: Callable[[jax.Array], TrainingState]
     """key -> state; consumes the key."""
     run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
-    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is that of
-    `first_fault`."""
+    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is the
+    result of `first_fault`."""
 
 
 def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
@@ -142,6 +159,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
     )
 
+    loop_form = Rows if has_kernels() else Unpacked
     casts = config.compute_dtype != "float32"
 
     def cast_inputs(inputs: jax.Array) -> jax.Array:
@@ -191,32 +209,35 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         """Runs the policy for T steps."""
         params, normalizer = cast_params(state.params), state.statistics.normalizer
 
+        first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
+        carry_form = loop_form((state.env, first_inputs.T))
+
         def one_step(carry, draws):
-            env_state, timeout_inputs = carry
+            env_state, timeout_inputs = carry_form.unpack(carry)
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
-            inputs = normalize(raw_inputs, normalizer)
-            distribution = policy_apply(params, cast_inputs(inputs))
+            distribution = policy_apply(params, cast_inputs(normalize(raw_inputs, normalizer)))
             action = distribution.mean + distribution.std * noise
             env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
             timeout_inputs = jnp.where(
-                result.truncated[:, None],
-                make_inputs(result.final_observation, result.metrics),
+                result.truncated,
+                make_inputs(result.final_observation, result.metrics).T,
                 timeout_inputs,
             )
-            step_of_rollout = Rollout(
-                inputs=inputs,
-                action=action,
+            step_of_rollout = StepOfRollout(
+                raw_inputs=raw_inputs.T,
+                action=action.T,
                 log_prob=distribution.log_prob(action),
                 reward=config.reward_scale * result.reward,
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
+            step_forms.append(loop_form(step_of_rollout))
             metrics = Packed.of(step_metrics(result, groups))
-            return (env_state, timeout_inputs), (step_of_rollout, raw_inputs, metrics)
+            carry = carry_form.pack((env_state, timeout_inputs))
+            return carry, (step_forms[-1].pack(step_of_rollout), metrics)
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
-        first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
         noise_key, reset_key = jax.random.split(key)
         # All at once, as on a GPU each draw costs a kernel or two.
         shape = (config.rollout_length, config.num_envs, env.action_size)
@@ -224,8 +245,19 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs))(
             jax.random.split(reset_key, config.rollout_length)
         )
-        (env_state, timeout_inputs), (rollout, raw_inputs, metrics) = jax.lax.scan(
-            one_step, (state.env, first_inputs), (noise, fresh)
+        step_forms: list = []
+        carry = carry_form.pack((state.env, first_inputs.T))
+        carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, fresh))
+        env_state, timeout_inputs = carry_form.unpack(carry)
+        steps = step_forms[-1].unpack(steps)
+        raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)
+        rollout = Rollout(
+            inputs=normalize(raw_inputs, normalizer),
+            action=jnp.swapaxes(steps.action, 1, 2),
+            log_prob=steps.log_prob,
+            reward=steps.reward,
+            terminated=steps.terminated,
+            truncated=steps.truncated,
         )
         last_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
         collection = Collection(
@@ -234,7 +266,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             raw_inputs=raw_inputs,
             statistics=statistics.update(state.statistics, raw_inputs),
             last_inputs=normalize(last_inputs, normalizer),
-            timeout_inputs=normalize(timeout_inputs, normalizer),
+            timeout_inputs=normalize(timeout_inputs.T, normalizer),
         )
         return collection, rollout_metrics(metrics.metrics())
 
@@ -286,50 +318,76 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             "policy/action_std": jnp.mean(distribution.std),
         }
 
+    def xla_gradients() -> MinibatchGradients:
+        """Parameters in one array, so that one kernel clips gradients and one makes a step."""
+
+        def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
+            return samples, (jnp.moveaxis(order, 1, 0), mean, deviation)
+
+        def gradient(flat_params: jax.Array, samples: Samples, minibatch):
+            order, mean, deviation = minibatch
+            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
+            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
+            return jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(flat_params)
+
+        return MinibatchGradients(lambda x: ravel_pytree(x)[0], unravel, shuffle, gradient)
+
+    shapes = jax.eval_shape(
+        lambda key: Params(networks.policy_network.init(key), networks.value_network.init(key)),
+        jax.random.PRNGKey(0),
+    )
+    unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))[1]
+    num_inputs = env.observation_size + len(config.critic_metrics)
+    if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
+        gradients = minibatch_kernel.kernel_gradients(config, env.action_size, shapes)
+    else:
+        gradients = xla_gradients()
+
     def update(state: TrainingState, samples: Samples, key: jax.Array):
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
-
-        # Gradients and parameters as one array: one kernel clips and one makes a step of Adam.
-        flat_params, unravel = ravel_pytree(state.params)
-
-        def minibatch(carry, chosen):
-            params, optimizer_state, learning_rate = carry
-            order, mean, deviation = chosen
-            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
-            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
-            gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
-                params
-            )
-            direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
-            params = params - learning_rate * direction
-            learning_rate = adapt_learning_rate(config, learning_rate, metrics["policy/kl"], limit)
-            metrics["loss/gradient_norm"] = jnp.linalg.norm(gradient)
-            return (params, optimizer_state, learning_rate), Packed.of(metrics)
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
             size = config.batch_steps // groups
             order = jax.vmap(lambda key: jax.random.permutation(key, size))(keys)
             order = order.reshape((groups, config.num_minibatches, -1))
-            # The advantages of all minibatches are measured at once: on several devices each
-            # measurement is a message, and there is one more in every minibatch anyhow.
+            # Mean and deviation of all minibatches at once: on several devices each reduction is a
+            # message, and every minibatch already has one for its gradient.
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
-            chosen = (
-                jnp.moveaxis(order, 1, 0),
-                jnp.mean(advantage, axis=(0, 2)),
-                jnp.std(advantage, axis=(0, 2)),
-            )
-            return jax.lax.scan(minibatch, carry, chosen)
+            mean, deviation = jnp.mean(advantage, axis=(0, 2)), jnp.std(advantage, axis=(0, 2))
+            shuffled, minibatches = gradients.shuffle(samples, order, mean, deviation)
 
-        carry = (flat_params, state.optimizer, state.learning_rate)
-        (flat_params, optimizer_state, learning_rate), packed = jax.lax.scan(
+            def step(carry, minibatch):
+                params, optimizer_state, learning_rate = carry
+                gradient, metrics = gradients.gradient(params, shuffled, minibatch)
+                direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+                params = jax.tree.map(lambda x, d: x - learning_rate * d, params, direction)
+                learning_rate = adapt_learning_rate(
+                    config, learning_rate, metrics["policy/kl"], limit
+                )
+                metrics["loss/gradient_norm"] = optax.global_norm(gradient)
+                return (params, optimizer_state, learning_rate), Packed.of(metrics)
+
+            return jax.lax.scan(step, carry, minibatches)
+
+        # Between updates the optimizer's moments are flat, whichever way computes the gradients.
+        moments = jax.tree.map(
+            lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
+        )
+        carry = (gradients.pack(state.params), moments, state.learning_rate)
+        (params, moments, learning_rate), packed = jax.lax.scan(
             epoch, carry, jax.random.split(key, config.num_epochs)
+        )
+        optimizer_state = jax.tree.map(
+            lambda x, packed: ravel_pytree(gradients.unpack(packed))[0] if x.ndim else packed,
+            state.optimizer,
+            moments,
         )
         metrics = packed.metrics()
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
-        return (unravel(flat_params), optimizer_state, learning_rate), means, metrics
+        return (gradients.unpack(params), optimizer_state, learning_rate), means, metrics
 
     def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
@@ -358,8 +416,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
 
 def population(trainer: Trainer) -> Trainer:
-    """The trainer of S independent trainings at once: keys [S, 2] -> states, their arrays with S
-    as the first axis; metrics are [S, I]."""
+    """A trainer of S independent trainings: keys [S, 2] -> states with S as the first axis of every
+    array; metrics are [S, I]."""
     return Trainer(
         jax.vmap(trainer.init),
         lambda states, num_iterations: jax.vmap(lambda state: trainer.run(state, num_iterations))(
@@ -369,11 +427,11 @@ def population(trainer: Trainer) -> Trainer:
 
 
 def num_groups(config: PPOConfig) -> int:
-    """Number of equal groups that the environments are dealt into, a power of two.
+    """Number of equal groups of environments, a power of two.
 
-    Samples are shuffled within their group, and every minibatch takes as many from each. So a
-    device that holds whole groups shuffles its own samples alone, and as the groups do not depend
-    on the devices, neither does the training.
+    Samples are shuffled within their group, and every minibatch takes equally many from each group.
+    So a device with whole groups shuffles only its own samples; and the training does not depend on
+    the number of devices, as the groups do not.
     """
     groups = max(_MIN_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:

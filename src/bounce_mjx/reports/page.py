@@ -89,14 +89,10 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [
-            f"{e['steps']:,}",
-            *[figure_text(e[name]) for name in names],
-            "pass" if e["passed"] else "screening" if e.get("screening") else "-",
-        ]
+        [f"{e['steps']:,}", *[figure_text(e[name]) for name in names], _outcome(e)]
         for e in results["evaluations"]
     ]
-    resets = ", on resets that no evaluation before had seen" if results["fresh_resets"] else ""
+    resets = "fresh resets" if results["fresh_resets"] else "the resets of the selection"
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -109,18 +105,24 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 <h1>{met} of {len(report.results)} results met</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
 {html.escape(results["device"])}. The best of {len(evaluations)} evaluations, after
-{results["best_steps"]:,} of {results["trained_steps"]:,} environment steps:
-{html.escape(details_line(report))}{resets}.</p>
+{results["best_steps"]:,} of {results["trained_steps"]:,} environment steps, on {resets}:
+{html.escape(details_line(report))}.</p>
 {_results(report)}
 {pictures}
 <h2>Where the time went</h2>
-{_table(["phase", "seconds"], [*phases, ["together", f"{sum(seconds.values()):.1f}"]])}
+{_table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
 <h2>All evaluations</h2>
 {_table(["environment steps", *names, "all five"], evaluations)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>
 </body>
 </html>
 """
+
+
+def _outcome(evaluation: dict[str, Any]) -> str:
+    if evaluation["passed"]:
+        return "pass"
+    return "screening" if evaluation["screening"] else "-"
 
 
 def _results(report: Report) -> str:

@@ -1,4 +1,4 @@
-"""The settings of a training run, and the files that hold them."""
+"""The settings of a training run, and their YAML file."""
 
 import stat
 from pathlib import Path
@@ -18,7 +18,7 @@ _MAX_ALIASES = 10
 
 
 class TrainConfig(StrictModel):
-    """A training run: the task, the trainer, and how long and how often."""
+    """A training run: the task, the trainer, the length and the evaluations."""
 
     env: EnvConfig = EnvConfig()
     """The task."""
@@ -27,10 +27,11 @@ class TrainConfig(StrictModel):
     seed: NonNegativeInt = 0
     """Seed of the whole training."""
     num_seeds: Count = 1
-    """Independent trainings in one program, from seeds `seed`, `seed` + 1, ...; a folder each."""
+    """Independent trainings in one program, with the seeds `seed`, `seed` + 1, ... and a folder for
+    each."""
     num_devices: Count | None = None
-    """Devices that share the environments (with several seeds: the seeds); left out, one, and on
-    several hosts all. The training does not depend on it."""
+    """Devices that share the environments (with several seeds: the seeds). The default is one, or
+    all on several hosts. It does not affect the training's result."""
     total_steps: Steps = 50_000_000
     """Environment steps to train for, rounded up to whole blocks."""
     block_steps: Steps = 1_000_000

@@ -19,7 +19,7 @@ _Steps = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class _Figures(pydantic.BaseModel):
-    """Figures by name: at least those of the class."""
+    """Figures by name, which include the fields of the class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _Figure]

@@ -26,7 +26,7 @@ _DISCARDED = ".discarded"
 
 class CheckpointWriter:
     """Saves the latest and the best checkpoint of a run, each replacing the one before, and the
-    run's results, in a thread beside the training.
+    run's results, in a thread while the training goes on.
 
     What cannot be saved is kept until it can, or until something newer takes its place.
     """

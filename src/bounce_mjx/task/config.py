@@ -18,7 +18,7 @@ class EnvConfig(StrictModel):
     physics: Literal["auto", "fused", "mjx"] = "auto"
     """Physics engine: fused (straight-line, fast), mjx (any MJCF), auto (fused where it can)."""
     mjcf: PlainPath | None = None
-    """MJCF file to simulate; the project's own robot where it is left out."""
+    """MJCF file to simulate; null for the project's own robot."""
     physics_dt: Positive = 0.001
     """Physics time step, s."""
     control_dt: Positive = 0.01
@@ -26,7 +26,7 @@ class EnvConfig(StrictModel):
     episode_seconds: Positive = 20.0
     """Length of an episode before it is truncated, s."""
     action_scale: Positive = 0.02
-    """Change of the servo target that the action 1 asks for, rad."""
+    """Change of the servo target at the action 1, rad."""
     default_joint_angles: ArmVector = tuple(math.radians(a) for a in (0, 40, 110, 0, -60, 0))
     """Joint angles of a reset before noise, rad."""
     joint_angle_noise: NonNegative = 0.1

@@ -128,7 +128,7 @@ class BounceBall:
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
             parameters = self._randomize(world_rng)
-        # One draw for everything: the keys of separate draws would cost more than the numbers.
+        # One draw for all: the keys of separate draws would cost more than the numbers.
         noise = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
         zero = jnp.zeros((), noise.dtype)
         low, high = config.target_height_range
@@ -193,18 +193,22 @@ class BounceBall:
         return jnp.stack(targets)
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
-        """The task's part of a step: bounces, reward, end and observation, given the clipped
-        action [6] and the physics state that it led to (by whichever engine).
+        """The task's part of a step: bounces, reward, end and observation.
 
-        A non-finite physics state ends the episode and is replaced by the one before it, so that
+        A non-finite physics state ends the episode and is replaced by the previous one, so that
         nothing non-finite leaves the environment.
+
+        Args:
+          state: before the step.
+          action: clipped [6].
+          physics: after the step, from any engine.
         """
         config = self.config
         before = state.pipeline_state
         finite = jnp.array(True)
         for coordinates in jax.tree.leaves(physics):
             finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
-        # What came before is itself looked at, in case the memory was damaged.
+        # The previous state is checked too, in case the memory was damaged.
         physics = jax.tree.map(
             lambda new, old: jnp.where(
                 finite, new, jnp.where(jnp.abs(old) < _MAX_COORDINATE, old, 0.0)
@@ -290,8 +294,8 @@ def update_task(
     """Detects a bounce and counts it.
 
     A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
-    the apex before it was no lower than the tolerance below the target height; otherwise the
-    count restarts at 1, which is also what the first bounce of an episode comes to.
+    the apex before it was above the target height minus the tolerance; otherwise the count restarts
+    at 1, which is also the count after the first bounce of an episode.
 
     Args:
       ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.

@@ -4,11 +4,13 @@ Internally the batch is the last axis of every array, so that the physics works 
 coordinates. Observations [B, N] and actions [B, A] have the batch first.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.gpu.elementwise import in_one_kernel
 from bounce_mjx.task.state import Env, State
 
 
@@ -90,7 +92,19 @@ def step_with(
     Args:
       fresh: `first_states` that replace the states of ended episodes.
     """
-    stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
+    # All of it in one function of one environment, which on a GPU becomes one kernel.
+    step_one = in_one_kernel(functools.partial(_step_one, env, episode_steps))
+    state, result = jax.vmap(step_one, in_axes=-1, out_axes=-1)(state, action.T, fresh)
+    return state, result._replace(
+        observation=result.observation.T, final_observation=result.final_observation.T
+    )
+
+
+def _step_one(
+    env: Env, episode_steps: int, state: VectorState, action: jax.Array, fresh: State
+) -> tuple[VectorState, StepResult]:
+    """`step_with` of one environment, without the batch axis."""
+    stepped = env.step(state.env, action)
     clock, length = state.clock + 1, state.length + 1
     episode_return = state.episode_return + stepped.reward
     terminated = stepped.done > 0
@@ -99,8 +113,8 @@ def step_with(
 
     env_state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, stepped)
     result = StepResult(
-        observation=env_state.obs.T,
-        final_observation=stepped.obs.T,
+        observation=env_state.obs,
+        final_observation=stepped.obs,
         reward=stepped.reward,
         terminated=terminated,
         truncated=truncated,

@@ -1,7 +1,7 @@
 """The fused engine's step, unrolled into scalar arithmetic while tracing.
 
 Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physics step into a few
-loops; on a GPU all physics steps of a control step are one kernel (`kernel.py`).
+loops; on a GPU all physics steps of a control step are one kernel (`gpu/elementwise.py`).
 """
 
 import functools
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
-from bounce_mjx.physics.fused.kernel import elementwise
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
 from bounce_mjx.physics.parameters import PhysicsParameters

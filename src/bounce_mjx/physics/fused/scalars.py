@@ -171,7 +171,7 @@ def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     if angle.dtype != jnp.float32:
         return jnp.sin(angle), jnp.cos(angle)
-    quarters = lax.floor(add(mul(angle, 2.0 / math.pi), 0.5))
+    quarters = lax.round(mul(angle, 2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     for part in _HALF_PI:
         angle = sub(angle, mul(quarters, part))
     square = mul(angle, angle)

@@ -1,0 +1,1 @@
+"""GPU kernels of elementwise functions, and where they run."""

@@ -1,0 +1,222 @@
+"""A long elementwise function as one GPU kernel.
+
+XLA makes a loop of physics steps into one kernel a step, with a copy of every coordinate before the
+first, and takes seconds to fuse one of them. Here the whole function, its loops included, becomes
+one kernel of Pallas' Mosaic GPU backend, in which a thread keeps one environment in its registers.
+
+XLA compiles the function everywhere else: on a CPU, on GPUs before NVIDIA's Hopper, for other types
+than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.custom_partitioning import custom_partitioning
+
+from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
+
+Arrays = tuple[jax.Array, ...]
+ElementwiseFunction = Callable[..., Arrays]
+Tree = Any
+
+# Environments in a block: the 128 threads of a warpgroup, with which Mosaic GPU computes.
+_BLOCK = 128
+
+
+def elementwise(
+    function: ElementwiseFunction, num_results: int, interpret: bool = False
+) -> ElementwiseFunction:
+    """The same function of K arrays of one shape, with a GPU kernel for its batches.
+
+    Args:
+      function: K arrays of one shape and type -> a tuple of arrays of that shape and type, by
+        elementwise operations alone.
+      num_results: length of that tuple; to count it here would mean another trace.
+      interpret: runs the kernel in Pallas' interpreter on any device, for tests.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def call(*args: jax.Array) -> Arrays:
+        if args[0].ndim == 0:
+            return function(*args)
+        if interpret:
+            return in_kernel(function, num_results, args, interpret)
+        return jax.lax.platform_dependent(
+            *args, cuda=lambda *args: in_kernel(function, num_results, args), default=function
+        )
+
+    @call.def_vmap
+    def batched(axis_size: int, in_batched: list[bool], *args: jax.Array):
+        args = [
+            x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            for x, is_batched in zip(args, in_batched, strict=True)
+        ]
+        results = call(*args)
+        return results, (True,) * len(results)
+
+    def chosen(*args: jax.Array) -> Arrays:
+        float32 = all(x.dtype == jnp.float32 for x in args)
+        return (call if float32 and (interpret or has_kernels()) else function)(*args)
+
+    return chosen
+
+
+def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Callable[..., Tree]:
+    """The same function of pytrees of small arrays, with one GPU kernel for its batches.
+
+    Where a batch of it, made by `jax.vmap`, runs on a GPU, a thread computes one element. The
+    function stays as it is where there are no kernels, for float64, and where it does what has no
+    form for scalars (`scalars.as_scalars`).
+
+    Args:
+      interpret: runs the kernel in Pallas' interpreter on any device, for tests.
+    """
+
+    def wrapped(*args: Tree) -> Tree:
+        leaves, tree = jax.tree.flatten(args)
+        types = {x.dtype for x in leaves}
+        if not (interpret or has_kernels()) or not types <= KERNEL_TYPES:
+            return function(*args)
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+        result_tree = []
+
+        def flat_function(*leaves: jax.Array) -> list[jax.Array]:
+            results, structure = jax.tree.flatten(function(*tree.unflatten(leaves)))
+            result_tree.append(structure)
+            return results
+
+        try:
+            scalar_function = as_scalars(flat_function, shapes)
+        except UnsupportedOperation:
+            return function(*args)
+        if not set(scalar_function.dtypes) <= KERNEL_TYPES:
+            return function(*args)
+
+        scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
+        used = list(itertools.compress(scalars, scalar_function.used))
+
+        def on_floats(*floats: jax.Array) -> Arrays:
+            given = iter(floats)
+            every = [
+                from_float(next(given), x.dtype) if needed else np.zeros((), x.dtype)
+                for x, needed in zip(scalars, scalar_function.used, strict=True)
+            ]
+            results = scalar_function.call(*every)
+            shape = floats[0].shape
+            return tuple(jnp.broadcast_to(to_float(x), shape) for x in results)
+
+        num_results = len(scalar_function.dtypes)
+        floats = elementwise(on_floats, num_results, interpret)(*map(to_float, used))
+        results = [
+            from_float(x, dtype) for x, dtype in zip(floats, scalar_function.dtypes, strict=True)
+        ]
+        arrays = [
+            jnp.stack([results[i] for i in positions.flat]).reshape(positions.shape)
+            if positions.ndim
+            else results[int(positions)]
+            for positions in scalar_function.positions
+        ]
+        return result_tree[-1].unflatten(arrays)
+
+    return wrapped
+
+
+KERNEL_TYPES = {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32), jnp.dtype(jnp.bool_)}
+
+
+def to_float(x: jax.Array) -> jax.Array:
+    """A number of a kernel's type as float32; an integer keeps its bits."""
+    x = jnp.asarray(x)
+    if x.dtype == jnp.int32:
+        return jax.lax.bitcast_convert_type(x, jnp.float32)
+    return x.astype(jnp.float32)
+
+
+def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """The inverse of `to_float`."""
+    if dtype == jnp.int32:
+        return jax.lax.bitcast_convert_type(x, jnp.int32)
+    return x > 0.5 if dtype == jnp.bool_ else x
+
+
+def in_kernel(
+    function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
+) -> Arrays:
+    """Runs `function` on arrays [...] in one kernel; each of several devices computes its shard."""
+
+    def run(packed: jax.Array) -> jax.Array:
+        rows, *batch = packed.shape
+        flat = packed.reshape(rows, math.prod(batch))
+        return _run_packed(function, flat, num_results, interpret).reshape(num_results, *batch)
+
+    packed = jnp.stack(args)
+    # On one device a partitioning would only keep the program out of the compilation cache.
+    results = run(packed) if jax.device_count() == 1 else _partitioned(run, packed)
+    return tuple(results[i] for i in range(num_results))
+
+
+def _partitioned(run: Callable[[jax.Array], jax.Array], packed: jax.Array) -> jax.Array:
+    """`run` on an array [rows, ...], the shards of which need nothing of each other."""
+    partitioned = custom_partitioning(run)
+
+    def partition(mesh, arg_shapes, result_shape):
+        del result_shape
+        spec = jax.sharding.PartitionSpec(None, *arg_shapes[0].sharding.spec[1:])
+        kept = jax.sharding.NamedSharding(mesh, spec)
+        return mesh, run, kept, (kept,)
+
+    axes = " ".join(f"b{i}" for i in range(packed.ndim - 1))
+    partitioned.def_partition(
+        partition=partition,
+        infer_sharding_from_operands=lambda mesh, args, _: args[0].sharding,
+        sharding_rule=f"rows {axes} -> results {axes}",
+        need_replication_factors=("rows", "results"),
+    )
+    return partitioned(packed)
+
+
+def _run_packed(
+    function: ElementwiseFunction, packed: jax.Array, num_results: int, interpret: bool
+) -> jax.Array:
+    """Arguments [rows, N] -> results [num_results, N]."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import mosaic_gpu as plgpu
+
+    num_rows, size = packed.shape
+    num_blocks = -(-size // _BLOCK)
+    out_type = jax.ShapeDtypeStruct((num_results, num_blocks * _BLOCK), packed.dtype)
+
+    def kernel(block: jax.Array, load: Callable, args_ref, results_ref) -> None:
+        columns = pl.ds(block * _BLOCK, _BLOCK)
+        args = [load(args_ref.at[row, columns]) for row in range(num_rows)]
+        for row, result in enumerate(function(*args)):
+            results_ref[row, columns] = result
+
+    if interpret:
+        run = pl.pallas_call(
+            lambda *refs: kernel(pl.program_id(0), lambda ref: ref[...], *refs),
+            grid=(num_blocks,),
+            out_shape=out_type,
+            interpret=True,
+        )
+    else:
+        load = functools.partial(
+            plgpu.load, idx=(), layout=plgpu.Layout.WG_STRIDED((_BLOCK,), 1), optimized=False
+        )
+        run = plgpu.kernel(
+            lambda *refs: kernel(jax.lax.axis_index("block"), load, *refs),
+            out_type=out_type,
+            grid=(num_blocks,),
+            grid_names=("block",),
+            # Each thread computes environments of its own. With the other semantics, vectors of a
+            # warpgroup, the kernel takes ten times as long to compile and runs as fast.
+            compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
+        )
+    return run(jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size))))[:, :size]
