@@ -23,7 +23,8 @@ TINY = (
     "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
     "--no-stop-when-solved --episode-seconds 0.5"
 ).split()
-TIMEOUT = 120.0
+# Generous, as a busy machine compiles slowly.
+TIMEOUT = 300.0
 
 
 def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
