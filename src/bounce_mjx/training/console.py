@@ -69,7 +69,7 @@ class Reporter:
         """
         means = {name: _finite_mean(values) for name, values in metrics.items()}
         # A sum: a mean would hide one event in many iterations.
-        non_finite = np.sum(metrics["task/non_finite"], axis=1)
+        non_finite = np.nansum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
         for name, of_seeds in means.items():
             for log, value in zip(self._logs, of_seeds, strict=False):

@@ -14,6 +14,9 @@ from bounce_mjx.learning.policy import Policy
 
 State = dict[str, Any]
 
+# The quantities that may not become infinite or NaN, in the order of their computation.
+CHECKED = ("reward", "loss/value", "loss/policy", "parameters")
+
 
 class Learner(abc.ABC):
     """A library's PPO on a batch of environments.
@@ -23,6 +26,8 @@ class Learner(abc.ABC):
     """
 
     library: ClassVar[str]
+    losses: ClassVar[tuple[str, ...]]
+    """Names of the metrics of an update."""
     optimizer: torch.optim.Adam
     iteration: int = 0
     """Iterations done."""
@@ -37,24 +42,37 @@ class Learner(abc.ABC):
         _set_random_state(vector.device, outside)
 
     def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`.
+        """Trains for `iterations`, or until the parameters are not finite: from there on the
+        library would raise exceptions.
 
         Returns:
-          The environment's metrics of each step [iterations, T], and the losses [iterations].
+          The environment's metrics of each step [iterations, T], the losses [iterations], and
+          "fault" [iterations]: the number, from 1, of the first of `CHECKED` that was not finite,
+          else 0. All others are NaN in the iterations that were not run.
         """
         outside = _random_state(self.vector.device)
         _set_random_state(self.vector.device, self._random)
-        rollouts, losses = [], []
-        for _ in range(iterations):
+        names = self.vector.metric_names
+        per_step = np.full((iterations, self.config.rollout_length, len(names)), np.nan, np.float32)
+        losses = {name: np.full(iterations, np.nan) for name in self.losses}
+        faults = np.full(iterations, len(CHECKED))
+        finite = self._is_finite()
+        for i in range(iterations):
+            if not finite:
+                break
             rollout, loss = self._iterate()
-            rollouts.append(rollout)
-            losses.append(loss)
             self.iteration += 1
+            per_step[i] = rollout.cpu().numpy()
+            for name in losses:
+                losses[name][i] = loss[name]
+            finite = self._is_finite()
+            reward = per_step[i, :, names.index("reward")].mean()
+            checked = (reward, loss["loss/value"], loss["loss/policy"], 0.0 if finite else np.nan)
+            faults[i] = 0 if np.isfinite(checked).all() else np.argmin(np.isfinite(checked)) + 1
         self._random = _random_state(self.vector.device)
         _set_random_state(self.vector.device, outside)
-        per_step = torch.stack(rollouts).cpu().numpy()
-        metrics = {name: per_step[..., i] for i, name in enumerate(self.vector.metric_names)}
-        return metrics | {name: np.array([x[name] for x in losses]) for name in losses[0]}
+        metrics = {name: per_step[..., i] for i, name in enumerate(names)}
+        return metrics | losses | {"fault": faults}
 
     def state(self) -> State:
         """Everything that training goes on from, as nested dictionaries of numpy arrays."""
@@ -94,10 +112,6 @@ class Learner(abc.ABC):
         self._observe(**{n: _to_tensor(state["observed"][n], tensor) for n, tensor in observed})
         self._random = {name: torch.from_numpy(np.array(x)) for name, x in state["random"].items()}
 
-    def is_finite(self) -> bool:
-        """Whether every parameter is finite."""
-        return all(bool(parameter.isfinite().all()) for parameter in self._parameters())
-
     @abc.abstractmethod
     def policy(self) -> Policy:
         """The policy as it acts now, without its noise."""
@@ -108,7 +122,7 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def _iterate(self) -> tuple[torch.Tensor, dict[str, float]]:
-        """One iteration: the environment's metrics of each step [T, M], and the losses."""
+        """One iteration: the environment's metrics of each step [T, M], and the `losses`."""
 
     @abc.abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
@@ -125,6 +139,10 @@ class Learner(abc.ABC):
     @abc.abstractmethod
     def _observe(self, **observed: torch.Tensor) -> None:
         """Sets the tensors of `_observed`."""
+
+    def _is_finite(self) -> bool:
+        """Whether every parameter is finite."""
+        return bool(torch.stack([p.isfinite().all() for p in self._parameters()]).all())
 
     def _parameters(self) -> list[nn.Parameter]:
         return [p for group in self.optimizer.param_groups for p in group["params"]]

@@ -130,6 +130,7 @@ class RslRlLearner(Learner):
     would wait for the device at every step."""
 
     library = "rsl_rl"
+    losses = ("loss/policy", "loss/value", "policy/entropy", "policy/learning_rate")
 
     def _build(self) -> None:
         self.env = RslRlVecEnv(self.vector)

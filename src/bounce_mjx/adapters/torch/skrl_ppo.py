@@ -115,6 +115,7 @@ class SkrlLearner(Learner):
     bootstraps time-outs from them."""
 
     library = "skrl"
+    losses = ("loss/policy", "loss/value", "policy/action_std", "policy/learning_rate")
 
     def _build(self) -> None:
         self.env = SkrlEnv(self.vector)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from bounce_mjx.adapters.torch.learner import Learner
+from bounce_mjx.adapters.torch.learner import CHECKED, Learner
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
@@ -24,7 +24,7 @@ _LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
 class TorchTrainer:
     """A library's PPO, its seeds one after another; see `training.trainer.Trainer`."""
 
-    checked = ("reward", "loss/value", "loss/policy", "parameters")
+    checked = CHECKED
 
     def __init__(self, library: str, config: TrainConfig, env: BounceBall):
         """
@@ -44,7 +44,6 @@ class TorchTrainer:
         for seed in range(config.seed, config.seed + config.num_seeds):
             vector = first.sibling(seed) if self.learners else first
             self.learners.append(_learner_class(library)(config.ppo, vector, seed))
-        self._diverged: set[int] = set()
 
     def state_template(self) -> Any:
         one = jax.tree.map(np.asarray, self.learners[0].state())
@@ -63,26 +62,10 @@ class TorchTrainer:
             if len(self.learners) > 1:
                 one = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
             learner.restore(one)
-            if not learner.is_finite():
-                self._diverged.add(i)
 
     def run(self) -> Metrics:
-        blocks = {
-            i: summarize(learner.learn(self._iterations))
-            for i, learner in enumerate(self.learners)
-            if i not in self._diverged
-        }
-        for i, block in blocks.items():
-            block["fault"] = faults(block, self.learners[i].is_finite())
-            if block["fault"].any():
-                self._diverged.add(i)
-        # A library may raise exceptions for what is not finite, so a diverged seed only waits.
-        names = next(iter(blocks.values()))
-        nothing = {name: np.full(self._iterations, np.nan) for name in names}
-        nothing |= {"task/non_finite": np.zeros(self._iterations)}
-        nothing |= {"fault": np.full(self._iterations, len(self.checked))}
-        of_seeds = [blocks.get(i, nothing) for i in range(len(self.learners))]
-        return {name: np.stack([block[name] for block in of_seeds]) for name in names}
+        blocks = [summarize(learner.learn(self._iterations)) for learner in self.learners]
+        return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
         snapshots = [
@@ -122,22 +105,6 @@ def summarize(metrics: Metrics) -> Metrics:
     return own | {
         name: np.asarray(value) for name, value in jax.vmap(rollout_metrics)(steps).items()
     }
-
-
-def faults(metrics: Metrics, finite_parameters: bool) -> np.ndarray:
-    """The metric "fault" [I] of a learner's block.
-
-    Args:
-      metrics: each [I].
-      finite_parameters: whether the parameters were finite at the end.
-    """
-    *names, _ = TorchTrainer.checked
-    numbers = np.zeros(len(metrics["reward"]), int)
-    if not finite_parameters:
-        numbers[-1] = len(TorchTrainer.checked)
-    for number, name in reversed(list(enumerate(names, start=1))):
-        numbers[~np.isfinite(metrics[name])] = number
-    return numbers
 
 
 def _learner_class(library: str) -> type[Learner]:
