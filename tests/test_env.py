@@ -158,7 +158,7 @@ def test_task_page_has_the_layout():
     page = (Path(__file__).parent.parent / "docs/task.md").read_text(encoding="utf-8")
     table = page.split("## Observation")[1].split("##")[0]
     rows = re.findall(
-        r"^\| (\d+)(?:-(\d+))? \| .* \| `(\w+)` \| .* \| (.*?) ?\|$", table, re.MULTILINE
+        r"^\| (\d+)(?:-(\d+))? \| .* \| `(\w+)` \|.*\| (.*?) ?\|$", table, re.MULTILINE
     )
     found = [(name, int(last or first) + 1 - int(first), unit) for first, last, name, unit in rows]
     assert found == [tuple(part) for part in OBSERVATION.parts]

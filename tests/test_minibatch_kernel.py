@@ -96,6 +96,9 @@ def test_packing_is_undone_and_pads_with_zeros():
         np.testing.assert_array_equal(ours, theirs)
     squares = [sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(t)) for t in (packed, params)]
     assert squares[0] == pytest.approx(squares[1], rel=1e-6)
+    ones = minibatch_kernel.pack(jax.tree.map(jnp.ones_like, params))
+    for mask, one in zip(minibatch_kernel.parameter_mask(params), ones, strict=True):
+        np.testing.assert_array_equal(mask, one > 0.0)
 
 
 def test_gradient_and_metrics_are_those_of_the_loss(interpret, monkeypatch):

@@ -7,7 +7,8 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation import results as evaluation
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning import policy, ppo
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
@@ -482,9 +483,9 @@ def test_ppo_learns_to_bounce():
     networks = policy.make_networks(config, env.observation_size, env.action_size)
     unseen = jax.random.key(1234)
     policies = [ppo.policy_of(untrained), ppo.policy_of(trained)]
-    evaluate = evaluation.make_evaluator(env, networks, episodes=64).lower(policies[0], unseen)
+    evaluate = make_evaluator(env, networks, episodes=64).lower(policies[0], unseen)
     evaluate = evaluate.compile()
-    before, after = (evaluation.judge(env, evaluate(p, unseen)).details for p in policies)
+    before, after = (judge(env, evaluate(p, unseen)).details for p in policies)
     assert after["mean_return"] > 3 * before["mean_return"]
     assert after["mean_consecutive_bounces"] > before["mean_consecutive_bounces"] + 2
     rewards = np.asarray(metrics["reward"])

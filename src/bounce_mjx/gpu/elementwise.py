@@ -102,15 +102,19 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
         scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
         used = list(itertools.compress(scalars, scalar_function.used))
 
+        # Jitted inline, so that JAX traces it once for every batch size.
+        call = jax.jit(scalar_function.call, inline=True)
+
         def on_floats(*floats: jax.Array) -> Arrays:
             given = iter(floats)
             every = [
-                from_float(next(given), x.dtype) if needed else np.zeros((), x.dtype)
+                from_float(next(given), x.dtype) if needed else jnp.zeros(floats[0].shape, x.dtype)
                 for x, needed in zip(scalars, scalar_function.used, strict=True)
             ]
-            results = scalar_function.call(*every)
-            shape = floats[0].shape
-            return tuple(jnp.broadcast_to(to_float(x), shape) for x in results)
+            batched = call
+            for _ in range(floats[0].ndim):
+                batched = jax.vmap(batched)
+            return tuple(map(to_float, batched(*every)))
 
         num_results = len(scalar_function.dtypes)
         floats = elementwise(on_floats, num_results, interpret)(*map(to_float, used))

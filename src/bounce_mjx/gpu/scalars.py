@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 Scalar = jax.Array | np.generic
 # An array of scalars, of dtype object.
@@ -76,32 +76,26 @@ def as_scalars(
     """
     closed = jax.make_jaxpr(function)(*args)
     consts = [_constant(c) for c in closed.consts]
+    positions = []
 
-    def evaluate(scalars: Sequence[Scalar]) -> tuple[list[Scalars], dict[int, Scalar]]:
+    def on_scalars(*scalars: jax.Array) -> list[jax.Array]:
         remaining = iter(scalars)
-        arrays = [_filled(a.shape, remaining) for a in args]
-        results = _evaluate(closed.jaxpr, consts, arrays)
-        return results, {id(x): x for result in results for x in result.flat}
-
-    positions, dtypes = [], []
-
-    def probe(*scalars: jax.Array) -> list[jax.Array]:
-        results, distinct = evaluate(scalars)
+        results = _evaluate(closed.jaxpr, consts, [_filled(a.shape, remaining) for a in args])
+        distinct = {id(x): x for result in results for x in result.flat}
         order = {key: i for i, key in enumerate(distinct)}
         for result in results:
             flat = [order[id(x)] for x in result.flat]
             positions.append(np.array(flat, int).reshape(result.shape))
-        dtypes.extend(jnp.result_type(x) for x in distinct.values())
         return [jnp.asarray(x) for x in distinct.values()]
 
     one_each = [jax.ShapeDtypeStruct((), a.dtype) for a in args for _ in range(math.prod(a.shape))]
-    trace = jax.make_jaxpr(probe)(*one_each).jaxpr
-    needed = _needed(trace)
+    trace = jax.make_jaxpr(on_scalars)(*one_each)
+    needed = _needed(trace.jaxpr)
     return ScalarFunction(
-        call=lambda *scalars: list(evaluate(scalars)[1].values()),
+        call=jaxpr_as_fun(trace),
         positions=positions,
-        dtypes=dtypes,
-        used=[v in needed for v in trace.invars],
+        dtypes=[v.aval.dtype for v in trace.jaxpr.outvars],
+        used=[v in needed for v in trace.jaxpr.invars],
     )
 
 
@@ -137,12 +131,6 @@ def _each(operation: Callable[..., Scalar], *arrays: Scalars) -> Scalars:
     return result
 
 
-def _like_shaped(*scalars: Scalar) -> list[Scalar]:
-    """Constants and scalars in one shape, as in a kernel a scalar is a block of environments."""
-    shape = np.broadcast_shapes(*(jnp.shape(x) for x in scalars))
-    return [x if jnp.shape(x) == shape else jnp.broadcast_to(x, shape) for x in scalars]
-
-
 def _evaluate(jaxpr: Jaxpr, consts: Sequence[Scalars], args: Sequence[Scalars]) -> list[Scalars]:
     values: dict[Any, Scalars] = {}
 
@@ -162,7 +150,7 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
     name, params = equation.primitive.name, equation.params
     if name in _ELEMENTWISE:
         bind = functools.partial(equation.primitive.bind, **params)
-        return [_each(lambda *xs: bind(*_like_shaped(*xs)), *_same_rank(args))]
+        return [_each(bind, *_same_rank(args))]
     if name in _REWRITTEN:
         return [_each(_REWRITTEN[name], *_same_rank(args))]
     if name in _REDUCTIONS:
@@ -191,7 +179,7 @@ def _reduce(operation: Callable[..., Scalar], array: Scalars, axes: Sequence[int
     rows = array.transpose(*kept, *axes).reshape([array.shape[i] for i in kept] + [-1])
     result = np.empty(rows.shape[:-1], object)
     for index in np.ndindex(*result.shape):
-        result[index] = functools.reduce(lambda a, b: operation(*_like_shaped(a, b)), rows[index])
+        result[index] = functools.reduce(operation, rows[index])
     return result
 
 
@@ -204,15 +192,14 @@ def _scan(equation, args: list[Scalars]) -> list[Scalars]:
     num_consts = len(args) - num_carry
     consts, carry = args[:num_consts], args[num_consts:]
     flat = [x for a in carry for x in a.flat]
-    shape = np.broadcast_shapes(*(jnp.shape(x) for x in flat))
 
     def body(_, scalars):
         remaining = iter(scalars)
         arrays = [_filled(a.shape, remaining) for a in carry]
         outs = _evaluate(inner.jaxpr, [_constant(c) for c in inner.consts], [*consts, *arrays])
-        return tuple(jnp.broadcast_to(x, shape) for out in outs for x in out.flat)
+        return tuple(jnp.asarray(x) for out in outs for x in out.flat)
 
-    start = tuple(jnp.broadcast_to(x, shape) for x in flat)
+    start = tuple(map(jnp.asarray, flat))
     end = iter(lax.fori_loop(0, equation.params["length"], body, start))
     return [_filled(a.shape, end) for a in carry]
 

@@ -98,10 +98,7 @@ def kernel_gradients(
     Args:
       shapes: of the parameters of the policy and of the value network.
     """
-    ones = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), shapes)
-    with jax.ensure_compile_time_eval():
-        # Only these numbers of the packed parameters are parameters; the rest is padding.
-        is_parameter = jax.tree.map(lambda x: np.asarray(x) > 0.0, pack(ones))
+    is_parameter = parameter_mask(shapes)
 
     def unpack(packed: PackedParams) -> tuple[Any, Any]:
         # Packing moves each number to one place, so its transpose moves it back.
@@ -139,6 +136,26 @@ def kernel_gradients(
         return gradient, metrics
 
     return MinibatchGradients(pack, unpack, shuffle, gradient)
+
+
+def parameter_mask(shapes: tuple[Any, Any]) -> PackedParams:
+    """Which numbers of the packed parameters are parameters and not padding, bool; NumPy, as JAX
+    would compile programs for it."""
+    policy, value = (network["params"] for network in shapes)
+    width = value["hidden_1"]["kernel"].shape[0]
+    num_actions = policy["Dense_0"]["kernel"].shape[1]
+    hidden = np.zeros((2, NUM_INPUTS + width + _BIAS_ROWS, width), bool)
+    output = np.zeros((2, width + _BIAS_ROWS, NUM_OUTPUTS), bool)
+    num_inputs = (
+        policy["MLP_0"]["hidden_0"]["kernel"].shape[0],
+        value["hidden_0"]["kernel"].shape[0],
+    )
+    for i, (inputs, outputs) in enumerate(zip(num_inputs, (num_actions, 1), strict=True)):
+        hidden[i, :inputs] = True
+        hidden[i, NUM_INPUTS - 1 : NUM_INPUTS + width + 1] = True
+        output[i, : width + 1, :outputs] = True
+    output[0, width + 1, :num_actions] = True
+    return PackedParams(hidden, output)
 
 
 def _pad_last(x: jax.Array, size: int, value: float = 0.0) -> jax.Array:

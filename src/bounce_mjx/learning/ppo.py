@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
@@ -318,7 +317,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             "policy/action_std": jnp.mean(distribution.std),
         }
 
-    def xla_gradients() -> MinibatchGradients:
+    def xla_gradients(unravel: Callable[[jax.Array], Params]) -> MinibatchGradients:
         """Parameters in one array, so that one kernel clips gradients and one makes a step."""
 
         def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
@@ -332,20 +331,16 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
         return MinibatchGradients(lambda x: ravel_pytree(x)[0], unravel, shuffle, gradient)
 
-    shapes = jax.eval_shape(
-        lambda key: Params(networks.policy_network.init(key), networks.value_network.init(key)),
-        jax.random.PRNGKey(0),
-    )
-    unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))[1]
-    num_inputs = env.observation_size + len(config.critic_metrics)
-    if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
-        gradients = minibatch_kernel.kernel_gradients(config, env.action_size, shapes)
-    else:
-        gradients = xla_gradients()
+    def make_gradients(params: Params) -> MinibatchGradients:
+        num_inputs = env.observation_size + len(config.critic_metrics)
+        if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
+            return minibatch_kernel.kernel_gradients(config, env.action_size, params)
+        return xla_gradients(ravel_pytree(params)[1])
 
     def update(state: TrainingState, samples: Samples, key: jax.Array):
         """Several epochs of minibatch steps."""
         limit = max_learning_rate(config, state.iteration)
+        gradients, unravel = make_gradients(state.params), ravel_pytree(state.params)[1]
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
