@@ -1,0 +1,128 @@
+"""Functions of small arrays as functions of scalars, and the control step as one kernel."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall
+from bounce_mjx.gpu import elementwise
+from bounce_mjx.gpu.rows import Rows
+from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
+from bounce_mjx.task import vector
+
+# No multiple of a block.
+BATCH = 70
+EPISODE_STEPS = 2000
+
+
+def evaluate(function, *args):
+    """A function of arrays, which returns a list of arrays, through its scalars."""
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
+    scalar_function = as_scalars(function, shapes)
+    scalars = [x[index] for x in args for index in np.ndindex(*x.shape)]
+    results = scalar_function.call(*scalars)
+    return [
+        np.array([results[i] for i in p.flat]).reshape(p.shape) for p in scalar_function.positions
+    ]
+
+
+def shapes_and_sums(x, y):
+    stacked = jnp.stack([x[0], x[1:].sum(axis=0), jnp.flip(y)])
+    return [stacked.T, jnp.concatenate([x, y[None]]).max(axis=1), (x > 0.0).any()]
+
+
+def calls_and_loops(x, y):
+    looped = jax.lax.fori_loop(0, 5, lambda _, c: (c[0] * 0.5 + c[1][0], c[1] - 0.1), (x[0, 0], y))
+    return [looped[1], jax.jit(jnp.tanh)(looped[0]), jax.nn.relu(x)]
+
+
+def rewritten_operations(x, y):
+    return [
+        jax.nn.sigmoid(x),
+        jnp.sqrt(jnp.abs(y)),
+        jnp.log1p(jnp.abs(x)),
+        jnp.floor(3.7 * x),
+        jnp.clip(y, -0.2, 0.3),
+        jnp.isfinite(x / jnp.where(y[0] > 100.0, 0.0, 1.0)),
+        jnp.linalg.norm(x, axis=1),
+        jnp.abs(y) ** 1.5,
+    ]
+
+
+@pytest.mark.parametrize("function", [shapes_and_sums, calls_and_loops, rewritten_operations])
+def test_scalars_give_the_arrays(function):
+    x, y = jax.random.normal(jax.random.PRNGKey(0), (3, 4)), jnp.array([0.5, -1.5, 0.0, 2.0])
+    for ours, theirs in zip(evaluate(function, x, y), function(x, y), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
+
+
+def test_equal_entries_are_one_scalar_and_unused_ones_are_told():
+    shape = jax.ShapeDtypeStruct((3,), jnp.float32)
+    scalar_function = as_scalars(lambda x, y: [x, jnp.stack([x[2], x[0]]), x[0] + 1.0], [shape] * 2)
+    assert len(scalar_function.dtypes) == 4
+    assert scalar_function.used == [True] * 3 + [False] * 3
+    assert scalar_function.positions[1].tolist() == [2, 0]
+
+
+@pytest.mark.parametrize("function", [lambda x: [jnp.sort(x)], lambda x: [x[jnp.argmax(x)]]])
+def test_what_has_no_scalar_form_is_refused(function):
+    with pytest.raises(UnsupportedOperation):
+        as_scalars(function, [jax.ShapeDtypeStruct((3,), jnp.float32)])
+
+
+def test_what_has_no_scalar_form_stays_as_it_is():
+    x = jax.random.normal(jax.random.PRNGKey(0), (BATCH, 3))
+    program = jax.vmap(elementwise.in_one_kernel(jnp.sort, interpret=True))
+    assert "pallas_call" not in str(jax.make_jaxpr(program)(x))
+    np.testing.assert_array_equal(program(x), jnp.sort(x))
+
+
+def test_rows_hold_every_type():
+    tree = {
+        "float": jax.random.normal(jax.random.PRNGKey(0), (2, 3, 5)),
+        "int": jnp.array([0, 1, -7, 2**31 - 1, -(2**31)], jnp.int32),
+        "bool": jnp.array([[True, False, True, True, False]]),
+    }
+    rows = Rows(tree)
+    packed = rows.pack(tree)
+    assert packed.shape == (8, 5) and packed.dtype == jnp.float32
+    twice = rows.unpack(jnp.stack([packed, packed]))
+    for name, expected in tree.items():
+        assert twice[name].dtype == expected.dtype
+        np.testing.assert_array_equal(twice[name][1], expected)
+
+
+def test_the_control_step_is_one_kernel(monkeypatch):
+    """Physics, task, reward, ends, time-outs and resets, against the program without a kernel."""
+    env = BounceBall()
+    reset_key, action_key, fresh_key = jax.random.split(jax.random.PRNGKey(0), 3)
+    state = jax.jit(lambda key: vector.reset(env, key, BATCH))(reset_key)
+    # Some time out at this step, and some lose the ball.
+    state = state._replace(clock=EPISODE_STEPS - 1 - jnp.arange(BATCH, dtype=jnp.int32) % 3)
+    physics = state.env.pipeline_state.physics
+    height = env._addresses.ball_qpos[2]
+    qpos = physics.qpos.at[height, ::5].set(0.04)
+    pipeline_state = state.env.pipeline_state._replace(physics=physics._replace(qpos=qpos))
+    state = state._replace(env=state.env.replace(pipeline_state=pipeline_state))
+    action = jax.random.uniform(action_key, (BATCH, 6), minval=-1.5, maxval=1.5)
+    fresh = jax.jit(lambda key: vector.first_states(env, key, BATCH))(fresh_key)
+
+    def step(state, action, fresh):
+        return vector.step_with(env, state, action, fresh, EPISODE_STEPS)
+
+    expected = jax.jit(step)(state, action, fresh)
+    assert expected[1].truncated.any() and expected[1].terminated.any()
+    in_one_kernel = functools.partial(elementwise.in_one_kernel, interpret=True)
+    monkeypatch.setattr(vector, "in_one_kernel", in_one_kernel)
+    program = jax.jit(lambda *args: step(*args)).trace(state, action, fresh)
+    assert str(program.jaxpr).count("pallas_call") == 1
+    found = program.lower().compile()(state, action, fresh)
+    for (path, ours), theirs in zip(
+        jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(expected), strict=True
+    ):
+        name = jax.tree_util.keystr(path)
+        assert ours.dtype == theirs.dtype, name
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5, err_msg=name)
