@@ -1,5 +1,6 @@
 """The documentation: links resolve, commands and flags exist, and what it quotes is true."""
 
+import ast
 import importlib
 import inspect
 import pkgutil
@@ -291,3 +292,19 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
     engine = BounceBall(EnvConfig(mjcf=tmp_path / "euler.xml")).engine
     page = (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8")
     assert f"    physics: {engine.name} ({engine.reason})\n" in page
+
+
+def test_packages_import_in_the_order_of_the_map():
+    """The map's promise: each folder of the package imports only from the rows above it."""
+    section = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("## Where things are\n")[1]
+    order = re.findall(r"^\| `src/bounce_mjx/(\w+)/`", section, re.MULTILINE)
+    package = CHECKOUT / "src" / "bounce_mjx"
+    against = []
+    for i, folder in enumerate(order):
+        for path in (package / folder).rglob("*.py"):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            modules = [n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+            imported = {m.split(".")[1] for m in modules if m and m.startswith("bounce_mjx.")}
+            if wrong := imported & set(order[i + 1 :]):
+                against.append(f"{path.relative_to(package)} imports {wrong}")
+    assert order and not against
