@@ -177,7 +177,7 @@ def test_flag_is_judged_on_top_of_the_config_file(fails: Fails, tmp_path: Path) 
 
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 BAD_MJCF = {
-    "text": ("hello", "does not compile", "mend it"),
+    "text": ("hello", "does not compile", "correct it"),
     "joint": (MJCF.replace('"Joint3"', '"Elbow"'), "no joint named Joint3", "needs the names"),
     "paddle": (MJCF.replace('"blocker"', '"bat"'), "no geom named blocker", "needs the names"),
     "ball": (MJCF.replace('"ball_link"', '"ball"'), "no body named ball_link", "needs the names"),
