@@ -361,7 +361,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 learning_rate = adapt_learning_rate(
                     config, learning_rate, metrics["policy/kl"], limit
                 )
-                metrics["loss/gradient_norm"] = optax.global_norm(gradient)
+                squares = [jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradient)]
+                metrics["loss/gradient_norm"] = jnp.sqrt(sum(squares))
                 return (params, optimizer_state, learning_rate), Packed.of(metrics)
 
             return jax.lax.scan(step, carry, minibatches)
