@@ -32,7 +32,7 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     runs_of_seeds,
 )
-from bounce_mjx.training import devices, hosts
+from bounce_mjx.training import devices, hosts, setup
 from bounce_mjx.training.peers import Peers
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from tiny_runs import STEPS, TINY, arrays, job
@@ -102,7 +102,7 @@ def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expecte
             monkeypatch.delenv(name)
     try:
         jax.config.update("jax_threefry_gpu_kernel_lowering", False)
-        devices.set_up_gpu()
+        setup.set_up_gpu()
         numbers = jax.config.jax_threefry_gpu_kernel_lowering
         assert (numbers, os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"]) == expected
     finally:

@@ -38,7 +38,9 @@ def _acquire(run: Path, path: Path) -> int:
     """The descriptor of the locked file."""
     try:
         while True:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            # Not for writing: such a file would keep an administrator from mounting the disk
+            # read-only.
+            descriptor = os.open(path, os.O_RDONLY | os.O_CREAT, 0o644)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
