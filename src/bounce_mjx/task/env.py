@@ -27,7 +27,7 @@ from bounce_mjx.robot.model import (
 from bounce_mjx.task import actuation, noise, sensing
 from bounce_mjx.task.actuation import Actuation
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.observation import Kinematics
+from bounce_mjx.task.observation import OF_BOUNCES, Kinematics
 from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
 from bounce_mjx.task.rewards import (
     TERM_NAMES,
@@ -484,7 +484,9 @@ class BounceBall:
         }
         near_height = paddle[2] + config.bounce_max_distance
         return memory._replace(
-            sensing=sensing.remember(past, measured, picture, near_height, state.task.target_height)
+            sensing=sensing.remember(
+                past, measured, picture, near_height, state.task.target_height, config.control_dt
+            )
         )
 
     @property
@@ -492,7 +494,7 @@ class BounceBall:
         """Whether the measured paddle position differs from the true one, and matters."""
         observation = self.config.observation
         wrong = {"encoder_bias", "joint_angle_noise", "paddle_offset", "paddle_tilt"}
-        matters = observation.paddle_position or observation.apex_error
+        matters = observation.paddle_position or any(getattr(observation, q) for q in OF_BOUNCES)
         return bool(matters and wrong & set(self.config.randomization.terms))
 
     def _privileged(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:

@@ -35,8 +35,15 @@ QUANTITIES = (
     Part("action", 6, ""),
     Part("ball_age", 1, "s"),
     Part("apex_error", 1, "m"),
+    Part("bounce_position", 2, "m"),
+    Part("bounce_interval", 1, "s"),
+    Part("bounce_joint_angles", 6, "rad"),
+    Part("bounce_joint_velocities", 6, "rad/s"),
 )
 """The quantities that an observation may hold, in its order, and the size of one value of each."""
+
+OF_BOUNCES = frozenset(part.name for part in QUANTITIES[10:])
+"""Quantities that have a value for each bounce in place of each control step."""
 
 
 class ObservationConfig(StrictModel):
@@ -64,7 +71,16 @@ class ObservationConfig(StrictModel):
     ball_age: History = 0
     """Time since the picture of the ball was taken."""
     apex_error: History = 0
-    """Highest measured ball position minus the target height, of the last flights."""
+    """Highest measured ball position minus the target height, of the flights before the last
+    bounces."""
+    bounce_position: History = 0
+    """Measured horizontal position of the ball at the lowest point of the last bounces."""
+    bounce_interval: History = 0
+    """Time between the last bounces."""
+    bounce_joint_angles: History = 0
+    """Measured joint angles at the lowest points of the last bounces."""
+    bounce_joint_velocities: History = 0
+    """Measured joint velocities at the lowest points of the last bounces."""
     velocity: Literal["measured", "differences"] = "measured"
     """Source of ball_velocity: a sensor, or differences of the pictures."""
 
@@ -78,7 +94,7 @@ class ObservationConfig(StrictModel):
     def is_momentary(self) -> bool:
         """Whether one instant's true state gives the whole observation."""
         past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
-        remembered = self.action or self.ball_age or self.apex_error
+        remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
         return not past and not remembered and self.velocity == "measured"
 
 

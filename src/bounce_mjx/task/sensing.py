@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.task import noise
 from bounce_mjx.task.actuation import taken
-from bounce_mjx.task.observation import QUANTITIES, Kinematics, ObservationConfig
+from bounce_mjx.task.observation import OF_BOUNCES, QUANTITIES, Kinematics, ObservationConfig
 from bounce_mjx.task.randomization import RandomizationConfig, World
 
 _BALL_STREAM, _JOINT_STREAM, _DROP_STREAM = 0, 1, 2
@@ -44,6 +44,10 @@ class Sensing(NamedTuple):
     """Highest measured position since the ball was last near the paddle [], m."""
     is_low: jax.Array
     """Whether the ball was measured near the paddle [], bool."""
+    lowest: jax.Array
+    """Lowest measured position while the ball is near the paddle [], m."""
+    flight_time: jax.Array
+    """Time since the ball was first measured near the paddle for the last bounce [], s."""
     seen: dict[str, jax.Array]
     """The last values of each observed quantity [H, size], the newest first."""
 
@@ -73,12 +77,18 @@ def start_sensing(
         "action": jnp.zeros_like(truth.joint_angles),
         "ball_age": zero[None],
         "apex_error": zero[None],
+        "bounce_position": truth.ball_position[:2],
+        "bounce_interval": zero[None],
+        "bounce_joint_angles": truth.joint_angles,
+        "bounce_joint_velocities": truth.joint_velocities,
     }
     return Sensing(
         balls=jnp.broadcast_to(ball, (length, 6)),
         picture=Picture(truth.ball_position, truth.ball_velocity, zero, -jnp.ones((), dtype)),
         flight_apex=truth.ball_position[2],
         is_low=jnp.zeros((), bool),
+        lowest=truth.ball_position[2],
+        flight_time=zero,
         seen={
             part.name: jnp.broadcast_to(values[part.name], (n, part.size))
             for part in QUANTITIES
@@ -173,28 +183,46 @@ def remember(
     picture: Picture,
     near_height: jax.Array,
     target_height: jax.Array,
+    control_dt: float,
 ) -> Sensing:
     """The memory with the measurements of a control step.
 
-    A flight ends when the ball is measured near the paddle; its highest measured position minus the
-    target height is the next value of `apex_error`.
+    A bounce starts when the ball is first measured near the paddle, and its values are those of the
+    ball's lowest measured point.
 
     Args:
-      measured: a value [size] of each quantity but `apex_error`.
+      measured: a value [size] of each quantity but those of bounces.
       near_height: height below which the ball counts as near the paddle [], m.
     """
     height = picture.position[2]
     is_low = height < near_height
-    landed = is_low & ~sensing.is_low
-    error = (sensing.flight_apex - target_height)[None]
+    starts = is_low & ~sensing.is_low
+    at_lowest = starts | (is_low & (height < sensing.lowest))
+    flight_time = sensing.flight_time + control_dt
+    of_flight = {
+        "apex_error": (sensing.flight_apex - target_height)[None],
+        "bounce_interval": flight_time[None],
+    }
+    of_lowest = {
+        "bounce_position": picture.position[:2],
+        "bounce_joint_angles": measured["joint_angles"],
+        "bounce_joint_velocities": measured["joint_velocities"],
+    }
     seen = {}
     for name, past in sensing.seen.items():
-        newest = error if name == "apex_error" else measured[name]
-        shifted = jnp.concatenate([newest[None], past[:-1]])
-        seen[name] = jnp.where(landed, shifted, past) if name == "apex_error" else shifted
+        if name in OF_BOUNCES:
+            newest = of_flight[name] if name in of_flight else of_lowest[name]
+            shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
+            changes = starts if name in of_flight else at_lowest
+            newest = jnp.where(changes, newest, shifted[0])
+            seen[name] = jnp.concatenate([newest[None], shifted[1:]])
+        else:
+            seen[name] = jnp.concatenate([measured[name][None], past[:-1]])
     return sensing._replace(
         picture=picture,
         flight_apex=jnp.where(is_low, height, jnp.maximum(sensing.flight_apex, height)),
         is_low=is_low,
+        lowest=jnp.where(at_lowest, height, sensing.lowest),
+        flight_time=jnp.where(starts, 0.0, flight_time),
         seen=seen,
     )
