@@ -51,17 +51,6 @@ MODEL = PhysicsParameters()
 NUM_WORLDS = 16
 
 
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(scope="module")
-def mj_model() -> mujoco.MjModel:
-    return load_model(None, EnvConfig().physics_dt)
-
-
 def world(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
     """World i of a batch [N, ...]."""
     return jax.tree.map(lambda array: array[i], parameters)

@@ -21,8 +21,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.fused import chain, scalars
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import Addresses, find_addresses, load_model
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
 HALF_SIZE = np.array([0.05, 0.065, 0.0035])
@@ -46,19 +45,6 @@ class States(NamedTuple):
     """[N, nv]."""
     ctrl: np.ndarray
     """[N, nu], rad."""
-
-
-@pytest.fixture
-def float64():
-    """Everything in the test runs in float64."""
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(scope="module")
-def mj_model() -> mujoco.MjModel:
-    """The shipped model at the default time step."""
-    return load_model(None, EnvConfig().physics_dt)
 
 
 @pytest.fixture(scope="module")
