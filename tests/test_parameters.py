@@ -21,7 +21,14 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.learning import policy as policies
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    fused,
+    make_engine,
+)
 from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import SHAPES
 from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
@@ -56,7 +63,7 @@ def uncompiled_steps(mj_model, parameters: PhysicsParameters, states: States) ->
         return jax.vmap(step)(
             jax.tree.map(jnp.asarray, parameters),
             PhysicsState(jnp.asarray(states.qpos), jnp.asarray(states.qvel)),
-            jnp.asarray(states.ctrl),
+            Control(jnp.asarray(states.ctrl)),
         )
 
 
@@ -165,10 +172,10 @@ def test_nothing_given_leaves_the_program_alone(mj_model):
     state = PhysicsState(jnp.zeros(mj_model.nq), jnp.zeros(mj_model.nv))
     ctrl = jnp.zeros(mj_model.nu)
     step = partial(fused.step, model, num_substeps=1)
-    default = jax.make_jaxpr(step)(MODEL, state, ctrl)
+    default = jax.make_jaxpr(step)(MODEL, state, Control(ctrl))
     assert len(default.in_avals) == 3
     assert not default.consts
-    given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, ctrl)
+    given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, Control(ctrl))
     assert len(given.in_avals) == 4
     # One field costs the operations that use it, not those of the other fields.
     assert 0 < num_operations(given) - num_operations(default) < 20
@@ -216,7 +223,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
         data.append((c_model, mujoco.MjData(c_model)))
         data[i][1].qpos[:], data[i][1].qvel[:], data[i][1].act[:] = (x[i] for x in state)
     engine = make_engine(model, "mjx")
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, u, num_substeps)))
+    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), num_substeps)))
     contacts = 0
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i
@@ -242,7 +249,7 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
     for field, shape in SHAPES._asdict().items():
         wrong = PhysicsParameters(**{field: jnp.ones((*shape, 2))})
         with pytest.raises(UserError, match=field):
-            engine.step(wrong, state, jnp.zeros(mj_model.nu), 1)
+            engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)
 
 
 def heavy_and_light(key: jax.Array) -> PhysicsParameters:

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused, make_engine, mjx_engine
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    fused,
+    make_engine,
+    mjx_engine,
+)
 from bounce_mjx.physics.fused import chain, scalars
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import Addresses, find_addresses
@@ -50,7 +57,7 @@ def batched(step):
     """(state, ctrl, number of steps) -> state, compiled over a leading batch axis."""
 
     def steps(state: PhysicsState, ctrl: np.ndarray, num_substeps: int) -> PhysicsState:
-        return jax.vmap(lambda s, u: step(MODEL, s, u, num_substeps))(state, ctrl)
+        return jax.vmap(lambda s, u: step(MODEL, s, Control(u), num_substeps))(state, ctrl)
 
     return jax.jit(steps, static_argnums=2)
 
@@ -59,7 +66,7 @@ def uncompiled_step(mj_model: mujoco.MjModel, states: States) -> PhysicsState:
     """One fused step from each state, operation by operation: no time goes into compiling."""
     step = partial(fused.step, fused.read_model(mj_model), MODEL, num_substeps=1)
     with jax.disable_jit():
-        return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), jnp.asarray(states.ctrl))
+        return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), Control(jnp.asarray(states.ctrl)))
 
 
 def as_jax(arrays):
@@ -290,7 +297,7 @@ def test_mjx_multiplies_in_full_precision(mj_model):
     state = PhysicsState(jnp.array(mj_model.qpos0), jnp.zeros(mj_model.nv))
 
     def step_and_look(state, ctrl):
-        state = mjx_engine.step(constants, MODEL, state, ctrl)
+        state = mjx_engine.step(constants, MODEL, state, Control(ctrl))
         return state, mjx_engine.paddle_position(constants, MODEL, state.qpos)
 
     program = jax.jit(step_and_look).lower(state, jnp.zeros(mj_model.nu)).as_text()

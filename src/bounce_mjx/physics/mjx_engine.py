@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 _INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
@@ -27,13 +28,13 @@ class MjxModel(NamedTuple):
     model: mjx.Model
     mj_model: mujoco.MjModel
     """Its source."""
-    paddle_geom: int
+    addresses: Addresses
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that has no `unsupported_feature`."""
     model = mjx.put_model(mj_model)
-    return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
+    return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model))
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
@@ -84,16 +85,27 @@ def step(
     constants: MjxModel,
     parameters: PhysicsParameters,
     state: PhysicsState,
-    ctrl: jax.Array,
+    control: Control,
     num_substeps: int = 1,
 ) -> PhysicsState:
-    """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu]."""
+    """Advances one environment by `num_substeps` physics steps."""
+    addresses = constants.addresses
+
+    def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
+        return mjx.step(model, data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype))))
+
     with _full_precision():
         model = in_world(constants, parameters)
-        data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
+        data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
+        if control.ball_push is not None:
+            velocity = np.array(addresses.ball_qvel[:3])
+            data = data.replace(qvel=data.qvel.at[velocity].add(control.ball_push))
+        if control.ball_force is not None:
+            force = data.xfrc_applied.at[addresses.ball_body, :3].set(control.ball_force)
+            data = data.replace(xfrc_applied=force)
         if state.act is not None:
             data = data.replace(act=state.act)
-        data = jax.lax.fori_loop(0, num_substeps, lambda _, carry: mjx.step(model, carry), data)
+        data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
 
 
@@ -104,7 +116,7 @@ def paddle_position(
     with _full_precision():
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=qpos)
-        return mjx.kinematics(model, data).geom_xpos[constants.paddle_geom]
+        return mjx.kinematics(model, data).geom_xpos[constants.addresses.paddle_geom]
 
 
 def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:

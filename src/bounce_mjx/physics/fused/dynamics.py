@@ -4,14 +4,16 @@ Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physi
 loops; on a GPU all physics steps of a control step are one kernel (`gpu/elementwise.py`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
+from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
@@ -33,10 +35,10 @@ def step(
     model: FusedModel,
     parameters: PhysicsParameters,
     state: PhysicsState,
-    ctrl: jax.Array,
+    control: Control,
     num_substeps: int = 1,
 ) -> PhysicsState:
-    """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu].
+    """Advances one environment by `num_substeps` physics steps.
 
     The parameters that are given enter the program as inputs; the others fold as constants. The
     coordinates go through the loop as scalars. The ball's spin is constant, because the
@@ -50,10 +52,14 @@ def step(
         ball_position=tuple(state.qpos[i] for i in addresses.ball_qpos[:3]),
         ball_velocity=tuple(state.qvel[i] for i in addresses.ball_qvel[:3]),
     )
+    if control.ball_push is not None:
+        pushed = vadd(motion.ball_velocity, tuple(control.ball_push[i] for i in range(3)))
+        motion = motion._replace(ball_velocity=pushed)
     leaves, tree = jax.tree.flatten(motion)
-    numbers, given = jax.tree.flatten(as_scalars(parameters, state.qpos.dtype))
+    inputs = (_of_servos(control, addresses.actuators), parameters)
+    numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, given, num_substeps), num_results=len(leaves))
-    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in addresses.actuators), *numbers))
+    motion = tree.unflatten(advance(*leaves, *numbers))
     quaternion = turn(
         tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
         tuple(state.qvel[i] for i in addresses.ball_qvel[3:]),
@@ -83,22 +89,36 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
 
 
-def as_scalars(parameters: PhysicsParameters, dtype: jnp.dtype) -> PhysicsParameters:
-    """The given arrays of one environment as scalars, or tuples of scalars, of one type."""
+def _of_servos(control: Control, actuators: tuple[int, ...]) -> Control:
+    """The control of the arm's servos, in the order of the joints; the push is spent."""
+
+    def chosen(ctrl: jax.Array | None) -> jax.Array | None:
+        return None if ctrl is None else jnp.stack([ctrl[i] for i in actuators])
+
+    return control._replace(
+        ctrl=chosen(control.ctrl),
+        previous=chosen(control.previous),
+        filtered=chosen(control.filtered),
+        ball_push=None,
+    )
+
+
+def as_scalars(arrays: Any, dtype: jnp.dtype) -> Any:
+    """The arrays of one environment as scalars, or tuples of scalars, of one type."""
 
     def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
         array = jnp.asarray(array, dtype)
         return array if array.ndim == 0 else tuple(array[i] for i in range(len(array)))
 
-    return jax.tree.map(scalars, parameters)
+    return jax.tree.map(scalars, arrays)
 
 
 @functools.lru_cache
 def _substeps(
     model: FusedModel, given: jax.tree_util.PyTreeDef, num_substeps: int
 ) -> Callable[..., tuple[Scalar, ...]]:
-    """Physics steps as a function of scalars: a flat `Motion`, the servo targets, and the flat
-    parameters of the structure `given`.
+    """Physics steps as a function of scalars: a flat `Motion`, then the `Control` and the
+    parameters, flat, of the structure `given`.
 
     The cache and the inline jit let JAX trace this long function once for all the programs that
     have it; each trace takes some tenths of a second.
@@ -108,17 +128,32 @@ def _substeps(
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         q, v, ball = scalars[:n], scalars[n : 2 * n], scalars[2 * n : num_coordinates]
-        targets = scalars[num_coordinates : num_coordinates + n]
-        world = in_world(model, given.unflatten(scalars[num_coordinates + n :]))
+        control, parameters = given.unflatten(scalars[num_coordinates:])
+        world = in_world(model, parameters)
+        if control.ball_force is not None:
+            world = dataclasses.replace(world, ball_force=control.ball_force)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
-            lambda _, motion: substep(world, motion, targets),
+            lambda i, motion: substep(world, motion, _targets(control, i)),
             Motion(q, v, ball[:3], ball[3:]),
         )
         return tuple(jax.tree.leaves(motion))
 
     return jax.jit(substeps, inline=True)
+
+
+def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
+    """Targets of the servos in a physics step."""
+    if control.previous is None and control.lag is None:
+        return control.ctrl
+    step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
+    none = (None,) * len(control.ctrl)
+    servos = zip(control.ctrl, control.previous or none, control.filtered or none, strict=True)
+    return tuple(
+        servo_target(control._replace(ctrl=ctrl, previous=previous, filtered=filtered), step)
+        for ctrl, previous, filtered in servos
+    )
 
 
 @functools.lru_cache
@@ -185,8 +220,9 @@ def contact_response(
     half_jacobian = chain.solve_lower(factor, jacobian)
     half_applied = chain.solve_lower(factor, applied)
 
+    ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     normal_velocity = dot(contact.normal, motion.ball_velocity)
-    free_acceleration = dot(contact.normal, model.gravity)
+    free_acceleration = dot(contact.normal, ball_free)
     inverse_inertia = 1.0 / model.ball_mass
     for j, v, half_j, half_a in zip(jacobian, motion.v, half_jacobian, half_applied, strict=True):
         normal_velocity = normal_velocity + j * v
@@ -195,7 +231,7 @@ def contact_response(
     force = normal_force(
         model.contact, contact, normal_velocity, free_acceleration, inverse_inertia
     )
-    ball_acceleration = vadd(model.gravity, scale(contact.normal, force / model.ball_mass))
+    ball_acceleration = vadd(ball_free, scale(contact.normal, force / model.ball_mass))
     return [j * force for j in jacobian], ball_acceleration
 
 
