@@ -421,7 +421,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
         value = result["value"]
         assert value is None or isinstance(value, float)
         figure = "none" if value is None else f"{value:.2f}"
-        assert f"{figure} │ {result['bound']}" in shown
+        assert f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown
 
 
