@@ -25,6 +25,8 @@ class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
 
     model: mjx.Model
+    frictional: mjx.Model
+    """`model` with a frictional contact pair; MJX holds the pair's dimension fixed."""
     mj_model: mujoco.MjModel
     """Its source."""
     paddle_geom: int
@@ -32,8 +34,13 @@ class MjxModel(NamedTuple):
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that has no `unsupported_feature`."""
-    model = mjx.put_model(mj_model)
-    return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
+    model = frictional = mjx.put_model(mj_model)
+    fields, _ = edited_fields(mj_model, PhysicsParameters(contact_friction=np.zeros(())))
+    if np.any(fields["pair_dim"] != mj_model.pair_dim):
+        with_friction = copy.copy(mj_model)
+        with_friction.pair_dim[:] = fields["pair_dim"]
+        frictional = mjx.put_model(with_friction)
+    return MjxModel(model, frictional, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
@@ -114,7 +121,9 @@ def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     replaced = fields | {f"opt.{name}": value for name, value in options.items()}
     # MJX transforms every geom, whether or not it is known to share its body's frame.
     replaced.pop("geom_sameframe", None)
-    return constants.model.tree_replace(replaced)
+    replaced.pop("pair_dim", None)
+    model = constants.model if parameters.contact_friction is None else constants.frictional
+    return model.tree_replace(replaced)
 
 
 def _full_precision() -> contextlib.AbstractContextManager:
