@@ -33,6 +33,7 @@ from bounce_mjx.physics.fused.scalars import (
     quaternion_matrix,
     scale,
     sine_cosine,
+    stored,
     transpose,
     vadd,
     vsub,
@@ -97,8 +98,10 @@ def contact_response(
     model, links = fused_model.contact, fused_model.links
     ball_mass, ball_inertia = fused_model.ball_mass, fused_model.ball_inertia
     position, velocity, spin = ball
+    contact = stored(contact)
     normal = contact.normal
     first, second = tangents(normal)
+    first, second = stored((first, second))
     # From the contact's point, midway between the surfaces, to the ball's centre.
     lever = model.radius + 0.5 * contact.distance
     point = vsub(position, scale(normal, lever))
@@ -106,7 +109,10 @@ def contact_response(
     torques = (scale(second, -lever), scale(first, lever))
     columns = list(chain.point_velocities(links, pose, point))
     rows = [[-dot(axis, column) for column in columns] for axis in (normal, first, second)]
+    rows = stored(rows)
+    factor = stored(factor)
     half = [chain.solve_lower(factor, row) for row in rows]
+    half, half_applied = stored((half, list(half_applied)))
 
     def inverse_inertia(i: int, j: int) -> Scalar:
         return functools.reduce(add, map(mul, half[i], half[j]))
@@ -139,8 +145,10 @@ def contact_response(
         offsets.append(acceleration + b * speed)
     offsets[0] = offsets[0] + model.stiffness * d * contact.distance
 
+    matrix, offsets = stored((matrix, tuple(offsets)))
     force = contact_force(model, matrix, tuple(offsets), softness(model, d))
     force = tuple(jnp.where(contact.distance < 0.0, f, 0.0) for f in force)
+    force = stored(force)
     along = vadd(scale(normal, force[0]), vadd(scale(first, force[1]), scale(second, force[2])))
     torque = vadd(scale(torques[0], force[1]), scale(torques[1], force[2]))
     return Response(
