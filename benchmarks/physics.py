@@ -25,7 +25,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.physics import PhysicsParameters
+from bounce_mjx.physics import Control, PhysicsParameters
 
 EngineName = Literal["fused", "mjx", "c"]
 
@@ -55,7 +55,7 @@ def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[
         targets = jax.vmap(env.servo_targets, **batch_last)(physics, actions)
         advance = jax.vmap(
             lambda state, ctrl: env.engine.step(
-                PhysicsParameters(), state, ctrl, env.config.num_substeps
+                PhysicsParameters(), state, Control(ctrl), env.config.num_substeps
             ),
             **batch_last,
         )

@@ -120,7 +120,7 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
     iterations = max(1, round(base.eval_every / config.batch_steps))
     run = jax.jit(lambda state: trainer.run(state, iterations), donate_argnums=0)
-    policies = jax.jit(jax.vmap(policy_of))
+    policies = jax.jit(jax.vmap(lambda state: policy_of(state, env.observation_size)))
 
     state = jax.jit(trainer.init)(
         jax.vmap(jax.random.PRNGKey)(base.seed + np.arange(command.seeds))

@@ -76,7 +76,9 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
         seconds = time.perf_counter() - started
         steps += iterations * config.ppo.batch_steps
         # A copy, as the next block reuses the memory of the state.
-        ended = on_block(steps, seconds, jax.tree.map(jnp.copy, policy_of(state)))
+        ended = on_block(
+            steps, seconds, jax.tree.map(jnp.copy, policy_of(state, env.observation_size))
+        )
 
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:

@@ -1,12 +1,24 @@
-"""Tests of optional packages are skipped where a package is missing; CI must have all of them."""
+"""Tests of optional packages are skipped where a package is missing; CI must have all of them.
+
+All tests and their processes share one cache of compiled programs, which ends with them.
+"""
 
 import importlib.util
 import os
+import shutil
+import tempfile
+from collections.abc import Iterator
 
+import jax
+import mujoco
 import pytest
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.robot.model import load_model
+from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.viewers.offscreen import choose_backend
+
+CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 OPTIONAL = "CI" not in os.environ
 HAS_TORCH = all(importlib.util.find_spec(name) for name in ("torch", "rsl_rl", "skrl"))
@@ -14,8 +26,33 @@ HAS_TORCH = all(importlib.util.find_spec(name) for name in ("torch", "rsl_rl", "
 collect_ignore = ["test_torch.py", "test_torch_train.py"] if OPTIONAL and not HAS_TORCH else []
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    # The workers of pytest-xdist inherit the folder.
+    if not hasattr(config, "workerinput"):
+        os.environ[CACHE] = tempfile.mkdtemp(prefix="bounce_mjx_tests_")
+    jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ[CACHE], ignore_errors=True)
+
+
 def pytest_report_header() -> list[str]:
     return [f"skipped, as PyTorch is missing: {name}" for name in collect_ignore]
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """Everything in the test runs in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def mj_model() -> mujoco.MjModel:
+    """The shipped model at the default time step."""
+    return load_model(None, EnvConfig().physics_dt)
 
 
 @pytest.fixture(scope="session")

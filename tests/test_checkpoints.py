@@ -26,6 +26,7 @@ from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.reading import load_policy, load_training_state
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.observation import OBSERVATION
 
 SOURCES = Path(bounce_mjx.__file__).parent
 CONFIG = TrainConfig(
@@ -44,7 +45,7 @@ def write_run(folder: Path, state: TrainingState, steps: int = 64) -> Path:
     run = create_run(CONFIG.model_copy(update={"log_dir": folder}))
     writer = CheckpointWriter(run, CONFIG)
     progress = {"best": None, "best_steps": 0, "solved_steps": None, "evaluations": []}
-    writer.save(["latest"], steps, policy_of(state), state, progress)
+    writer.save(["latest"], steps, policy_of(state, OBSERVATION.size), state, progress)
     assert writer.problem() is None
     writer.close()
     return run
@@ -87,16 +88,16 @@ def assert_refused(run: Path, state: TrainingState, *words: str) -> None:
 
 
 def test_what_is_written_is_read(run: Path, state: TrainingState) -> None:
-    assert_identical(load_both(run, state), (policy_of(state), state))
+    assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
 
 
 def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -> None:
     run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
     writer = CheckpointWriter(run, CONFIG)
-    writer.save(["best"], 64, policy_of(state))
+    writer.save(["best"], 64, policy_of(state, OBSERVATION.size))
     writer.close()
     checkpoint = find_checkpoint(run, run)
-    assert_identical(load_policy(checkpoint, CONFIG), policy_of(state))
+    assert_identical(load_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
     with pytest.raises(UserError, match="holds no training state to go on from"):
         load_training_state(checkpoint, state)
 
@@ -106,7 +107,7 @@ def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingStat
     writer = CheckpointWriter(run, CONFIG)
     for steps in (64, 128, 128):
         changed = state._replace(iteration=state.iteration + steps)
-        writer.save(["latest"], steps, policy_of(changed), changed, {})
+        writer.save(["latest"], steps, policy_of(changed, OBSERVATION.size), changed, {})
     writer.close()
     assert [p.name for p in (run / "checkpoints/latest").iterdir()] == ["128"]
     assert load_training_state(find_checkpoint(run, run), state)[0].iteration == 128
@@ -161,7 +162,7 @@ def test_damage_is_refused_or_does_no_harm(
             refused += 1
             assert "\n" not in str(error) and len(str(error)) < 1000, (i, what)
         else:
-            assert_identical(loaded, (policy_of(state), state))
+            assert_identical(loaded, (policy_of(state, OBSERVATION.size), state))
         shutil.rmtree(run)
     assert refused > 150
 
@@ -176,7 +177,7 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
     config = load_config(run / "config.yaml").model_copy(update={"seed": 3})
     shutil.rmtree(step_of(run))
     writer = CheckpointWriter(run, config)
-    writer.save(["latest"], 64, policy_of(state), state, {})
+    writer.save(["latest"], 64, policy_of(state, OBSERVATION.size), state, {})
     writer.close()
     assert_refused(run, state, "another config", "differs in seed;", "restore that file")
 
@@ -245,7 +246,7 @@ def test_code_in_any_file_is_not_run(
             except UserError:
                 pass
             else:
-                assert_identical(loaded, (policy_of(state), state))
+                assert_identical(loaded, (policy_of(state, OBSERVATION.size), state))
             assert not target.exists(), name
             shutil.rmtree(run)
 

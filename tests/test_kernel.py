@@ -14,7 +14,7 @@ import pytest
 from bounce_mjx import BounceBall
 from bounce_mjx.gpu import availability
 from bounce_mjx.gpu import elementwise as kernel
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics
 from random_worlds import random_parameters
 
@@ -57,7 +57,9 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
 def step(
     env: BounceBall, physics: PhysicsState, ctrl: jax.Array, parameters: PhysicsParameters = MODEL
 ) -> PhysicsState:
-    return fused.step(fused.read_model(env.mj_model), parameters, physics, ctrl, NUM_SUBSTEPS)
+    return fused.step(
+        fused.read_model(env.mj_model), parameters, physics, Control(ctrl), NUM_SUBSTEPS
+    )
 
 
 def batched(env: BounceBall) -> Step:

@@ -21,7 +21,14 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.learning import policy as policies
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model, fused, make_engine
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    fused,
+    make_engine,
+)
 from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import SHAPES
 from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
@@ -41,18 +48,9 @@ from test_physics import (
 )
 
 MODEL = PhysicsParameters()
+# The numbers of a frictionless world; test_friction.py has the contact's friction.
+FIELDS = [field for field in PhysicsParameters._fields if field != "contact_friction"]
 NUM_WORLDS = 16
-
-
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(scope="module")
-def mj_model() -> mujoco.MjModel:
-    return load_model(None, EnvConfig().physics_dt)
 
 
 def world(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
@@ -67,7 +65,7 @@ def uncompiled_steps(mj_model, parameters: PhysicsParameters, states: States) ->
         return jax.vmap(step)(
             jax.tree.map(jnp.asarray, parameters),
             PhysicsState(jnp.asarray(states.qpos), jnp.asarray(states.qvel)),
-            jnp.asarray(states.ctrl),
+            Control(jnp.asarray(states.ctrl)),
         )
 
 
@@ -107,7 +105,7 @@ def test_one_step_in_random_worlds_is_mujocos(mj_model):
 @pytest.mark.usefixtures("float64")
 def test_each_number_alone_acts_as_in_mujoco(mj_model):
     """In one batch: states and numbers are shared, but for one field that is drawn."""
-    fields = PhysicsParameters._fields
+    fields = FIELDS
     count = 8
     states, _ = random_states(mj_model, count, seed=1)
     states = States(*(np.tile(x, (len(fields), 1)) for x in states))
@@ -127,7 +125,7 @@ def test_each_number_alone_acts_as_in_mujoco(mj_model):
     assert np.all(change.max(axis=1) > 1e-4), dict(zip(fields, change.max(axis=1), strict=True))
 
 
-@pytest.mark.parametrize("field", PhysicsParameters._fields)
+@pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.usefixtures("float64")
 def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
     """A field alone, the rest None, at a model whose solref has the standard format."""
@@ -152,7 +150,9 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
         CEngine(model, PhysicsState(*(x[i : i + 1] for x in state[:2])))
         for i, model in enumerate(models)
     ]
-    step = jax.jit(jax.vmap(lambda p, s, u: make_engine(mj_model, "fused").step(p, s, u, 1)))
+    step = jax.jit(
+        jax.vmap(lambda p, s, u: make_engine(mj_model, "fused").step(p, s, Control(u), 1))
+    )
     contacts, error = 0, 0.0
     for i in range(500):
         if i % 10 == 0:
@@ -176,10 +176,10 @@ def test_nothing_given_leaves_the_program_alone(mj_model):
     state = PhysicsState(jnp.zeros(mj_model.nq), jnp.zeros(mj_model.nv))
     ctrl = jnp.zeros(mj_model.nu)
     step = partial(fused.step, model, num_substeps=1)
-    default = jax.make_jaxpr(step)(MODEL, state, ctrl)
+    default = jax.make_jaxpr(step)(MODEL, state, Control(ctrl))
     assert len(default.in_avals) == 3
     assert not default.consts
-    given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, ctrl)
+    given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, Control(ctrl))
     assert len(given.in_avals) == 4
     # One field costs the operations that use it, not those of the other fields.
     assert 0 < num_operations(given) - num_operations(default) < 20
@@ -227,7 +227,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
         data.append((c_model, mujoco.MjData(c_model)))
         data[i][1].qpos[:], data[i][1].qvel[:], data[i][1].act[:] = (x[i] for x in state)
     engine = make_engine(model, "mjx")
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, u, num_substeps)))
+    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), num_substeps)))
     contacts = 0
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i
@@ -253,7 +253,7 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
     for field, shape in SHAPES._asdict().items():
         wrong = PhysicsParameters(**{field: jnp.ones((*shape, 2))})
         with pytest.raises(UserError, match=field):
-            engine.step(wrong, state, jnp.zeros(mj_model.nu), 1)
+            engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)
 
 
 def heavy_and_light(key: jax.Array) -> PhysicsParameters:

@@ -11,11 +11,17 @@ import numpy as np
 import pytest
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, fused, make_engine, mjx_engine
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    fused,
+    make_engine,
+    mjx_engine,
+)
 from bounce_mjx.physics.fused import chain, scalars
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import Addresses, find_addresses, load_model
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
 HALF_SIZE = np.array([0.05, 0.065, 0.0035])
@@ -41,19 +47,6 @@ class States(NamedTuple):
     """[N, nu], rad."""
 
 
-@pytest.fixture
-def float64():
-    """Everything in the test runs in float64."""
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(scope="module")
-def mj_model() -> mujoco.MjModel:
-    """The shipped model at the default time step."""
-    return load_model(None, EnvConfig().physics_dt)
-
-
 @pytest.fixture(scope="module")
 def fused_step(mj_model):
     """The fused step, compiled once for each dtype and number of steps if always given BATCH."""
@@ -64,7 +57,7 @@ def batched(step):
     """(state, ctrl, number of steps) -> state, compiled over a leading batch axis."""
 
     def steps(state: PhysicsState, ctrl: np.ndarray, num_substeps: int) -> PhysicsState:
-        return jax.vmap(lambda s, u: step(MODEL, s, u, num_substeps))(state, ctrl)
+        return jax.vmap(lambda s, u: step(MODEL, s, Control(u), num_substeps))(state, ctrl)
 
     return jax.jit(steps, static_argnums=2)
 
@@ -73,7 +66,7 @@ def uncompiled_step(mj_model: mujoco.MjModel, states: States) -> PhysicsState:
     """One fused step from each state, operation by operation: no time goes into compiling."""
     step = partial(fused.step, fused.read_model(mj_model), MODEL, num_substeps=1)
     with jax.disable_jit():
-        return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), jnp.asarray(states.ctrl))
+        return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), Control(jnp.asarray(states.ctrl)))
 
 
 def as_jax(arrays):
@@ -304,7 +297,7 @@ def test_mjx_multiplies_in_full_precision(mj_model):
     state = PhysicsState(jnp.array(mj_model.qpos0), jnp.zeros(mj_model.nv))
 
     def step_and_look(state, ctrl):
-        state = mjx_engine.step(constants, MODEL, state, ctrl)
+        state = mjx_engine.step(constants, MODEL, state, Control(ctrl))
         return state, mjx_engine.paddle_position(constants, MODEL, state.qpos)
 
     program = jax.jit(step_and_look).lower(state, jnp.zeros(mj_model.nu)).as_text()
@@ -438,7 +431,8 @@ UNSUPPORTED = {
         flag: ("<flag ", f'<flag {flag}="enable" ', f"({flag})")
         for flag in ("override", "sleep", "diagexact")
     },
-    "condim 3": ('condim="1"', 'condim="3"', "condim 3"),
+    "condim 4": ('condim="1"', 'condim="4"', "condim 4"),
+    "condim 6": ('condim="1"', 'condim="6"', "condim 6"),
     "second pair": ("</contact>", '<pair geom1="floor" geom2="ball"/></contact>', "contact pair"),
     "no pair": (piece("<pair ", "  </contact>"), "", "contact pair"),
     "pair with the floor": ('pair geom1="blocker"', 'pair geom1="floor"', "ball and the paddle"),
@@ -538,7 +532,7 @@ def test_unsupported_models_are_refused(name):
         assert text == f"the fused physics does not support {refusal.value}; use --physics mjx"
 
 
-@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 3"])
+@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 4"])
 def test_auto_takes_mjx_for_unsupported_models(name):
     """And says why, in a whole sentence."""
     old, new, feature = UNSUPPORTED[name]

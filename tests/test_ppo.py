@@ -14,6 +14,7 @@ from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.task import vector
+from bounce_mjx.task.observation import OBSERVATION
 from bounce_mjx.task.state import State
 
 
@@ -359,7 +360,7 @@ def test_counters(tiny, init, after_two):
 def test_policy_sees_only_the_observation(tiny, after_two):
     state, _ = after_two
     assert state.statistics.mean.shape == (29 + len(tiny.critic_metrics),)
-    acting = ppo.policy_of(state)
+    acting = ppo.policy_of(state, OBSERVATION.size)
     np.testing.assert_array_equal(acting.normalizer.mean, state.statistics.mean[:29])
     networks = policy.make_networks(tiny, 29, 6)
     observation = state.statistics.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
@@ -482,7 +483,10 @@ def test_ppo_learns_to_bounce():
 
     networks = policy.make_networks(config, env.observation_size, env.action_size)
     unseen = jax.random.key(1234)
-    policies = [ppo.policy_of(untrained), ppo.policy_of(trained)]
+    policies = [
+        ppo.policy_of(untrained, OBSERVATION.size),
+        ppo.policy_of(trained, OBSERVATION.size),
+    ]
     evaluate = make_evaluator(env, networks, episodes=64).lower(policies[0], unseen)
     evaluate = evaluate.compile()
     before, after = (judge(env, evaluate(p, unseen)).details for p in policies)

@@ -247,7 +247,7 @@ def test_wrong_environment_is_refused(task):
     with pytest.raises(UserError, match="device is meta, but JAX's arrays lie on"):
         TorchVectorEnv(task, NUM_ENVS, device="meta")
     with pytest.raises(
-        UserError, match="'bounces', which is not a metric .* choose from .*n_bounces"
+        UserError, match="bounces, which the environment .* choose from .*n_bounces"
     ):
         TorchVectorEnv(task, NUM_ENVS, critic_metrics=("bounces",))
     with pytest.raises(UserError, match="call reset first"):

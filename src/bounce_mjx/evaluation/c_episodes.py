@@ -11,11 +11,19 @@ from mujoco import rollout
 
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
-from bounce_mjx.physics import PhysicsParameters, PhysicsState, edited_model
-from bounce_mjx.robot.model import load_model
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    servo_targets,
+)
+from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.task.env import BounceBall
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CTRL = mujoco.mjtState.mjSTATE_CTRL
+_CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 
 def make_mujoco_evaluator(
@@ -34,10 +42,8 @@ def make_mujoco_evaluator(
     @jax.jit
     def decide(policy, states):
         actions = act(networks, policy, states.obs.T).T
-        targets = jax.vmap(env.servo_targets, in_axes=-1, out_axes=-1)(
-            states.pipeline_state.physics, actions
-        )
-        return actions, targets.T
+        states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
+        return actions, states, _rollout_inputs(env, control)
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -47,16 +53,17 @@ def make_mujoco_evaluator(
     def evaluate(policy: Policy, key: jax.Array) -> Statistics:
         states = start(key)
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
+        ball_velocity = np.array(find_addresses(env.mj_model).ball_qvel[:3]) + 1 + env.mj_model.nq
         models = episode_models(env, states.pipeline_state.parameters)
         data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
         statistics = empty_statistics(episodes)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, targets = decide(policy, states)
-                control = np.repeat(
-                    np.asarray(targets, np.float64)[:, None], env.config.num_substeps, axis=1
-                )
-                trajectory, _ = pool.rollout(models, data, simulated, control)
+                actions, states, inputs = decide(policy, states)
+                control, push = (np.asarray(x, np.float64) for x in inputs)
+                simulated[:, ball_velocity] += push
+                spec = _CTRL if control.shape[-1] == env.mj_model.nu else _CTRL_AND_FORCE
+                trajectory, _ = pool.rollout(models, data, simulated, control, control_spec=spec)
                 simulated = trajectory[:, -1]
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
@@ -65,6 +72,26 @@ def make_mujoco_evaluator(
         return statistics
 
     return evaluate
+
+
+def _rollout_inputs(env: BounceBall, control: Control) -> tuple[jax.Array, jax.Array]:
+    """Inputs of MuJoCo's rollout for N episodes [N, substeps, size]: `ctrl`, and with a force on
+    the ball also `xfrc_applied`; and the velocities that the balls are given [N, 3], m/s.
+
+    Args:
+      control: the batch is last.
+    """
+    count, model = control.ctrl.shape[-1], env.mj_model
+    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
+    push = jnp.zeros((count, 3)) if control.ball_push is None else control.ball_push.T
+    if control.ball_force is None:
+        return targets, push
+    forces = jnp.zeros((count, model.nbody, 6))
+    forces = forces.at[:, find_addresses(model).ball_body, :3].set(control.ball_force.T)
+    forces = jnp.broadcast_to(
+        forces.reshape(count, 1, -1), (count, env.config.num_substeps, model.nbody * 6)
+    )
+    return jnp.concatenate([targets, forces], axis=-1), push
 
 
 def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoco.MjModel]:

@@ -156,7 +156,9 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
     if name in _REDUCTIONS:
         return [_reduce(_REDUCTIONS[name], args[0], params["axes"])]
     if name == "unstack":
-        return [np.asarray(x, object) for x in np.moveaxis(args[0], params["axis"], 0)]
+        entries = np.moveaxis(args[0], params["axis"], 0)
+        # A slice keeps an array around what may be a scalar.
+        return [entries[i : i + 1].reshape(entries.shape[1:]) for i in range(len(entries))]
     if name in _SHAPES:
         return [_SHAPES[name](*args, **params)]
     if name in _CALLS and _CALLS[name] in params:

@@ -1,14 +1,20 @@
 """Metrics of a rollout: means over its steps and over the episodes that ended in it."""
 
 import dataclasses
+import fnmatch
 import functools
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.task import vector
 
 Metrics = dict[str, jax.Array]
+
+PRIVILEGED = ("world/", "true/")
+"""Beginnings of the names of metrics that are there for a critic alone."""
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["columns"], meta_fields=["names"])
@@ -30,11 +36,31 @@ class Packed:
         return dict(zip(self.names, jnp.moveaxis(self.columns, -1, 0), strict=True))
 
 
+def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """Names among the known ones that the patterns name; a pattern such as world/* names many.
+
+    Raises:
+      UserError: a pattern matches none.
+    """
+    known = tuple(known)
+    names: dict[str, None] = {}
+    for pattern in patterns:
+        matching = fnmatch.filter(known, pattern)
+        if not matching and "*" not in pattern:
+            raise UserError(
+                f"critic_metrics names {pattern}, which the environment does not have; choose from "
+                f"{', '.join(known)}"
+            )
+        names |= dict.fromkeys(matching)
+    return tuple(names)
+
+
 def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
     """Metrics of one step over each group of environments [G]: means, and sums over the episodes
     that ended on the step."""
     ended = result.terminated | result.truncated
-    means = result.metrics | {"reward": result.reward}
+    logged = {n: v for n, v in result.metrics.items() if not n.startswith(PRIVILEGED)}
+    means = logged | {"reward": result.reward}
     totals = {
         "ended": ended,
         "return": jnp.where(ended, result.episode_return, 0.0),

@@ -38,11 +38,13 @@ class Networks(NamedTuple):
     """Its inputs are the observation and the critic metrics, its output the values [...]."""
 
 
-def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> Networks:
-    """The networks of a config for an environment with these sizes."""
+def make_networks(
+    config: PPOConfig, observation_size: int, action_size: int, num_critic_metrics: int = 0
+) -> Networks:
+    """The networks of a config for an environment with these sizes; acting needs no critic."""
     policy = PolicyNetwork(config.hidden_layers, action_size, config.init_noise_std)
     value = MLP((*config.hidden_layers, 1), activate_final=False)
-    critic_size = observation_size + len(config.critic_metrics)
+    critic_size = observation_size + num_critic_metrics
     return Networks(
         policy_network=Network(
             init=lambda key: policy.init(key, jnp.zeros((1, observation_size))),

@@ -21,11 +21,16 @@ from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.gradients import MinibatchGradients
-from bounce_mjx.learning.metrics import Metrics, Packed, rollout_metrics, step_metrics
+from bounce_mjx.learning.metrics import (
+    Metrics,
+    Packed,
+    matching_metrics,
+    rollout_metrics,
+    step_metrics,
+)
 from bounce_mjx.learning.policy import Policy, cast_hidden_layers, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
 from bounce_mjx.task import vector
-from bounce_mjx.task.observation import OBSERVATION
 from bounce_mjx.task.state import Env
 
 # Factor by which one update may change the learning rate.
@@ -146,13 +151,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             "control steps; choose a shorter rollout or longer episodes"
         )
     known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
-    unknown = [name for name in config.critic_metrics if name not in known_metrics]
-    if unknown:
-        raise UserError(
-            f"critic_metrics names {unknown[0]}, which the environment does not have; choose from "
-            f"{', '.join(known_metrics)}"
-        )
-    networks = make_networks(config, env.observation_size, env.action_size)
+    critic_metrics = matching_metrics(config.critic_metrics, known_metrics)
+    num_inputs = env.observation_size + len(critic_metrics)
+    networks = make_networks(config, env.observation_size, env.action_size, len(critic_metrics))
     groups = num_groups(config)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
@@ -181,23 +182,28 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def make_inputs(observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before their normalisation [B, N + K]."""
-        critic_metrics = [metrics[name][:, None] for name in config.critic_metrics]
-        return jnp.concatenate([observation, *critic_metrics], axis=-1)
+        columns = [metrics[name][:, None] for name in critic_metrics]
+        return jnp.concatenate([observation, *columns], axis=-1)
+
+    def ranges_at(iteration: jax.Array) -> Any:
+        """Ranges of the randomisation, which grow over its warm-up; None without one."""
+        warmup_steps = getattr(env, "warmup_steps", 0)
+        if not warmup_steps:
+            return None
+        return env.ranges(jnp.minimum(1.0, iteration * (config.batch_steps / warmup_steps)))
 
     def init(key: jax.Array) -> TrainingState:
         key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
         params = Params(
             networks.policy_network.init(policy_key), networks.value_network.init(value_key)
         )
-        env_state = vector.reset(env, env_key, config.num_envs)
+        env_state = vector.reset(env, env_key, config.num_envs, ranges_at(jnp.int32(0)))
         # Without different clocks, all episodes would time out together.
         clock = jax.random.randint(clock_key, (config.num_envs,), 0, episode_steps)
         return TrainingState(
             params=params,
             optimizer=optimizer.init(ravel_pytree(params)[0]),
-            statistics=statistics.init_statistics(
-                env.observation_size + len(config.critic_metrics)
-            ),
+            statistics=statistics.init_statistics(num_inputs),
             learning_rate=jnp.float32(config.learning_rate),
             env=env_state._replace(clock=clock),
             key=key,
@@ -241,7 +247,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         # All at once, as on a GPU each draw costs a kernel or two.
         shape = (config.rollout_length, config.num_envs, env.action_size)
         noise = jax.random.normal(noise_key, shape)
-        fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs))(
+        ranges = ranges_at(state.iteration)
+        fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
         )
         step_forms: list = []
@@ -332,7 +339,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return MinibatchGradients(lambda x: ravel_pytree(x)[0], unravel, shuffle, gradient)
 
     def make_gradients(params: Params) -> MinibatchGradients:
-        num_inputs = env.observation_size + len(config.critic_metrics)
         if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
             return minibatch_kernel.kernel_gradients(config, env.action_size, params)
         return xla_gradients(ravel_pytree(params)[1])
@@ -442,9 +448,9 @@ def group(x: jax.Array, groups: int) -> jax.Array:
     return x.reshape((groups, length * batch // groups, *rest))
 
 
-def policy_of(state: TrainingState) -> Policy:
+def policy_of(state: TrainingState, observation_size: int) -> Policy:
     """The policy of a training state, or the policies of a population's."""
-    mean, std = (x[..., : OBSERVATION.size] for x in state.statistics.normalizer)
+    mean, std = (x[..., :observation_size] for x in state.statistics.normalizer)
     return Policy(Normalizer(mean, std), state.params.policy)
 
 

@@ -1,7 +1,16 @@
 """Physics engines behind one interface: `fused` (straight-line arithmetic) and `mjx`."""
 
+from bounce_mjx.physics.control import Control, servo_targets
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_model
 from bounce_mjx.physics.state import PhysicsState
 
-__all__ = ["Engine", "PhysicsParameters", "PhysicsState", "edited_model", "make_engine"]
+__all__ = [
+    "Control",
+    "Engine",
+    "PhysicsParameters",
+    "PhysicsState",
+    "edited_model",
+    "make_engine",
+    "servo_targets",
+]

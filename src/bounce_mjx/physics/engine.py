@@ -12,6 +12,7 @@ import mujoco
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import fused
+from bounce_mjx.physics.control import Control
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.physics.parameters import PhysicsParameters, check_shapes
 from bounce_mjx.physics.state import PhysicsState
@@ -24,8 +25,8 @@ class Engine(NamedTuple):
     """fused or mjx."""
     reason: str
     """Reason of the choice, for the user."""
-    step: Callable[[PhysicsParameters, PhysicsState, jax.Array, int], PhysicsState]
-    """(parameters, state, ctrl [nu], number of physics steps) -> state."""
+    step: Callable[[PhysicsParameters, PhysicsState, Control, int], PhysicsState]
+    """(parameters, state, control, number of physics steps) -> state."""
     paddle_position: Callable[[PhysicsParameters, jax.Array], jax.Array]
     """(parameters, qpos [nq]) -> world position [3] of the paddle's centre, m."""
     warnings: tuple[str, ...] = ()
@@ -62,10 +63,10 @@ def _engine(
     constants = implementation.read_model(mj_model)
 
     def step(
-        parameters: PhysicsParameters, state: PhysicsState, ctrl: jax.Array, num_substeps: int
+        parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
         check_shapes(parameters)
-        return implementation.step(constants, parameters, state, ctrl, num_substeps)
+        return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(
         name=name,

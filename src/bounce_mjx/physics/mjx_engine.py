@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 _INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
@@ -29,18 +31,26 @@ class MjxModel(NamedTuple):
     """`model` with a frictional contact pair; MJX holds the pair's dimension fixed."""
     mj_model: mujoco.MjModel
     """Its source."""
-    paddle_geom: int
+    addresses: Addresses
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that has no `unsupported_feature`."""
-    model = frictional = mjx.put_model(mj_model)
-    fields, _ = edited_fields(mj_model, PhysicsParameters(contact_friction=np.zeros(())))
-    if np.any(fields["pair_dim"] != mj_model.pair_dim):
-        with_friction = copy.copy(mj_model)
-        with_friction.pair_dim[:] = fields["pair_dim"]
-        frictional = mjx.put_model(with_friction)
-    return MjxModel(model, frictional, copy.copy(mj_model), find_addresses(mj_model).paddle_geom)
+    return MjxModel(
+        mjx.put_model(mj_model),
+        mjx.put_model(_with_frictional_pair(mj_model)),
+        copy.copy(mj_model),
+        find_addresses(mj_model),
+    )
+
+
+def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy whose pair of the ball and the paddle, if it has one, has sliding friction."""
+    model = copy.copy(mj_model)
+    with contextlib.suppress(UserError):
+        fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
+        model.pair_dim[:] = fields["pair_dim"]
+    return model
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
@@ -91,16 +101,27 @@ def step(
     constants: MjxModel,
     parameters: PhysicsParameters,
     state: PhysicsState,
-    ctrl: jax.Array,
+    control: Control,
     num_substeps: int = 1,
 ) -> PhysicsState:
-    """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu]."""
+    """Advances one environment by `num_substeps` physics steps."""
+    addresses = constants.addresses
+
+    def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
+        return mjx.step(model, data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype))))
+
     with _full_precision():
         model = in_world(constants, parameters)
-        data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=ctrl)
+        data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
+        if control.ball_push is not None:
+            velocity = np.array(addresses.ball_qvel[:3])
+            data = data.replace(qvel=data.qvel.at[velocity].add(control.ball_push))
+        if control.ball_force is not None:
+            force = data.xfrc_applied.at[addresses.ball_body, :3].set(control.ball_force)
+            data = data.replace(xfrc_applied=force)
         if state.act is not None:
             data = data.replace(act=state.act)
-        data = jax.lax.fori_loop(0, num_substeps, lambda _, carry: mjx.step(model, carry), data)
+        data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
 
 
@@ -111,7 +132,7 @@ def paddle_position(
     with _full_precision():
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=qpos)
-        return mjx.kinematics(model, data).geom_xpos[constants.paddle_geom]
+        return mjx.kinematics(model, data).geom_xpos[constants.addresses.paddle_geom]
 
 
 def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:

@@ -22,7 +22,6 @@ from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, read_json
 from bounce_mjx.runs.folders import Checkpoint
-from bounce_mjx.task.observation import OBSERVATION
 
 RECORD_FILE = "run.json"
 
@@ -44,11 +43,12 @@ class Record(pydantic.BaseModel):
 
 def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
-    networks = make_networks(config.ppo, OBSERVATION.size, len(JOINT_NAMES))
+    size = config.env.observation.layout.size
+    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
 
     def initial_policy() -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))
-        return Policy(init_normalizer(OBSERVATION.size), params)
+        return Policy(init_normalizer(size), params)
 
     read_record(checkpoint)
     return _read_arrays(checkpoint, "policy", jax.eval_shape(initial_policy))

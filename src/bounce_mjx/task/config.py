@@ -7,6 +7,8 @@ from typing import Literal
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.task.observation import ObservationConfig
+from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig
 
 ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
@@ -53,6 +55,10 @@ class EnvConfig(StrictModel):
     """The episode ends when |x| or |y| of the ball exceeds this, m."""
     max_joint_velocity: Positive = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
+    observation: ObservationConfig = ObservationConfig()
+    """The quantities that the policy sees."""
+    randomization: RandomizationConfig = RandomizationConfig()
+    """The world that each episode draws."""
     reward: RewardConfig = RewardConfig()
     """The reward terms."""
 

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import mujoco
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import Engine, PhysicsParameters, PhysicsState, make_engine
+from bounce_mjx.physics import (
+    Control,
+    Engine,
+    PhysicsParameters,
+    PhysicsState,
+    make_engine,
+)
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import (
     JOINT_NAMES,
     check_unedited,
@@ -17,18 +24,24 @@ from bounce_mjx.robot.model import (
     load_model,
     resting_activations,
 )
+from bounce_mjx.task import actuation, noise, sensing
+from bounce_mjx.task.actuation import Actuation
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.observation import OBSERVATION, Kinematics
+from bounce_mjx.task.observation import OF_BOUNCES, Kinematics
+from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
 from bounce_mjx.task.rewards import (
     TERM_NAMES,
     RewardInputs,
     horizontal_distance,
     weighted_terms,
 )
+from bounce_mjx.task.sensing import Sensing
 from bounce_mjx.task.state import State
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
+# Streams of random numbers, besides those of sensors and pushes.
+_TARGET_STREAM = 4
 
 
 class TaskState(NamedTuple):
@@ -46,13 +59,31 @@ class TaskState(NamedTuple):
     """Highest ball position since the last bounce [], m."""
 
 
+class Memory(NamedTuple):
+    """State that only a randomised world or an observation of the past needs."""
+
+    counter: jax.Array
+    """Of the random numbers [], int32."""
+    step: jax.Array
+    """Control steps since the reset [], int32."""
+    phases: jax.Array
+    """Shares of an interval that were over at the reset [3]: camera, pushes, targets."""
+    target_age: jax.Array
+    """Time since the target height was drawn [], s."""
+    actuation: Actuation | None
+    sensing: Sensing | None
+
+
 class BounceState(NamedTuple):
     """The whole state of one environment, `State.pipeline_state`."""
 
     physics: PhysicsState
     task: TaskState
     parameters: PhysicsParameters = PhysicsParameters()
-    """The world of this environment; drawn at its reset."""
+    """The physics of this environment; drawn at its reset."""
+    world: World = {}
+    """The terms of the randomisation that are on, as drawn at the reset."""
+    memory: Memory | None = None
 
 
 class BounceBall:
@@ -81,6 +112,7 @@ class BounceBall:
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._randomize = randomize
+        self.layout = self.config.observation.layout
         self._fingerprint = fingerprint(self.mj_model)
 
     @property
@@ -91,7 +123,7 @@ class BounceBall:
     @property
     def observation_size(self) -> int:
         """Length of the observation vector."""
-        return OBSERVATION.size
+        return self.layout.size
 
     @property
     def action_size(self) -> int:
@@ -120,35 +152,65 @@ class BounceBall:
             "use, so it would have no effect; give BounceBall a function randomize instead"
         )
 
-    def reset(self, rng: jax.Array) -> State:
-        """Starts an episode; consumes the key `rng`."""
+    @property
+    def warmup_steps(self) -> int:
+        """Environment steps of a training over which `ranges` grow."""
+        return self.config.randomization.warmup_steps
+
+    def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
+        """The ranges of the randomisation; `progress` [] is the share of the warm-up that is
+        over."""
+        return self.config.randomization.ranges(progress)
+
+    def reset(self, rng: jax.Array, ranges: Ranges | None = None) -> State:
+        """Starts an episode.
+
+        Args:
+          rng: consumed.
+          ranges: other ranges of the terms that are on; the config's by default.
+        """
         check_unedited(self.mj_model, self._fingerprint)
         config, addresses = self.config, self._addresses
-        parameters = PhysicsParameters()
+        ranges = self.ranges() if ranges is None else ranges
+        world, parameters = {}, PhysicsParameters()
+        if ranges or self._needs_sensing:
+            rng, world_rng, memory_rng = jax.random.split(rng, 3)
+            world = draw_world(ranges, world_rng, jnp.result_type(float))
+            parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
-            parameters = self._randomize(world_rng)
+            given = self._randomize(world_rng)
+            parameters = PhysicsParameters(
+                *(b if a is None else a for a, b in zip(given, parameters, strict=True))
+            )
         # One draw for all: the keys of separate draws would cost more than the numbers.
-        noise = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
-        zero = jnp.zeros((), noise.dtype)
+        draws = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
+        dtype = draws.dtype
+        zero = jnp.zeros((), dtype)
         low, high = config.target_height_range
 
-        qpos = [jnp.asarray(q, noise.dtype) for q in self.mj_model.qpos0]
+        qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
         qvel = [zero] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
-            qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * noise[i]
-            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * noise[6 + i]
+            qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
+            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[6 + i]
         for i, coordinate in enumerate(config.ball_init_pos):
-            qpos[addresses.ball_qpos[i]] = coordinate + config.ball_position_noise * noise[12 + i]
+            qpos[addresses.ball_qpos[i]] = coordinate + config.ball_position_noise * draws[12 + i]
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
-            qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, noise.dtype)
+            qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, dtype)
+        for term, entries in (
+            ("joint_start", addresses.arm_qpos),
+            ("ball_start", addresses.ball_qpos[:3]),
+        ):
+            for i, entry in enumerate(entries if term in world else ()):
+                qpos[entry] = qpos[entry] + world[term][i]
         physics = PhysicsState(
             jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
         )
 
         task = TaskState(
-            target_height=low + (high - low) * 0.5 * (noise[15] + 1.0),
-            last_action=jnp.zeros(self.action_size, noise.dtype),
+            target_height=world.get("target_height", low + (high - low) * 0.5 * (draws[15] + 1.0)),
+            last_action=jnp.zeros(self.action_size, dtype),
             rising=jnp.zeros((), bool),
             n_bounces=zero,
             apex=physics.qpos[addresses.ball_qpos[2]],
@@ -157,34 +219,91 @@ class BounceBall:
         metrics |= dict.fromkeys(
             ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"), zero
         )
-        state = BounceState(physics, task, parameters)
+        state = BounceState(physics, task, parameters, world)
+        truth = self.kinematics(state)
+        if world or self._needs_sensing:
+            state = state._replace(memory=self._first_memory(state, truth, memory_rng))
         return State(
             pipeline_state=state,
-            obs=self.observe(self.kinematics(state), task),
+            obs=self.observe(state, truth),
             reward=zero,
             done=zero,
-            metrics=metrics,
+            metrics=metrics | self._privileged(world, truth),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [6], clipped to [-1, 1]."""
         check_unedited(self.mj_model, self._fingerprint)
         action = jnp.clip(action, -1.0, 1.0)
+        state, control = self.begin_step(state, action)
         before = state.pipeline_state
-        targets = self.servo_targets(before.physics, action)
         physics = self.engine.step(
-            before.parameters, before.physics, targets, self.config.num_substeps
+            before.parameters, before.physics, control, self.config.num_substeps
         )
         return self.finish_step(state, action, physics)
 
-    def servo_targets(self, physics: PhysicsState, action: jax.Array) -> jax.Array:
+    def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
+        """The task's part of a step before the physics: the control of a clipped action [6]."""
+        config, before = self.config, state.pipeline_state
+        world, memory = before.world, before.memory
+        if memory is None:
+            return state, Control(self.servo_targets(before.physics, action))
+        # The same noise as in the observation that the action answers.
+        error = sensing.joint_angle_noise(world, memory.counter, action.dtype)
+        targets = self.servo_targets(before.physics, action, error)
+        control, queue = actuation.delayed(
+            world, memory.actuation, targets, config.control_dt, config.num_substeps
+        )
+        memory = memory._replace(counter=noise.next_counter(memory.counter), actuation=queue)
+        task = before.task
+        if "air_drag" in world:
+            velocity = jnp.stack([before.physics.qvel[i] for i in self._addresses.ball_qvel[:3]])
+            mass = before.parameters.ball_mass
+            if mass is None:
+                mass = float(self.mj_model.body_mass[self._addresses.ball_body])
+            control = control._replace(ball_force=actuation.drag_force(world, velocity, mass))
+        if "push_speed" in world:
+            push = actuation.push(
+                world, memory.counter, memory.phases[1], memory.step, config.control_dt
+            )
+            control = control._replace(ball_push=push)
+        if "target_interval" in world:
+            task, memory = self._next_target(world, task, memory)
+        before = before._replace(task=task, memory=memory)
+        return state.replace(pipeline_state=before), control
+
+    def _next_target(
+        self, world: World, task: TaskState, memory: Memory
+    ) -> tuple[TaskState, Memory]:
+        """Draws another target height where its interval is over."""
+        now = actuation.passes(
+            world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
+        )
+        low, high = self.config.randomization.target_height or self.config.target_height_range
+        share = noise.uniform(memory.counter, _TARGET_STREAM, (), task.target_height.dtype)
+        drawn = jnp.where(now, low + (high - low) * share, task.target_height)
+        return task._replace(target_height=drawn), memory._replace(
+            target_age=jnp.where(now, 0.0, memory.target_age)
+        )
+
+    def servo_targets(
+        self, physics: PhysicsState, action: jax.Array, error: jax.Array | None = None
+    ) -> jax.Array:
         """Servo targets ctrl [nu] of a clipped action [6]: the measured joint angles plus the
-        scaled action (rad), clipped to the range of each joint that has one, times the gear."""
+        scaled action (rad), clipped to the range of each joint that has one, times the gear.
+
+        Args:
+          error: of the measured angles [6], rad; without that of an encoder's zero, which the
+            servo shares.
+        """
         model, addresses = self.mj_model, self._addresses
         targets = [jnp.zeros_like(action[0])] * model.nu
         # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
         for i, actuator in enumerate(addresses.actuators):
-            target = physics.qpos[addresses.arm_qpos[i]] + self.config.action_scale * action[i]
+            angle = physics.qpos[addresses.arm_qpos[i]]
+            if error is not None:
+                angle = angle + error[i]
+            target = angle + self.config.action_scale * action[i]
             low, high = (float(limit) for limit in model.jnt_range[addresses.arm_joints[i]])
             if low < high:
                 target = jnp.clip(target, low, high)
@@ -256,13 +375,16 @@ class BounceBall:
             "apex_error": jnp.where(bounced, apex_error, 0.0),
             "non_finite": (~finite).astype(dtype),
         }
+        after = before._replace(physics=physics, task=task)
+        if before.memory is not None:
+            after = after._replace(memory=self._next_memory(after, kinematics))
         return state.replace(
-            pipeline_state=before._replace(physics=physics, task=task),
-            obs=self.observe(kinematics, task),
+            pipeline_state=after,
+            obs=self.observe(after, kinematics),
             reward=sum(terms.values()),
             done=ended.astype(dtype),
             # Wrappers add metrics of their own, which a step must keep.
-            metrics=state.metrics | metrics,
+            metrics=state.metrics | metrics | self._privileged(before.world, kinematics),
         )
 
     def kinematics(self, state: BounceState) -> Kinematics:
@@ -278,9 +400,117 @@ class BounceBall:
             paddle_position=self.engine.paddle_position(state.parameters, qpos),
         )
 
-    def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
-        """The observation [29], laid out as `OBSERVATION`; sensor noise would go here."""
-        return OBSERVATION.pack(kinematics._asdict() | {"target_height": task.target_height[None]})
+    def observe(self, state: BounceState, truth: Kinematics | None = None) -> jax.Array:
+        """The observation [observation_size] of a state, laid out as `layout`.
+
+        Args:
+          truth: `kinematics(state)`, if it is at hand.
+        """
+        target_height = state.task.target_height[None]
+        if state.memory is None or state.memory.sensing is None:
+            truth = self.kinematics(state) if truth is None else truth
+            return self.layout.pack(truth._asdict() | {"target_height": target_height})
+        seen = dict(state.memory.sensing.seen)
+        if "target_height" in seen:
+            seen["target_height"] = jnp.concatenate(
+                [target_height[None], seen["target_height"][1:]]
+            )
+        return self.layout.pack({name: values.reshape(-1) for name, values in seen.items()})
+
+    @property
+    def _needs_sensing(self) -> bool:
+        return sensing.is_needed(self.config.randomization, self.config.observation)
+
+    def _first_memory(self, state: BounceState, truth: Kinematics, rng: jax.Array) -> Memory:
+        config, dtype = self.config, truth.ball_position.dtype
+        counter = jax.lax.bitcast_convert_type(jax.random.bits(rng), jnp.int32)
+        return Memory(
+            counter=counter,
+            step=jnp.zeros((), jnp.int32),
+            phases=noise.uniform(counter, _TARGET_STREAM, (3,), dtype),
+            target_age=jnp.zeros((), dtype),
+            actuation=actuation.start_actuation(
+                config.randomization,
+                config.control_dt,
+                self.servo_targets(state.physics, jnp.zeros(self.action_size, dtype)),
+            ),
+            sensing=sensing.start_sensing(
+                config.randomization,
+                config.observation,
+                config.control_dt,
+                truth,
+                state.task.target_height,
+            )
+            if self._needs_sensing
+            else None,
+        )
+
+    def _next_memory(self, state: BounceState, truth: Kinematics) -> Memory:
+        """The memory after a control step: time, and the measurements of the new state."""
+        memory, config = state.memory, self.config
+        memory = memory._replace(
+            step=memory.step + 1, target_age=memory.target_age + config.control_dt
+        )
+        if memory.sensing is None:
+            return memory
+        ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
+        balls = jnp.concatenate([ball[None], memory.sensing.balls[:-1]])
+        past = memory.sensing._replace(balls=balls)
+        picture = sensing.take_picture(
+            config.observation,
+            state.world,
+            past,
+            memory.counter,
+            memory.phases[0],
+            memory.step,
+            config.control_dt,
+        )
+        angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
+        paddle = truth.paddle_position
+        if self._misjudges_paddle:
+            qpos = [state.physics.qpos[i] for i in range(self.mj_model.nq)]
+            for i, address in enumerate(self._addresses.arm_qpos):
+                qpos[address] = angles[i]
+            paddle = self.engine.paddle_position(MODEL_PARAMETERS, jnp.stack(qpos))
+        measured = truth._asdict() | {
+            "joint_angles": angles,
+            "joint_velocities": velocities,
+            "ball_position": picture.position,
+            "ball_velocity": picture.velocity,
+            "paddle_position": paddle,
+            "target_height": state.task.target_height[None],
+            "action": state.task.last_action,
+            "ball_age": picture.age[None],
+        }
+        near_height = paddle[2] + config.bounce_max_distance
+        return memory._replace(
+            sensing=sensing.remember(
+                past, measured, picture, near_height, state.task.target_height, config.control_dt
+            )
+        )
+
+    @property
+    def _misjudges_paddle(self) -> bool:
+        """Whether the measured paddle position differs from the true one, and matters."""
+        observation = self.config.observation
+        wrong = {"encoder_bias", "joint_angle_noise", "paddle_offset", "paddle_tilt"}
+        matters = observation.paddle_position or any(getattr(observation, q) for q in OF_BOUNCES)
+        return bool(matters and wrong & set(self.config.randomization.terms))
+
+    def _privileged(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
+        """Numbers that only a critic may see: `world/<term>` and, where the sensors differ from the
+        truth, `true/<quantity>`; with an index for each entry of an array."""
+        named = {f"world/{name}": value for name, value in world.items()}
+        if self._needs_sensing:
+            hidden = ("joint_angles", "ball_position", "joint_velocities", "ball_velocity")
+            named |= {f"true/{name}": getattr(truth, name) for name in hidden}
+            named["true/ball_angular_velocity"] = truth.ball_angular_velocity
+            named["true/paddle_position"] = truth.paddle_position
+        return {
+            name if value.ndim == 0 else f"{name}_{i}": entry
+            for name, value in named.items()
+            for i, entry in enumerate(value if value.ndim else (value,))
+        }
 
 
 def update_task(

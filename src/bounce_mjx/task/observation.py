@@ -1,11 +1,16 @@
-"""The observation: its parts, their sizes and units, and their order."""
+"""The observation: its quantities, how many past values of each it holds, and their order."""
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from pydantic import Field
+
+from bounce_mjx.config.settings import StrictModel
+
+History = Annotated[int, Field(ge=0, le=100)]
 
 
 class Part(NamedTuple):
@@ -16,6 +21,81 @@ class Part(NamedTuple):
     """Number of entries."""
     unit: str
     """Unit of the entries; empty for a pure number."""
+
+
+QUANTITIES = (
+    Part("joint_angles", 6, "rad"),
+    Part("ball_position", 3, "m"),
+    Part("ball_quaternion", 4, ""),
+    Part("joint_velocities", 6, "rad/s"),
+    Part("ball_velocity", 3, "m/s"),
+    Part("ball_angular_velocity", 3, "rad/s"),
+    Part("paddle_position", 3, "m"),
+    Part("target_height", 1, "m"),
+    Part("action", 6, ""),
+    Part("ball_age", 1, "s"),
+    Part("apex_error", 1, "m"),
+    Part("bounce_position", 2, "m"),
+    Part("bounce_interval", 1, "s"),
+    Part("bounce_joint_angles", 6, "rad"),
+    Part("bounce_joint_velocities", 6, "rad/s"),
+)
+"""The quantities that an observation may hold, in its order, and the size of one value of each."""
+
+OF_BOUNCES = frozenset(part.name for part in QUANTITIES[10:])
+"""Quantities that have a value for each bounce in place of each control step."""
+
+
+class ObservationConfig(StrictModel):
+    """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
+    newest, N for the last N, the newest first."""
+
+    joint_angles: History = 1
+    """Measured angles of Joint1..Joint6."""
+    ball_position: History = 1
+    """Measured position of the ball."""
+    ball_quaternion: History = 1
+    """Orientation of the ball, which no sensor of a robot measures."""
+    joint_velocities: History = 1
+    """Measured velocities of Joint1..Joint6."""
+    ball_velocity: History = 1
+    """Measured or estimated velocity of the ball."""
+    ball_angular_velocity: History = 1
+    """Spin of the ball, which no sensor of a robot measures."""
+    paddle_position: History = 1
+    """Centre of the paddle by the forward kinematics of the measured joint angles."""
+    target_height: History = 1
+    """Target height."""
+    action: History = 0
+    """Actions of the last control steps."""
+    ball_age: History = 0
+    """Time since the picture of the ball was taken."""
+    apex_error: History = 0
+    """Highest measured ball position minus the target height, of the flights before the last
+    bounces."""
+    bounce_position: History = 0
+    """Measured horizontal position of the ball at the lowest point of the last bounces."""
+    bounce_interval: History = 0
+    """Time between the last bounces."""
+    bounce_joint_angles: History = 0
+    """Measured joint angles at the lowest points of the last bounces."""
+    bounce_joint_velocities: History = 0
+    """Measured joint velocities at the lowest points of the last bounces."""
+    velocity: Literal["measured", "differences"] = "measured"
+    """Source of ball_velocity: a sensor, or differences of the pictures."""
+
+    @functools.cached_property
+    def layout(self) -> "ObservationLayout":
+        """The order of the entries."""
+        sizes = ((p, getattr(self, p.name)) for p in QUANTITIES)
+        return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in sizes if n))
+
+    @property
+    def is_momentary(self) -> bool:
+        """Whether one instant's true state gives the whole observation."""
+        past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
+        remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
+        return not past and not remembered and self.velocity == "measured"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,18 +127,8 @@ class ObservationLayout:
         return jnp.stack([values[part.name][i] for part in self.parts for i in range(part.size)])
 
 
-OBSERVATION = ObservationLayout(
-    (
-        Part("joint_angles", 6, "rad"),
-        Part("ball_position", 3, "m"),
-        Part("ball_quaternion", 4, ""),
-        Part("joint_velocities", 6, "rad/s"),
-        Part("ball_velocity", 3, "m/s"),
-        Part("ball_angular_velocity", 3, "rad/s"),
-        Part("paddle_position", 3, "m"),
-        Part("target_height", 1, "m"),
-    )
-)
+OBSERVATION = ObservationConfig().layout
+"""The layout of the original specification, the default."""
 
 
 class Kinematics(NamedTuple):

@@ -5,6 +5,7 @@ A term is a config class with the weight and the constants, and below it the for
 `reward/<name>`, the log and the report's figure follow the registry `TERMS`.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -438,7 +439,13 @@ RewardConfig = pydantic.create_model(
     __base__=SharedRewardConfig,
     __module__=__name__,
     __doc__=SharedRewardConfig.__doc__,
-    **{name: (entry.config, entry.config()) for name, entry in TERMS.items()},
+    **{
+        name: (
+            entry.config,
+            pydantic.Field(entry.config(), description=inspect.getdoc(entry.config)),
+        )
+        for name, entry in TERMS.items()
+    },
 )
 
 

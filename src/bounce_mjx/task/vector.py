@@ -5,7 +5,7 @@ coordinates. Observations [B, N] and actions [B, A] have the batch first.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,9 +49,9 @@ class StepResult(NamedTuple):
     """Length of the episode up to this step [B], int."""
 
 
-def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
+def reset(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) -> VectorState:
     """Starts `num_envs` episodes; consumes `key`."""
-    states = first_states(env, key, num_envs)
+    states = first_states(env, key, num_envs, ranges)
     return VectorState(
         env=states,
         clock=jnp.zeros(num_envs, jnp.int32),
@@ -60,9 +60,16 @@ def reset(env: Env, key: jax.Array, num_envs: int) -> VectorState:
     )
 
 
-def first_states(env: Env, key: jax.Array, num_envs: int) -> State:
-    """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`."""
-    return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+def first_states(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) -> State:
+    """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`.
+
+    Args:
+      ranges: of the environment's randomisation; None for its own.
+    """
+    given = () if ranges is None else (ranges,)
+    return jax.vmap(lambda key: env.reset(key, *given), out_axes=-1)(
+        jax.random.split(key, num_envs)
+    )
 
 
 def observe(state: VectorState) -> jax.Array:

@@ -26,7 +26,7 @@ class PPOTrainer:
         Raises:
           UserError: the config does not fit the devices or the environment.
         """
-        self._config = config
+        self._config, self._observation_size = config, env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = make_trainer(config.ppo, env, config.env.episode_steps)
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
@@ -73,7 +73,7 @@ class PPOTrainer:
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
-        return Snapshot(policy_of(state), state)
+        return Snapshot(policy_of(state, self._observation_size), state)
 
     def _initial_state(self, seeds: jax.Array) -> TrainingState:
         """The first state of the training of a seed [], or of those of several [S]."""

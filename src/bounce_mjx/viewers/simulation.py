@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import BounceBall, BounceState
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.task.state import State
 from bounce_mjx.viewers.controllers import Controller
@@ -141,10 +141,7 @@ def _influence(env: BounceBall, states: State, target: jax.Array, push: jax.Arra
         task=task._replace(target_height=jnp.where(jnp.isnan(target), task.target_height, target)),
     )
 
-    def observe(state: BounceState) -> jax.Array:
-        return env.observe(env.kinematics(state), state.task)
-
-    observation = jax.vmap(observe, in_axes=-1, out_axes=-1)(changed)
+    observation = jax.vmap(env.observe, in_axes=-1, out_axes=-1)(changed)
     return states.replace(pipeline_state=changed, obs=observation)
 
 

@@ -19,14 +19,17 @@ from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.task import vector
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
-from bounce_mjx.task.observation import OBSERVATION
 from bounce_mjx.task.state import State
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
 ACTION_SPACE = gymnasium.spaces.Box(-1.0, 1.0, (len(JOINT_NAMES),), np.float32)
-OBSERVATION_SPACE = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION.size,), np.float32)
 _FRAMES_PER_SECOND = 50
 _HEIGHT, _WIDTH = 480, 640
+
+
+def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
+    """The space of the observations of one environment."""
+    return gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
 
 
 class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -48,7 +51,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
         self.render_mode = render_mode
         self.action_space = ACTION_SPACE
-        self.observation_space = OBSERVATION_SPACE
+        self.observation_space = observation_space(self.task)
         self._reset = jax.jit(self.task.reset)
         self._step = jax.jit(self.task.step)
         self._state: State | None = None
@@ -112,9 +115,12 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.single_action_space, self.single_observation_space = ACTION_SPACE, OBSERVATION_SPACE
+        self.single_action_space = ACTION_SPACE
+        self.single_observation_space = observation_space(self.task)
         self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
-        self.observation_space = gymnasium.vector.utils.batch_space(OBSERVATION_SPACE, num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )
         self._reset = jax.jit(lambda key: vector.reset(self.task, key, num_envs))
         self._step = jax.jit(self._step_and_split_key, donate_argnums=0)
         self._state: vector.VectorState | None = None

@@ -6,7 +6,7 @@ import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.environments import ACTION_SPACE, OBSERVATION_SPACE
+from bounce_mjx.adapters.gymnasium.environments import ACTION_SPACE, observation_space
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
@@ -22,9 +22,12 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def __init__(self, env: TorchVectorEnv):
         self.env = env
         self.num_envs = env.num_envs
-        self.single_action_space, self.single_observation_space = ACTION_SPACE, OBSERVATION_SPACE
+        self.single_action_space = ACTION_SPACE
+        self.single_observation_space = observation_space(env.env)
         self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, env.num_envs)
-        self.observation_space = gymnasium.vector.utils.batch_space(OBSERVATION_SPACE, env.num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, env.num_envs
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -19,7 +19,6 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD, MIN_VARIANCE
 from bounce_mjx.robot.model import JOINT_NAMES
-from bounce_mjx.task.observation import OBSERVATION
 
 
 class Normalizer(nn.Module):
@@ -106,7 +105,7 @@ def to_policy(
             "std_logparam": {"log_value": _array(log_std)},
         }
     }
-    networks = make_networks(config, OBSERVATION.size, len(JOINT_NAMES))
+    networks = make_networks(config, len(normalizer.mean), len(JOINT_NAMES))
     expected = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
     shapes, expected_shapes = (jax.tree.map(lambda x: x.shape, tree) for tree in (params, expected))
     if shapes != expected_shapes:

@@ -16,7 +16,7 @@ import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.metrics import step_metrics
+from bounce_mjx.learning.metrics import matching_metrics, step_metrics
 from bounce_mjx.task import vector
 from bounce_mjx.task.env import BounceBall
 
@@ -96,7 +96,8 @@ class TorchVectorEnv:
         Args:
           env: the task; None for the default one.
           seed: of all resets.
-          critic_metrics: names of the metrics that are additional inputs of the value network.
+          critic_metrics: names of the metrics that are additional inputs of the value network;
+            a pattern such as world/* names many.
           reward_scale: factor of the rewards.
           device: the device of the tensors, which must be JAX's default device; None accepts it.
 
@@ -108,20 +109,13 @@ class TorchVectorEnv:
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size
         self.episode_steps = self.env.config.episode_steps
-        self.critic_metrics = critic_metrics
         self.device = _shared_device(None if device is None else torch.device(device))
         self._reward_scale = reward_scale
         self._key = jax.random.PRNGKey(seed)
         self._template = jax.eval_shape(
             lambda key: vector.reset(self.env, key, num_envs), self._key
         )
-        known = self._template.env.metrics
-        unknown = [name for name in critic_metrics if name not in known]
-        if unknown:
-            raise UserError(
-                f"critic_metrics names {unknown[0]!r}, which is not a metric of the environment; "
-                f"choose from {', '.join(sorted(known))}"
-            )
+        self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
         _, arrays, metrics = jax.eval_shape(self._advance, carried, action)

@@ -4,14 +4,16 @@ Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physi
 loops; on a GPU all physics steps of a control step are one kernel (`gpu/elementwise.py`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
+from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.fused import chain, friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
@@ -35,10 +37,10 @@ def step(
     model: FusedModel,
     parameters: PhysicsParameters,
     state: PhysicsState,
-    ctrl: jax.Array,
+    control: Control,
     num_substeps: int = 1,
 ) -> PhysicsState:
-    """Advances one environment by `num_substeps` physics steps under a constant `ctrl` [nu].
+    """Advances one environment by `num_substeps` physics steps.
 
     The parameters that are given enter the program as inputs; the others fold as constants. The
     coordinates go through the loop as scalars. Without friction the ball's spin is constant,
@@ -54,11 +56,14 @@ def step(
         ball_velocity=tuple(state.qvel[i] for i in addresses.ball_qvel[:3]),
         turning=friction.turning_of(*_orientation_and_spin(model, state)) if frictional else None,
     )
+    if control.ball_push is not None:
+        pushed = vadd(motion.ball_velocity, tuple(control.ball_push[i] for i in range(3)))
+        motion = motion._replace(ball_velocity=pushed)
     leaves, tree = jax.tree.flatten(motion)
-    numbers, given = jax.tree.flatten(as_scalars(parameters, state.qpos.dtype))
-    substeps = _substeps(model, tree, given, num_substeps)
-    advance = elementwise(substeps, num_results=len(leaves))
-    motion = tree.unflatten(advance(*leaves, *(ctrl[i] for i in addresses.actuators), *numbers))
+    inputs = (_of_servos(control, addresses.actuators), parameters)
+    numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
+    advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
+    motion = tree.unflatten(advance(*leaves, *numbers))
     if motion.turning is None:
         quaternion = turn(*_orientation_and_spin(model, state), num_substeps * model.dt)
         spin = ()
@@ -96,14 +101,28 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
 
 
-def as_scalars(parameters: PhysicsParameters, dtype: jnp.dtype) -> PhysicsParameters:
-    """The given arrays of one environment as scalars, or tuples of scalars, of one type."""
+def _of_servos(control: Control, actuators: tuple[int, ...]) -> Control:
+    """The control of the arm's servos, in the order of the joints; the push is spent."""
+
+    def chosen(ctrl: jax.Array | None) -> jax.Array | None:
+        return None if ctrl is None else jnp.stack([ctrl[i] for i in actuators])
+
+    return control._replace(
+        ctrl=chosen(control.ctrl),
+        previous=chosen(control.previous),
+        filtered=chosen(control.filtered),
+        ball_push=None,
+    )
+
+
+def as_scalars(arrays: Any, dtype: jnp.dtype) -> Any:
+    """The arrays of one environment as scalars, or tuples of scalars, of one type."""
 
     def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
         array = jnp.asarray(array, dtype)
         return array if array.ndim == 0 else tuple(array[i] for i in range(len(array)))
 
-    return jax.tree.map(scalars, parameters)
+    return jax.tree.map(scalars, arrays)
 
 
 @functools.lru_cache
@@ -113,27 +132,41 @@ def _substeps(
     given: jax.tree_util.PyTreeDef,
     num_substeps: int,
 ) -> Callable[..., tuple[Scalar, ...]]:
-    """Physics steps as a function of scalars: a flat `Motion` of the structure `coordinates`, the
-    servo targets, and the flat parameters of the structure `given`.
+    """Physics steps as a function of scalars: a flat `Motion` of the structure `coordinates`, then
+    the `Control` and the parameters, flat, of the structure `given`.
 
     The cache and the inline jit let JAX trace this long function once for all the programs that
     have it; each trace takes some tenths of a second.
     """
-    first_target = coordinates.num_leaves
-    first_number = first_target + len(model.links)
+    num_coordinates = coordinates.num_leaves
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
-        targets = scalars[first_target:first_number]
-        world = in_world(model, given.unflatten(scalars[first_number:]))
+        control, parameters = given.unflatten(scalars[num_coordinates:])
+        world = in_world(model, parameters)
+        if control.ball_force is not None:
+            world = dataclasses.replace(world, ball_force=control.ball_force)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
-            lambda _, motion: substep(world, motion, targets),
-            coordinates.unflatten(scalars[:first_target]),
+            lambda i, motion: substep(world, motion, _targets(control, i)),
+            coordinates.unflatten(scalars[:num_coordinates]),
         )
         return tuple(jax.tree.leaves(motion))
 
     return jax.jit(substeps, inline=True)
+
+
+def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
+    """Targets of the servos in a physics step."""
+    if control.previous is None and control.lag is None:
+        return control.ctrl
+    step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
+    none = (None,) * len(control.ctrl)
+    servos = zip(control.ctrl, control.previous or none, control.filtered or none, strict=True)
+    return tuple(
+        servo_target(control._replace(ctrl=ctrl, previous=previous, filtered=filtered), step)
+        for ctrl, previous, filtered in servos
+    )
 
 
 @functools.lru_cache
@@ -195,6 +228,7 @@ def contact_response(
         _paddle_origin(model, pose),
         matmul(pose.world_rotation[-1], model.paddle_rotation),
     )
+    ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     if motion.turning is not None:
         factor = chain.cholesky(inertia)
         response = friction.contact_response(
@@ -205,9 +239,9 @@ def contact_response(
             joint_velocity=motion.v,
             half_applied=chain.solve_lower(factor, applied),
             ball=(motion.ball_position, motion.ball_velocity, motion.turning.spin),
-            free_acceleration=model.gravity,
+            free_acceleration=ball_free,
         )
-        ball_acceleration = vadd(model.gravity, response.ball_acceleration)
+        ball_acceleration = vadd(ball_free, response.ball_acceleration)
         return response.joint_torque, ball_acceleration, response.spin_acceleration
     # The torque of a force along the normal is the same at the contact as at the ball's centre.
     jacobian = [
@@ -219,7 +253,7 @@ def contact_response(
     half_applied = chain.solve_lower(factor, applied)
 
     normal_velocity = dot(contact.normal, motion.ball_velocity)
-    free_acceleration = dot(contact.normal, model.gravity)
+    free_acceleration = dot(contact.normal, ball_free)
     inverse_inertia = 1.0 / model.ball_mass
     for j, v, half_j, half_a in zip(jacobian, motion.v, half_jacobian, half_applied, strict=True):
         normal_velocity = normal_velocity + j * v
@@ -228,7 +262,7 @@ def contact_response(
     force = normal_force(
         model.contact, contact, normal_velocity, free_acceleration, inverse_inertia
     )
-    ball_acceleration = vadd(model.gravity, scale(contact.normal, force / model.ball_mass))
+    ball_acceleration = vadd(ball_free, scale(contact.normal, force / model.ball_mass))
     return [j * force for j in jacobian], ball_acceleration, None
 
 

@@ -8,7 +8,15 @@ import numpy as np
 
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
-from bounce_mjx.physics.fused.scalars import Mat3, Scalar, Vec3, mul, quaternion_matrix, scale
+from bounce_mjx.physics.fused.scalars import (
+    ZERO3,
+    Mat3,
+    Scalar,
+    Vec3,
+    mul,
+    quaternion_matrix,
+    scale,
+)
 from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.robot.model import Addresses, find_addresses
@@ -56,6 +64,8 @@ class FusedModel:
     addresses: Addresses
     nq: int
     nv: int
+    ball_force: Vec3 = ZERO3
+    """External force on the ball, N."""
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:

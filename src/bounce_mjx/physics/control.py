@@ -1,0 +1,64 @@
+"""The inputs of the physics over one control step."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+Scalar = float | jax.Array
+
+
+class Control(NamedTuple):
+    """Servo targets and disturbances over N physics steps; None where there is none.
+
+    Every engine simulates it alike: `servo_targets` gives the `ctrl` of each physics step, the push
+    changes the ball's velocity before the first one, and the force acts during all.
+    """
+
+    ctrl: Any
+    """Servo targets [nu]."""
+    previous: Any = None
+    """Servo targets [nu] before the physics step `switch`."""
+    switch: Any = None
+    """Number [] of physics steps under `previous`, a whole number."""
+    filtered: Any = None
+    """Outputs [nu] of the servos' first-order lags before the first step."""
+    lag: Any = None
+    """Time constant [] of the lags in physics steps."""
+    ball_force: Any = None
+    """Force [3] on the ball's centre, N."""
+    ball_push: Any = None
+    """Velocity [3] that the ball is given, m/s."""
+
+
+def servo_target(control: Control, step: Scalar) -> Scalar:
+    """Target of a servo in a physics step.
+
+    The lag is the exact solution of a first-order filter whose input is constant during a step.
+
+    Args:
+      control: `ctrl`, `previous` and `filtered` of one servo or of several.
+      step: index of the physics step, from 0.
+    """
+    late = control.previous is not None
+    asked = control.ctrl
+    before = control.switch if late else 0.0
+    if late:
+        asked = jnp.where(step < before, control.previous, control.ctrl)
+    if control.lag is None:
+        return asked
+    # A time constant of 0 is a filter without memory.
+    rate = -1.0 / jnp.maximum(control.lag, 1e-3)
+    held = jnp.minimum(step + 1.0, before) if late else 0.0
+    at_switch = control.filtered
+    if late:
+        at_switch = control.previous + (at_switch - control.previous) * jnp.exp(rate * held)
+    since = jnp.maximum(step + 1.0 - before, 0.0)
+    settled = control.ctrl + (at_switch - control.ctrl) * jnp.exp(rate * since)
+    return jnp.where(step < before, at_switch, settled) if late else settled
+
+
+def servo_targets(control: Control, num_steps: int) -> jax.Array:
+    """Targets [num_steps, nu] of all servos in each physics step."""
+    steps = jnp.arange(num_steps, dtype=control.ctrl.dtype)
+    return jax.vmap(lambda step: servo_target(control, step))(steps)

@@ -1,0 +1,116 @@
+"""From the policy's action to the inputs of the physics: late and lagging servo targets, air drag
+and pushes."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.physics import Control
+from bounce_mjx.physics.control import servo_target
+from bounce_mjx.task import noise
+from bounce_mjx.task.randomization import RandomizationConfig, World
+
+# Time between pushes where only their speed is given, s.
+DEFAULT_PUSH_INTERVAL = 2.0
+_PUSH_STREAM = 3
+
+
+class Actuation(NamedTuple):
+    """Memory of the actuation; None where no term needs it."""
+
+    targets: jax.Array | None
+    """Servo targets of the last control steps [K, nu], the newest first."""
+    filtered: jax.Array | None
+    """Outputs of the servos' lags [nu]."""
+
+
+def start_actuation(
+    config: RandomizationConfig, control_dt: float, targets: jax.Array
+) -> Actuation | None:
+    """The memory at a reset, at which the servos hold the targets [nu]."""
+    queue = filtered = None
+    if config.action_latency is not None:
+        length = math.floor(config.action_latency[1] / control_dt) + 2
+        queue = jnp.broadcast_to(targets, (length, *targets.shape))
+    if config.servo_lag is not None:
+        filtered = targets
+    return None if queue is None and filtered is None else Actuation(queue, filtered)
+
+
+def delayed(
+    world: World,
+    actuation: Actuation | None,
+    targets: jax.Array,
+    control_dt: float,
+    num_substeps: int,
+) -> tuple[Control, Actuation | None]:
+    """The control of a control step, given the targets [nu] that its action asks for.
+
+    The targets arrive late by any number of physics steps, and the servos' first-order lag filters
+    them.
+    """
+    control = Control(targets)
+    if actuation is None:
+        return control, None
+    queue = actuation.targets
+    if queue is not None:
+        queue = jnp.concatenate([targets[None], queue[:-1]])
+        latency = world["action_latency"] / control_dt
+        # Rounding must not make 10 ms of 10 ms steps into one step less and a whole switch.
+        whole = jnp.floor(latency + 1e-4)
+        control = Control(
+            ctrl=taken(queue, whole),
+            previous=taken(queue[1:], whole),
+            switch=jnp.round((latency - whole) * num_substeps),
+        )
+    filtered = actuation.filtered
+    if filtered is not None:
+        steps = world["servo_lag"] / (control_dt / num_substeps)
+        control = control._replace(filtered=filtered, lag=steps)
+        filtered = servo_target(control, jnp.asarray(num_substeps - 1, targets.dtype))
+    return control, Actuation(queue, filtered)
+
+
+def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
+    """The entry of a queue [K, ...] at an index [], which is a whole number; the last one at most.
+
+    A chain of selections, as the kernel has no indexing.
+    """
+    entry = queue[0]
+    for i in range(1, len(queue)):
+        entry = jnp.where(index >= i, queue[i], entry)
+    return entry
+
+
+def drag_force(world: World, velocity: jax.Array, mass: jax.Array | float) -> jax.Array:
+    """Force [3] of the air on a ball of this velocity [3] (m/s) and mass (kg), N."""
+    speed_squared = jnp.sum(jnp.square(velocity))
+    positive = speed_squared > 0.0
+    speed = jnp.where(positive, jnp.sqrt(jnp.where(positive, speed_squared, 1.0)), 0.0)
+    return -world["air_drag"] * mass * speed * velocity
+
+
+def push(
+    world: World, counter: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float
+) -> jax.Array:
+    """Velocity [3] that the ball is given at the start of a control step, m/s; mostly 0.
+
+    Args:
+      counter: of the random numbers.
+      phase: share of an interval that was over at the reset [].
+      step: control steps since the reset [].
+    """
+    interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
+    now = passes(interval, phase, step, control_dt)
+    angle = 2.0 * math.pi * noise.uniform(counter, _PUSH_STREAM, (), phase.dtype)
+    speed = jnp.where(now, world["push_speed"], 0.0)
+    return jnp.stack([speed * jnp.cos(angle), speed * jnp.sin(angle), jnp.zeros_like(speed)])
+
+
+def passes(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:
+    """Whether an event that recurs every interval (s) falls into the control step [], bool."""
+    per_step = control_dt / interval
+    time = phase + step.astype(phase.dtype) * per_step
+    return jnp.floor(time + per_step) > jnp.floor(time)

@@ -1,0 +1,292 @@
+"""Domain randomisation: the world that each episode draws.
+
+A term is one key of the config with a range (low, high), from which a reset draws every entry of
+the term uniformly. A term that is null is off and costs nothing.
+"""
+
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pydantic
+from pydantic import Field
+
+from bounce_mjx.config.settings import Finite, StrictModel, whole_number
+from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
+from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+
+Range = tuple[Finite, Finite]
+
+World = dict[str, jax.Array]
+"""The numbers that an episode drew, by the names of the terms that are on."""
+
+Ranges = dict[str, tuple[jax.Array, jax.Array]]
+"""Lower and upper ends [] of the terms that are on."""
+
+
+class Term(NamedTuple):
+    """A quantity that may differ between episodes."""
+
+    shape: tuple[int, ...]
+    """Shape of one episode's draw."""
+    nominal: float | None
+    """Value without randomisation, from which the range grows; None for a range that does not."""
+    limits: tuple[float, float]
+    """Least and greatest sensible value."""
+
+
+_J = (len(JOINT_NAMES),)
+_ANY = (-np.inf, np.inf)
+_FACTOR = (1e-3, 1e3)
+_NOT_NEGATIVE = (0.0, np.inf)
+
+TERMS: dict[str, Term] = {
+    "restitution": Term((), 0.85, (0.6, 0.98)),
+    "ball_mass": Term((), 1.0, _FACTOR),
+    "ball_radius": Term((), 1.0, _FACTOR),
+    "air_drag": Term((), 0.0, _NOT_NEGATIVE),
+    "contact_friction": Term((), 0.0, _NOT_NEGATIVE),
+    "servo_gain": Term(_J, 1.0, _FACTOR),
+    "servo_damping": Term(_J, 1.0, _FACTOR),
+    "servo_lag": Term((), 0.0, _NOT_NEGATIVE),
+    "torque_limit": Term(_J, None, (1e-3, np.inf)),
+    "joint_damping": Term(_J, 0.0, _NOT_NEGATIVE),
+    "joint_frictionloss": Term(_J, 0.0, _NOT_NEGATIVE),
+    "armature": Term(_J, 1.0, _FACTOR),
+    "link_mass": Term(_J, 1.0, _FACTOR),
+    "paddle_offset": Term((3,), 0.0, _ANY),
+    "paddle_tilt": Term((2,), 0.0, _ANY),
+    "gravity_tilt": Term((2,), 0.0, _ANY),
+    "action_latency": Term((), 0.0, _NOT_NEGATIVE),
+    "ball_latency": Term((), 0.0, _NOT_NEGATIVE),
+    "camera_rate": Term((), None, (1.0, 1e4)),
+    "frame_drop": Term((), 0.0, (0.0, 0.99)),
+    "ball_position_noise": Term((), 0.0, _NOT_NEGATIVE),
+    "ball_position_bias": Term((3,), 0.0, _ANY),
+    "ball_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
+    "ball_velocity_bias": Term((3,), 0.0, _ANY),
+    "joint_angle_noise": Term((), 0.0, _NOT_NEGATIVE),
+    "encoder_bias": Term(_J, 0.0, _ANY),
+    "joint_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
+    "joint_velocity_bias": Term(_J, 0.0, _ANY),
+    "push_speed": Term((), 0.0, _NOT_NEGATIVE),
+    "push_interval": Term((), None, (0.01, np.inf)),
+    "target_height": Term((), None, (1e-3, np.inf)),
+    "target_interval": Term((), None, (0.01, np.inf)),
+    "ball_start": Term((3,), 0.0, _ANY),
+    "joint_start": Term(_J, 0.0, _ANY),
+}
+"""The terms of `RandomizationConfig`."""
+
+
+class RandomizationConfig(StrictModel):
+    """The world that each episode draws: a range for each term, null for off."""
+
+    restitution: Range | None = None
+    """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
+    ball_mass: Range | None = None
+    """Factor of the ball's mass."""
+    ball_radius: Range | None = None
+    """Factor of the ball's radius."""
+    air_drag: Range | None = None
+    """Deceleration of the ball by the air over its squared speed, 1/m; a table-tennis ball's is
+    about 0.11."""
+    contact_friction: Range | None = None
+    """Coefficient of sliding friction between ball and paddle."""
+    servo_gain: Range | None = None
+    """Factor of each servo's stiffness."""
+    servo_damping: Range | None = None
+    """Factor of each servo's damping."""
+    servo_lag: Range | None = None
+    """Time constant of a first-order lag of the servo targets, s."""
+    torque_limit: Range | None = None
+    """Largest torque of each servo, N m."""
+    joint_damping: Range | None = None
+    """Viscous damping added to each joint, N m s/rad."""
+    joint_frictionloss: Range | None = None
+    """Dry friction of each joint, N m."""
+    armature: Range | None = None
+    """Factor of each joint's rotor inertia."""
+    link_mass: Range | None = None
+    """Factor of each link's mass."""
+    paddle_offset: Range | None = None
+    """Displacement of the paddle along each axis of the last link, m."""
+    paddle_tilt: Range | None = None
+    """Rotation of the paddle about its own x and y axis, rad."""
+    gravity_tilt: Range | None = None
+    """Rotation of gravity about the world's x and y axis, rad."""
+    action_latency: Range | None = None
+    """Time from an action to its servo targets, s."""
+    ball_latency: Range | None = None
+    """Time from a picture of the ball to its use, s."""
+    camera_rate: Range | None = None
+    """Pictures of the ball per second, Hz; the last picture holds until the next. Off: a picture at
+    every control step."""
+    frame_drop: Range | None = None
+    """Probability that a picture is lost."""
+    ball_position_noise: Range | None = None
+    """Standard deviation of the noise of each measured ball coordinate, m."""
+    ball_position_bias: Range | None = None
+    """Error of each measured ball coordinate, constant in an episode, m."""
+    ball_velocity_noise: Range | None = None
+    """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
+    ball_velocity_bias: Range | None = None
+    """Error of each component of the measured ball velocity, constant in an episode, m/s."""
+    joint_angle_noise: Range | None = None
+    """Standard deviation of the noise of each measured joint angle, rad."""
+    encoder_bias: Range | None = None
+    """Error of each encoder's zero, which the servo shares, rad."""
+    joint_velocity_noise: Range | None = None
+    """Standard deviation of the noise of each measured joint velocity, rad/s."""
+    joint_velocity_bias: Range | None = None
+    """Error of each measured joint velocity, constant in an episode, rad/s."""
+    push_speed: Range | None = None
+    """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
+    push_interval: Range | None = None
+    """Time between two pushes, s; 2 s if only push_speed is given."""
+    target_height: Range | None = None
+    """Target height, m; in the place of target_height_range."""
+    target_interval: Range | None = None
+    """Time between two draws of the target height within an episode, s."""
+    ball_start: Range | None = None
+    """Displacement of each coordinate of the ball at a reset, m."""
+    joint_start: Range | None = None
+    """Displacement of each joint angle at a reset, rad."""
+    warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
+    """Environment steps of the training over which the ranges grow from the nominal values."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_ranges(self):
+        for name in self.terms:
+            (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
+            if not low <= high:
+                raise ValueError(f"{name} ({low}, {high}) is not a range; give the lower end first")
+            if low < least or high > greatest:
+                raise ValueError(
+                    f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}; narrow the range"
+                )
+        return self
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the terms that are on."""
+        return tuple(name for name in TERMS if getattr(self, name) is not None)
+
+    def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
+        """The ranges of the terms that are on.
+
+        Args:
+          progress: share of the warm-up that is over [], from 0 to 1.
+        """
+
+        def grown(name: str, end: float) -> jax.Array:
+            nominal = TERMS[name].nominal
+            start = end if nominal is None else nominal
+            return jnp.asarray(start + (end - start) * progress, jnp.float32)
+
+        return {name: tuple(grown(name, end) for end in getattr(self, name)) for name in self.terms}
+
+
+def draw_world(ranges: Ranges, key: jax.Array, dtype: jnp.dtype) -> World:
+    """The world of one episode; consumes the key."""
+    sizes = {name: int(np.prod(TERMS[name].shape)) for name in ranges}
+    # One draw for all: the keys of separate draws would cost more than the numbers.
+    uniform, world, start = jax.random.uniform(key, (sum(sizes.values()),), dtype), {}, 0
+    for name, (low, high) in ranges.items():
+        shares = uniform[start : start + sizes[name]].reshape(TERMS[name].shape)
+        world[name] = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
+        start += sizes[name]
+    return world
+
+
+def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
+    """The part of the world that changes the physics model, as its parameters."""
+    m, addresses = mj_model, find_addresses(mj_model)
+    servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
+    links = m.jnt_bodyid[list(addresses.arm_joints)]
+    paddle = addresses.paddle_geom
+    given = {}
+    if "restitution" in world:
+        stiffness, _ = direct_solref(m)
+        given["contact_damping"] = contact_damping(world["restitution"], stiffness)
+    scaled = {
+        "ball_mass": ("ball_mass", m.body_mass[addresses.ball_body]),
+        "ball_radius": ("ball_radius", m.geom_size[addresses.ball_geom, 0]),
+        "servo_gain": ("servo_gain", m.actuator_gainprm[servos, 0]),
+        "servo_damping": ("servo_damping", -m.actuator_biasprm[servos, 2]),
+        "armature": ("armature", m.dof_armature[dofs]),
+        "link_mass": ("link_mass", m.body_mass[links]),
+    }
+    for term, (parameter, model_value) in scaled.items():
+        if term in world:
+            given[parameter] = world[term] * _array(model_value, world[term])
+    same = {
+        "contact_friction": "contact_friction",
+        "torque_limit": "force_limit",
+        "joint_frictionloss": "frictionloss",
+    }
+    for term, parameter in same.items():
+        if term in world:
+            given[parameter] = world[term]
+    if "joint_damping" in world:
+        added = world["joint_damping"]
+        given["damping"] = added + _array(m.dof_damping.reshape(m.nv, -1)[dofs, 0], added)
+    if "paddle_offset" in world:
+        offset = world["paddle_offset"]
+        given["paddle_position"] = offset + _array(m.geom_pos[paddle], offset)
+    if "paddle_tilt" in world:
+        tilt = world["paddle_tilt"]
+        given["paddle_rotation"] = _product(_array(m.geom_quat[paddle], tilt), _rotation_xy(tilt))
+    if "gravity_tilt" in world:
+        about_x, about_y = world["gravity_tilt"]
+        strength = float(np.linalg.norm(m.opt.gravity))
+        given["gravity"] = -strength * jnp.stack(
+            [
+                jnp.sin(about_y),
+                -jnp.sin(about_x) * jnp.cos(about_y),
+                jnp.cos(about_x) * jnp.cos(about_y),
+            ]
+        )
+    return PhysicsParameters(**given)
+
+
+# Damping ratio of the contact, and the restitution of drops at 1 to 4 m/s on the level paddle.
+_DAMPING_RATIO = (0.0, 0.005, 0.01, 0.0152, 0.032, 0.05, 0.0697, 0.0921, 0.116, 0.13, 0.16, 0.2)
+_RESTITUTION = (0.993, 0.98, 0.965, 0.95, 0.90, 0.85, 0.80, 0.75, 0.70, 0.674, 0.622, 0.565)
+
+
+def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
+    """Damping [] of the contact, 1/s, that gives a restitution [] at a contact stiffness (1/s^2):
+    2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests."""
+    e, ratio = np.array(_RESTITUTION[::-1]), np.array(_DAMPING_RATIO[::-1])
+    zeta = jnp.interp(restitution, e, ratio)
+    return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
+
+
+def _array(values: np.ndarray, like: jax.Array) -> jax.Array:
+    return jnp.asarray(values, like.dtype)
+
+
+def _rotation_xy(angles: jax.Array) -> jax.Array:
+    """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
+    a, b = 0.5 * angles[0], 0.5 * angles[1]
+    zero = jnp.zeros_like(a)
+    about_x = jnp.stack([jnp.cos(a), jnp.sin(a), zero, zero])
+    about_y = jnp.stack([jnp.cos(b), zero, jnp.sin(b), zero])
+    return _product(about_x, about_y)
+
+
+def _product(p: jax.Array, q: jax.Array) -> jax.Array:
+    """Product of two quaternions [w, x, y, z]."""
+    w, x, y, z = p
+    a, b, c, d = q
+    return jnp.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )

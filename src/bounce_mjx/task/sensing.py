@@ -1,0 +1,228 @@
+"""From the true state to the measured quantities: a late camera, noisy sensors, and their past."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.task import noise
+from bounce_mjx.task.actuation import taken
+from bounce_mjx.task.observation import OF_BOUNCES, QUANTITIES, Kinematics, ObservationConfig
+from bounce_mjx.task.randomization import RandomizationConfig, World
+
+_BALL_STREAM, _JOINT_STREAM, _DROP_STREAM = 0, 1, 2
+
+SENSOR_TERMS = frozenset(
+    "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
+    "ball_velocity_noise ball_velocity_bias joint_angle_noise encoder_bias joint_velocity_noise "
+    "joint_velocity_bias paddle_offset paddle_tilt".split()
+)
+"""Terms that make a measurement differ from the truth."""
+
+
+class Picture(NamedTuple):
+    """The last picture of the ball that has arrived."""
+
+    position: jax.Array
+    """Measured position [3], m."""
+    velocity: jax.Array
+    """Measured velocity, or the difference quotient of the last two pictures [3], m/s."""
+    age: jax.Array
+    """Time since it was taken [], s."""
+    number: jax.Array
+    """Number of pictures since the reset []; negative before the first."""
+
+
+class Sensing(NamedTuple):
+    """Memory of the sensors."""
+
+    balls: jax.Array
+    """True position and velocity of the ball in the last control steps [K, 6], the newest first."""
+    picture: Picture
+    flight_apex: jax.Array
+    """Highest measured position since the ball was last near the paddle [], m."""
+    is_low: jax.Array
+    """Whether the ball was measured near the paddle [], bool."""
+    lowest: jax.Array
+    """Lowest measured position while the ball is near the paddle [], m."""
+    flight_time: jax.Array
+    """Time since the ball was first measured near the paddle for the last bounce [], s."""
+    seen: dict[str, jax.Array]
+    """The last values of each observed quantity [H, size], the newest first."""
+
+
+def is_needed(randomization: RandomizationConfig, observation: ObservationConfig) -> bool:
+    """Whether the observation is more than one instant's true state."""
+    return bool(SENSOR_TERMS & set(randomization.terms)) or not observation.is_momentary
+
+
+def start_sensing(
+    randomization: RandomizationConfig,
+    observation: ObservationConfig,
+    control_dt: float,
+    truth: Kinematics,
+    target_height: jax.Array,
+) -> Sensing:
+    """The memory at a reset: the past is as the present, and all is as it is."""
+    dtype = truth.ball_position.dtype
+    latest = (randomization.ball_latency or (0.0, 0.0))[1]
+    if randomization.camera_rate is not None:
+        latest += 1.0 / randomization.camera_rate[0]
+    length = math.ceil(latest / control_dt - 1e-6) + 1
+    ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
+    zero = jnp.zeros((), dtype)
+    values = truth._asdict() | {
+        "target_height": target_height[None],
+        "action": jnp.zeros_like(truth.joint_angles),
+        "ball_age": zero[None],
+        "apex_error": zero[None],
+        "bounce_position": truth.ball_position[:2],
+        "bounce_interval": zero[None],
+        "bounce_joint_angles": truth.joint_angles,
+        "bounce_joint_velocities": truth.joint_velocities,
+    }
+    return Sensing(
+        balls=jnp.broadcast_to(ball, (length, 6)),
+        picture=Picture(truth.ball_position, truth.ball_velocity, zero, -jnp.ones((), dtype)),
+        flight_apex=truth.ball_position[2],
+        is_low=jnp.zeros((), bool),
+        lowest=truth.ball_position[2],
+        flight_time=zero,
+        seen={
+            part.name: jnp.broadcast_to(values[part.name], (n, part.size))
+            for part in QUANTITIES
+            if (n := getattr(observation, part.name))
+        },
+    )
+
+
+def joint_angle_noise(world: World, counter: jax.Array, dtype: jnp.dtype) -> jax.Array | None:
+    """Noise [6] of the measured joint angles of a control step, rad; None without any."""
+    if "joint_angle_noise" not in world:
+        return None
+    return world["joint_angle_noise"] * noise.normal(counter, _JOINT_STREAM, (12,), dtype)[:6]
+
+
+def take_picture(
+    observation: ObservationConfig,
+    world: World,
+    sensing: Sensing,
+    counter: jax.Array,
+    phase: jax.Array,
+    step: jax.Array,
+    control_dt: float,
+) -> Picture:
+    """The last picture that has arrived at a control step.
+
+    A camera takes pictures at its rate, in no relation to the control steps; between them the ball
+    moves straight. Each arrives after the latency, or not at all.
+
+    Args:
+      sensing: with the ball of this control step.
+      phase: share of a picture interval that was over at the reset [].
+      step: control steps since the reset [].
+    """
+    dtype, last = sensing.balls.dtype, sensing.picture
+    steps = step.astype(dtype)
+    latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
+    if "camera_rate" in world:
+        interval = 1.0 / (world["camera_rate"] * control_dt)
+        # A picture that is due at this very instant has arrived, whatever the rounding.
+        number = jnp.floor((steps - latency) / interval - phase + 1e-4)
+        age = steps - (number + phase) * interval
+    else:
+        number, age = steps, latency
+    age = jnp.maximum(age, 0.0)
+    whole = jnp.floor(age)
+    newer, older = taken(sensing.balls, whole), taken(sensing.balls, whole + 1.0)
+    ball = newer + (age - whole) * (older - newer)
+
+    noises = noise.normal(counter, _BALL_STREAM, (6,), dtype)
+    position, velocity = ball[:3], ball[3:]
+    position = _disturbed(world, "ball_position", position, noises[:3])
+    arrived = number > last.number
+    if "frame_drop" in world:
+        lost = noise.uniform(counter, _DROP_STREAM, (), dtype) < world["frame_drop"]
+        arrived &= ~lost
+    held_age = last.age + control_dt
+    if observation.velocity == "differences":
+        elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
+        velocity = (position - last.position) / elapsed
+    velocity = _disturbed(world, "ball_velocity", velocity, noises[3:])
+    fresh = Picture(position, velocity, age * control_dt, number)
+    held = last._replace(age=held_age)
+    return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
+
+
+def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:
+    if f"{name}_bias" in world:
+        value = value + world[f"{name}_bias"]
+    if f"{name}_noise" in world:
+        value = value + world[f"{name}_noise"] * noises
+    return value
+
+
+def measured_joints(
+    world: World, counter: jax.Array, truth: Kinematics
+) -> tuple[jax.Array, jax.Array]:
+    """Measured joint angles [6] (rad) and joint velocities [6] (rad/s)."""
+    dtype = truth.joint_angles.dtype
+    angles, error = truth.joint_angles, joint_angle_noise(world, counter, dtype)
+    if error is not None:
+        angles = angles + error
+    if "encoder_bias" in world:
+        angles = angles + world["encoder_bias"]
+    noises = noise.normal(counter, _JOINT_STREAM, (12,), dtype)[6:]
+    return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, noises)
+
+
+def remember(
+    sensing: Sensing,
+    measured: dict[str, jax.Array],
+    picture: Picture,
+    near_height: jax.Array,
+    target_height: jax.Array,
+    control_dt: float,
+) -> Sensing:
+    """The memory with the measurements of a control step.
+
+    A bounce starts when the ball is first measured near the paddle, and its values are those of the
+    ball's lowest measured point.
+
+    Args:
+      measured: a value [size] of each quantity but those of bounces.
+      near_height: height below which the ball counts as near the paddle [], m.
+    """
+    height = picture.position[2]
+    is_low = height < near_height
+    starts = is_low & ~sensing.is_low
+    at_lowest = starts | (is_low & (height < sensing.lowest))
+    flight_time = sensing.flight_time + control_dt
+    of_flight = {
+        "apex_error": (sensing.flight_apex - target_height)[None],
+        "bounce_interval": flight_time[None],
+    }
+    of_lowest = {
+        "bounce_position": picture.position[:2],
+        "bounce_joint_angles": measured["joint_angles"],
+        "bounce_joint_velocities": measured["joint_velocities"],
+    }
+    seen = {}
+    for name, past in sensing.seen.items():
+        if name in OF_BOUNCES:
+            newest = of_flight[name] if name in of_flight else of_lowest[name]
+            shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
+            changes = starts if name in of_flight else at_lowest
+            newest = jnp.where(changes, newest, shifted[0])
+            seen[name] = jnp.concatenate([newest[None], shifted[1:]])
+        else:
+            seen[name] = jnp.concatenate([measured[name][None], past[:-1]])
+    return sensing._replace(
+        picture=picture,
+        flight_apex=jnp.where(is_low, height, jnp.maximum(sensing.flight_apex, height)),
+        is_low=is_low,
+        lowest=jnp.where(at_lowest, height, sensing.lowest),
+        flight_time=jnp.where(starts, 0.0, flight_time),
+        seen=seen,
+    )
