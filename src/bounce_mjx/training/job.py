@@ -477,7 +477,7 @@ class _Job:
           snapshot: the latest state, if it is at hand.
         """
         policy, state = snapshot or self.trainer.snapshot()
-        # A second signal may end the process: the log must not lack what the checkpoint holds.
+        # A second signal may end the process: the log must hold every step of the checkpoint.
         self.reporter.flush()
         several = self.config.num_seeds > 1
         library = {"library": self.trainer.library}
