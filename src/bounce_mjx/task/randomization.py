@@ -23,7 +23,7 @@ World = dict[str, jax.Array]
 """The numbers that an episode drew, by the names of the terms that are on."""
 
 Ranges = dict[str, tuple[jax.Array, jax.Array]]
-"""Lower and upper ends [] of the terms that are on."""
+"""Lower and upper ends of the terms that are on, each a number [] or of the term's shape."""
 
 
 class Term(NamedTuple):
@@ -191,13 +191,15 @@ class RandomizationConfig(StrictModel):
 
 def draw_world(ranges: Ranges, key: jax.Array, dtype: jnp.dtype) -> World:
     """The world of one episode; consumes the key."""
-    sizes = {name: int(np.prod(TERMS[name].shape)) for name in ranges}
+    # In one order, though a traced dictionary has its keys sorted.
+    sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
     # One draw for all: the keys of separate draws would cost more than the numbers.
     uniform, world, start = jax.random.uniform(key, (sum(sizes.values()),), dtype), {}, 0
-    for name, (low, high) in ranges.items():
-        shares = uniform[start : start + sizes[name]].reshape(TERMS[name].shape)
+    for name, size in sizes.items():
+        shares = uniform[start : start + size].reshape(TERMS[name].shape)
+        low, high = ranges[name]
         world[name] = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
-        start += sizes[name]
+        start += size
     return world
 
 
