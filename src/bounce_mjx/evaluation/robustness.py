@@ -121,9 +121,9 @@ def measure_conditions(
             # The last call has a part of its conditions twice: another shape would be compiled.
             padded = batch + [batch[-1]] * (size - len(batch))
             statistics = evaluate(policy, jax.random.PRNGKey(seed), _stacked_ranges(env, padded))
-            statistics = jax.tree.map(lambda x: np.asarray(x).reshape(size, episodes), statistics)
             for i, condition in enumerate(batch):
-                of_condition = jax.tree.map(lambda x, i=i: x[i], statistics)
+                own = slice(i * episodes, (i + 1) * episodes)
+                of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
                 report = judge(env, of_condition, condition.target_heights)
                 outcomes[indices[start + i]] = Outcome(
                     perturbation=condition.perturbation.name,
