@@ -16,6 +16,7 @@ from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
 from bounce_mjx.evaluation.suite import Condition, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import RandomizationConfig, Ranges
@@ -88,7 +89,7 @@ def measure_conditions(
     seed: int = DEFAULT_SEED,
     physics: Physics = "config",
     progress: Callable[[int], None] = lambda done: None,
-) -> list[Outcome]:
+) -> tuple[list[Outcome], str]:
     """Measures the five results of a policy without its noise, in the order of the conditions.
 
     Conditions of the same structure are simulated by one compiled program, which takes their ranges
@@ -100,18 +101,22 @@ def measure_conditions(
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
       progress: called with the number of conditions that are done.
 
+    Returns:
+      The outcomes, and the name of the engine: fused, mjx or mujoco.
+
     Raises:
       UserError: the engine does not support the model.
     """
     programs = defaultdict(list)
     for index, condition in enumerate(conditions):
         key = json.dumps(condition.env.model_dump(mode="json"))
-        programs[key, _SEPARATE_TERMS & condition.ranges.keys()].append(index)
+        programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
     outcomes: list[Outcome | None] = [None] * len(conditions)
-    done = 0
+    done, engine = 0, physics
     for indices in programs.values():
         members = [conditions[index] for index in indices]
         env = BounceBall(_spanning_config(members, physics))
+        engine = physics if physics == "mujoco" else env.engine.name
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
         size = _batch_size(len(members), episodes, physics)
         make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
@@ -137,7 +142,14 @@ def measure_conditions(
                 )
             done += len(batch)
             progress(done)
-    return outcomes
+    return outcomes, engine
+
+
+def computed(conditions: Sequence[Condition]) -> list[Condition]:
+    """The conditions whose terms the physics has a parameter for."""
+    parameters = {"torque_limit": "force_limit", "joint_frictionloss": "frictionloss"}
+    lacking = {term for term, name in parameters.items() if name not in PhysicsParameters._fields}
+    return [condition for condition in conditions if lacking.isdisjoint(condition.ranges)]
 
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:
