@@ -162,12 +162,15 @@ class BounceBall:
         over."""
         return self.config.randomization.ranges(progress)
 
-    def reset(self, rng: jax.Array, ranges: Ranges | None = None) -> State:
+    def reset(
+        self, rng: jax.Array, ranges: Ranges | None = None, share: float | None = None
+    ) -> State:
         """Starts an episode.
 
         Args:
           rng: consumed.
           ranges: other ranges of the terms that are on; the config's by default.
+          share: other probability of each term to be drawn; the config's by default.
         """
         check_unedited(self.mj_model, self._fingerprint)
         config, addresses = self.config, self._addresses
@@ -175,7 +178,8 @@ class BounceBall:
         world, parameters = {}, PhysicsParameters()
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
-            world = draw_world(ranges, world_rng, jnp.result_type(float))
+            share = config.randomization.share if share is None else share
+            world = draw_world(ranges, world_rng, jnp.result_type(float), share)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
