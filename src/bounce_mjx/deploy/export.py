@@ -26,6 +26,9 @@ from bounce_mjx.task.observation import QUANTITIES
 # Of 2022: any onnxruntime from 1.14 on reads them.
 _OPSET, _IR_VERSION = 17, 8
 
+# An input and the output cannot share a name.
+_INPUT_NAMES = {"action": "past_actions"}
+
 _ACTION = (
     "servo target of joint i in rad = clip(joint_angles[i] + action_scale * action[i], "
     "joint_ranges[i]), from the joint angles of the same observation"
@@ -35,7 +38,8 @@ _ACTION = (
 def export_onnx(checkpoint: Checkpoint) -> bytes:
     """The policy of a checkpoint as an ONNX file with normaliser, network, clipping and metadata.
 
-    Inputs `<quantity>` [N, history, size] as in the metadata, output `action` [N, 6], all float32.
+    The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
+    action); the output is `action`, float32 [N, 6].
 
     Raises:
       UserError: the checkpoint is damaged, its arm cannot be exported, or onnx is not installed.
@@ -118,9 +122,10 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
 
 
 def _parts(env: EnvConfig) -> tuple[Part, ...]:
-    observation = env.observation
     return tuple(
-        Part(q.name, n, q.size, q.unit) for q in QUANTITIES if (n := getattr(observation, q.name))
+        Part(_INPUT_NAMES.get(q.name, q.name), history, q.size, q.unit)
+        for q in QUANTITIES
+        if (history := getattr(env.observation, q.name))
     )
 
 

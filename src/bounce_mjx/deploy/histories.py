@@ -42,7 +42,7 @@ class Histories:
         zero, joints = np.zeros(1), np.zeros(len(metadata.joint_names))
         angles = measured.get("joint_angles", joints)
         start = {
-            "action": joints,
+            "past_actions": joints,
             "ball_age": np.array([self._age]),
             "ball_velocity": self._ball_velocity,
             "apex_error": zero,
@@ -62,7 +62,7 @@ class Histories:
         metadata = self._metadata
         angles = measured.get("joint_angles")
         paddle = np.zeros(3) if angles is None else paddle_position(metadata, angles)
-        measured = measured | {"action": action, "paddle_position": paddle}
+        measured = measured | {"past_actions": action, "paddle_position": paddle}
         if "ball_position" in measured:
             measured |= self._picture(measured)
         bounces = self._bounces(measured, paddle[2] + metadata.bounce_max_distance)

@@ -15,6 +15,7 @@ class Part(NamedTuple):
     """One input of the network."""
 
     name: str
+    """The quantity; `past_actions` are the outputs of the last steps."""
     history: int
     """Number of values, the newest first."""
     size: int
