@@ -10,7 +10,7 @@ from bounce_mjx.robot.model import find_addresses
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, all of them given."""
+    """The model's own numbers, all of them given but for the friction of a contact without."""
     at = find_addresses(mj_model)
     links = mj_model.jnt_bodyid[at.arm_joints,]
     stiffness, damping = direct_solref(mj_model)
@@ -31,7 +31,7 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
 
 
 def random_parameters(mj_model: mujoco.MjModel, count: int, seed: int) -> PhysicsParameters:
-    """Worlds [N, ...] around the model's own one, every number drawn."""
+    """Worlds [N, ...] around the model's own one: all of `own_parameters`, drawn."""
     rng = np.random.default_rng(seed)
     own = own_parameters(mj_model)
 

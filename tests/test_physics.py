@@ -431,7 +431,8 @@ UNSUPPORTED = {
         flag: ("<flag ", f'<flag {flag}="enable" ', f"({flag})")
         for flag in ("override", "sleep", "diagexact")
     },
-    "condim 3": ('condim="1"', 'condim="3"', "condim 3"),
+    "condim 4": ('condim="1"', 'condim="4"', "condim 4"),
+    "condim 6": ('condim="1"', 'condim="6"', "condim 6"),
     "second pair": ("</contact>", '<pair geom1="floor" geom2="ball"/></contact>', "contact pair"),
     "no pair": (piece("<pair ", "  </contact>"), "", "contact pair"),
     "pair with the floor": ('pair geom1="blocker"', 'pair geom1="floor"', "ball and the paddle"),
@@ -531,7 +532,7 @@ def test_unsupported_models_are_refused(name):
         assert text == f"the fused physics does not support {refusal.value}; use --physics mjx"
 
 
-@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 3"])
+@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 4"])
 def test_auto_takes_mjx_for_unsupported_models(name):
     """And says why, in a whole sentence."""
     old, new, feature = UNSUPPORTED[name]

@@ -22,7 +22,7 @@ class PPOConfig(StrictModel):
     """Environments that run in parallel."""
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
-    episode_seconds: Positive | None = None
+    training_episode_seconds: Positive | None = None
     """Time limit of the training's episodes, s; null for the environment's. A shorter one trains
     more starts and more drawn worlds; a time-out is bootstrapped and no end."""
     num_epochs: Count = 4

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
@@ -26,6 +27,8 @@ class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
 
     model: mjx.Model
+    frictional: mjx.Model
+    """`model` with a frictional contact pair; MJX holds the pair's dimension fixed."""
     mj_model: mujoco.MjModel
     """Its source."""
     addresses: Addresses
@@ -33,8 +36,21 @@ class MjxModel(NamedTuple):
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that has no `unsupported_feature`."""
-    model = mjx.put_model(mj_model)
-    return MjxModel(model, copy.copy(mj_model), find_addresses(mj_model))
+    return MjxModel(
+        mjx.put_model(mj_model),
+        mjx.put_model(_with_frictional_pair(mj_model)),
+        copy.copy(mj_model),
+        find_addresses(mj_model),
+    )
+
+
+def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy whose pair of the ball and the paddle, if it has one, has sliding friction."""
+    model = copy.copy(mj_model)
+    with contextlib.suppress(UserError):
+        fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
+        model.pair_dim[:] = fields["pair_dim"]
+    return model
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
@@ -126,7 +142,9 @@ def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     replaced = fields | {f"opt.{name}": value for name, value in options.items()}
     # MJX transforms every geom, whether or not it is known to share its body's frame.
     replaced.pop("geom_sameframe", None)
-    return constants.model.tree_replace(replaced)
+    replaced.pop("pair_dim", None)
+    model = constants.model if parameters.contact_friction is None else constants.frictional
+    return model.tree_replace(replaced)
 
 
 def _full_precision() -> contextlib.AbstractContextManager:

@@ -31,6 +31,9 @@ class PhysicsParameters(NamedTuple):
     """Stiffness [] of the contact, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
     contact_damping: Array | None = None
     """Damping [] of the contact, 1/s: b of `solref="-k -b"`."""
+    contact_friction: Array | None = None
+    """Coefficient [] of sliding friction between ball and paddle; given, it makes a pair without
+    friction one of `condim="3"`."""
     servo_gain: Array | None = None
     """Stiffness [6] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
@@ -59,6 +62,7 @@ SHAPES = PhysicsParameters(
     ball_radius=(),
     contact_stiffness=(),
     contact_damping=(),
+    contact_friction=(),
     servo_gain=(_NUM_JOINTS,),
     servo_damping=(_NUM_JOINTS,),
     armature=(_NUM_JOINTS,),
@@ -131,6 +135,10 @@ def edited_fields(
         pair = _contact_pair(m)
         put("pair_solref", (pair, 0), -_given(p.contact_stiffness, stiffness))
         put("pair_solref", (pair, 1), -_given(p.contact_damping, damping))
+    if p.contact_friction is not None:
+        pair = _contact_pair(m)
+        put("pair_dim", pair, max(3, int(m.pair_dim[pair])))
+        put("pair_friction", (pair, slice(0, 2)), p.contact_friction)
     if p.servo_gain is not None:
         put("actuator_gainprm", (servos, 0), p.servo_gain)
         put("actuator_biasprm", (servos, 1), -p.servo_gain)
@@ -193,8 +201,8 @@ def _contact_pair(mj_model: mujoco.MjModel) -> int:
         if geoms == {addresses.ball_geom, addresses.paddle_geom}:
             return pair
     raise UserError(
-        "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness and "
-        "contact_damping change; add <pair> to <contact>"
+        "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
+        "contact_damping and contact_friction change; add <pair> to <contact>"
     )
 
 

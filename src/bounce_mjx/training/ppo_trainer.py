@@ -83,7 +83,7 @@ class PPOTrainer:
 
 def episode_steps(config: TrainConfig) -> int:
     """Control steps after which the training truncates an episode."""
-    limit = config.ppo.episode_seconds
+    limit = config.ppo.training_episode_seconds
     if limit is None:
         return config.env.episode_steps
     return min(config.env.episode_steps, max(1, round(limit / config.env.control_dt)))

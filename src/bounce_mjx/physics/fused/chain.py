@@ -7,7 +7,7 @@ three-dimensional form.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -148,11 +148,15 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
 def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3) -> list[Scalar]:
     """Velocity along a world direction, per unit joint velocity, of a world point fixed to the
     last link."""
-    row = []
+    return [dot(direction, velocity) for velocity in point_velocities(links, pose, point)]
+
+
+def point_velocities(links: Sequence[Link], pose: Pose, point: Vec3) -> Iterator[Vec3]:
+    """World velocities of a world point fixed to the last link, each per unit velocity of one
+    joint."""
     for link, rotation, origin in zip(links, pose.world_rotation, pose.world_origin, strict=True):
         arm = vsub(point, origin)
-        row.append(dot(direction, cross(matvec(rotation, link.axis), arm)))
-    return row
+        yield cross(matvec(rotation, link.axis), arm)
 
 
 def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:

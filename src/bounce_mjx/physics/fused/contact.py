@@ -1,4 +1,4 @@
-"""The one contact: a sphere against a box, frictionless, as MuJoCo computes it.
+"""The one contact: a sphere against a box, as MuJoCo computes it; its force without friction.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: impedance, reference
 acceleration, the diagonal regulariser) and its collision function for a sphere and a box.
@@ -34,6 +34,14 @@ class ContactModel:
     """Translational inverse inertia of the paddle's body at the reference pose, 1/kg."""
     ball_inverse_weight: Scalar
     """Translational inverse inertia of the ball, 1/kg."""
+    friction: tuple[Scalar, Scalar] | None = None
+    """Coefficients of sliding friction along the two tangents; None for a contact without."""
+    elliptic: bool = False
+    """Whether the friction cone is elliptic; else pyramidal."""
+    impratio: float = 1.0
+    """Ratio of the impedances along the tangents and the normal (the option `impratio`)."""
+    tangent_damping: float | None = None
+    """b of the reference acceleration along the tangents, 1/s; None where it is `damping`."""
 
 
 class Contact(NamedTuple):
@@ -83,6 +91,11 @@ def impedance(model: ContactModel, distance: jax.Array) -> jax.Array:
     return dmin + y * (dmax - dmin)
 
 
+def softness(model: ContactModel, d: jax.Array) -> jax.Array:
+    """Regulariser (1/kg) of the normal force at the impedance d."""
+    return (1.0 - d) / d * (model.paddle_inverse_weight + model.ball_inverse_weight)
+
+
 def normal_force(
     model: ContactModel,
     contact: Contact,
@@ -99,6 +112,6 @@ def normal_force(
     """
     d = impedance(model, contact.distance)
     reference = -model.damping * normal_velocity - model.stiffness * d * contact.distance
-    regulariser = (1.0 - d) / d * (model.paddle_inverse_weight + model.ball_inverse_weight)
+    regulariser = softness(model, d)
     force = (reference - free_acceleration) / (inverse_inertia + regulariser)
     return jnp.where(contact.distance < 0.0, jnp.maximum(force, 0.0), 0.0)

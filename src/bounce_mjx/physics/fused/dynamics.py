@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, servo_target
-from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused import chain, friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
@@ -29,6 +29,8 @@ class Motion(NamedTuple):
     v: tuple[Scalar, ...]
     ball_position: Vec3
     ball_velocity: Vec3
+    turning: friction.Turning | None
+    """The ball's; None without friction, which alone changes it."""
 
 
 def step(
@@ -41,16 +43,18 @@ def step(
     """Advances one environment by `num_substeps` physics steps.
 
     The parameters that are given enter the program as inputs; the others fold as constants. The
-    coordinates go through the loop as scalars. The ball's spin is constant, because the
-    only contact is frictionless and its force goes through the centre; so the orientation turns
-    once, by the angle of the whole interval.
+    coordinates go through the loop as scalars. Without friction the ball's spin is constant,
+    because the contact's force goes through the centre; so the orientation turns once, by the angle
+    of the whole interval.
     """
     addresses = model.addresses
+    frictional = model.contact.friction is not None or parameters.contact_friction is not None
     motion = Motion(
         q=tuple(state.qpos[i] for i in addresses.arm_qpos),
         v=tuple(state.qvel[i] for i in addresses.arm_qvel),
         ball_position=tuple(state.qpos[i] for i in addresses.ball_qpos[:3]),
         ball_velocity=tuple(state.qvel[i] for i in addresses.ball_qvel[:3]),
+        turning=friction.turning_of(*_orientation_and_spin(model, state)) if frictional else None,
     )
     if control.ball_push is not None:
         pushed = vadd(motion.ball_velocity, tuple(control.ball_push[i] for i in range(3)))
@@ -58,26 +62,34 @@ def step(
     leaves, tree = jax.tree.flatten(motion)
     inputs = (_of_servos(control, addresses.actuators), parameters)
     numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
-    advance = elementwise(_substeps(model, given, num_substeps), num_results=len(leaves))
+    advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
-    quaternion = turn(
-        tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
-        tuple(state.qvel[i] for i in addresses.ball_qvel[3:]),
-        num_substeps * model.dt,
-    )
+    if motion.turning is None:
+        quaternion = turn(*_orientation_and_spin(model, state), num_substeps * model.dt)
+        spin = ()
+    else:
+        quaternion, spin = motion.turning.orientation, friction.spin_in_ball(motion.turning)
 
     qpos = [state.qpos[i] for i in range(model.nq)]
     qvel = [state.qvel[i] for i in range(model.nv)]
     positions = (*motion.q, *motion.ball_position, *quaternion)
     for i, value in zip(addresses.arm_qpos + addresses.ball_qpos, positions, strict=True):
         qpos[i] = value
-    for i, value in zip(
-        addresses.arm_qvel + addresses.ball_qvel[:3],
-        (*motion.v, *motion.ball_velocity),
-        strict=True,
-    ):
+    velocities = (*motion.v, *motion.ball_velocity, *spin)
+    for i, value in zip(addresses.arm_qvel + addresses.ball_qvel, velocities, strict=False):
         qvel[i] = value
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
+
+
+def _orientation_and_spin(
+    model: FusedModel, state: PhysicsState
+) -> tuple[tuple[Scalar, ...], Vec3]:
+    """The ball's, in MuJoCo's coordinates."""
+    addresses = model.addresses
+    return (
+        tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
+        tuple(state.qvel[i] for i in addresses.ball_qvel[3:]),
+    )
 
 
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
@@ -115,19 +127,20 @@ def as_scalars(arrays: Any, dtype: jnp.dtype) -> Any:
 
 @functools.lru_cache
 def _substeps(
-    model: FusedModel, given: jax.tree_util.PyTreeDef, num_substeps: int
+    model: FusedModel,
+    coordinates: jax.tree_util.PyTreeDef,
+    given: jax.tree_util.PyTreeDef,
+    num_substeps: int,
 ) -> Callable[..., tuple[Scalar, ...]]:
-    """Physics steps as a function of scalars: a flat `Motion`, then the `Control` and the
-    parameters, flat, of the structure `given`.
+    """Physics steps as a function of scalars: a flat `Motion` of the structure `coordinates`, then
+    the `Control` and the parameters, flat, of the structure `given`.
 
     The cache and the inline jit let JAX trace this long function once for all the programs that
     have it; each trace takes some tenths of a second.
     """
-    n = len(model.links)
-    num_coordinates = 2 * n + 6
+    num_coordinates = coordinates.num_leaves
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
-        q, v, ball = scalars[:n], scalars[n : 2 * n], scalars[2 * n : num_coordinates]
         control, parameters = given.unflatten(scalars[num_coordinates:])
         world = in_world(model, parameters)
         if control.ball_force is not None:
@@ -136,7 +149,7 @@ def _substeps(
             0,
             num_substeps,
             lambda i, motion: substep(world, motion, _targets(control, i)),
-            Motion(q, v, ball[:3], ball[3:]),
+            coordinates.unflatten(scalars[:num_coordinates]),
         )
         return tuple(jax.tree.leaves(motion))
 
@@ -180,13 +193,16 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
             model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
         )
     ]
-    contact_torque, ball_acceleration = contact_response(model, motion, pose, inertia, applied)
+    contact_torque, ball_acceleration, spin_acceleration = contact_response(
+        model, motion, pose, inertia, applied
+    )
     return integrate(
         model,
         motion,
         inertia,
         [add(a, c) for a, c in zip(applied, contact_torque, strict=True)],
         ball_acceleration,
+        spin_acceleration,
     )
 
 
@@ -203,14 +219,30 @@ def contact_response(
     pose: chain.Pose,
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
-) -> tuple[list[Scalar], Vec3]:
-    """Joint torques (N m) of the contact, and the ball's acceleration (m/s^2) with it."""
+) -> tuple[list[Scalar], Vec3, Vec3 | None]:
+    """Joint torques (N m) of the contact, and the ball's acceleration (m/s^2) and that of its spin
+    (rad/s^2, in the world) with it; None for the latter without friction."""
     contact = sphere_box(
         model.contact,
         motion.ball_position,
         _paddle_origin(model, pose),
         matmul(pose.world_rotation[-1], model.paddle_rotation),
     )
+    ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
+    if motion.turning is not None:
+        factor = chain.cholesky(inertia)
+        response = friction.contact_response(
+            model,
+            pose,
+            factor,
+            contact,
+            joint_velocity=motion.v,
+            half_applied=chain.solve_lower(factor, applied),
+            ball=(motion.ball_position, motion.ball_velocity, motion.turning.spin),
+            free_acceleration=ball_free,
+        )
+        ball_acceleration = vadd(ball_free, response.ball_acceleration)
+        return response.joint_torque, ball_acceleration, response.spin_acceleration
     # The torque of a force along the normal is the same at the contact as at the ball's centre.
     jacobian = [
         -entry
@@ -220,7 +252,6 @@ def contact_response(
     half_jacobian = chain.solve_lower(factor, jacobian)
     half_applied = chain.solve_lower(factor, applied)
 
-    ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     normal_velocity = dot(contact.normal, motion.ball_velocity)
     free_acceleration = dot(contact.normal, ball_free)
     inverse_inertia = 1.0 / model.ball_mass
@@ -232,7 +263,7 @@ def contact_response(
         model.contact, contact, normal_velocity, free_acceleration, inverse_inertia
     )
     ball_acceleration = vadd(ball_free, scale(contact.normal, force / model.ball_mass))
-    return [j * force for j in jacobian], ball_acceleration
+    return [j * force for j in jacobian], ball_acceleration, None
 
 
 def integrate(
@@ -241,6 +272,7 @@ def integrate(
     inertia: chain.SquareMatrix,
     torque: list[Scalar],
     ball_acceleration: Vec3,
+    spin_acceleration: Vec3 | None,
 ) -> Motion:
     """MuJoCo's implicitfast integrator: semi-implicit Euler, implicit in the velocity-dependent
     torques of servos and joint damping (documentation, "Computation", numerical integration)."""
@@ -254,7 +286,10 @@ def integrate(
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
     ball_velocity = vadd(motion.ball_velocity, scale(ball_acceleration, dt))
     ball_position = vadd(motion.ball_position, scale(ball_velocity, dt))
-    return Motion(q, v, ball_position, ball_velocity)
+    turning = motion.turning
+    if turning is not None:
+        turning = friction.turned(turning, spin_acceleration, dt)
+    return Motion(q, v, ball_position, ball_velocity, turning)
 
 
 def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[Scalar, ...]:

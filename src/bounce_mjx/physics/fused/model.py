@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -19,6 +20,11 @@ from bounce_mjx.physics.fused.scalars import (
 from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.robot.model import Addresses, find_addresses
+
+# MuJoCo's mjMINVAL.
+_MIN_VALUE = 1e-15
+# MuJoCo's mjMINMU, the least coefficient of friction that its engine computes with.
+_MIN_FRICTION = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +58,8 @@ class FusedModel:
     paddle_rotation: Mat3
     """Orientation of the paddle in the frame of the last link."""
     ball_mass: Scalar
+    ball_inertia: Scalar
+    """Of the homogeneous sphere, about any axis through its centre, kg m^2."""
     contact: ContactModel
     addresses: Addresses
     nq: int
@@ -77,6 +85,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
         paddle_origin=_floats(mj_model.geom_pos[addresses.paddle_geom]),
         paddle_rotation=_rotation(mj_model.geom_quat[addresses.paddle_geom]),
         ball_mass=float(mj_model.body_mass[addresses.ball_body]),
+        ball_inertia=float(mj_model.body_inertia[addresses.ball_body, 0]),
         contact=_read_contact(mj_model, addresses),
         addresses=addresses,
         nq=mj_model.nq,
@@ -90,14 +99,20 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
     Args:
       parameters: as scalars, or tuples of scalars; without any, the model stays as it is.
     """
-    p, contact = parameters, model.contact
+    p, contact, ball_inertia = parameters, model.contact, model.ball_inertia
     if p.ball_mass is not None:
         ratio = model.ball_mass / p.ball_mass
         contact = dataclasses.replace(
             contact, ball_inverse_weight=mul(contact.ball_inverse_weight, ratio)
         )
+        ball_inertia = mul(p.ball_mass, ball_inertia / model.ball_mass)
     if p.ball_radius is not None:
+        ratio = mul(p.ball_radius, 1.0 / contact.radius)
         contact = dataclasses.replace(contact, radius=p.ball_radius)
+        ball_inertia = mul(ball_inertia, mul(ratio, ratio))
+    if p.contact_friction is not None:
+        friction = jnp.maximum(p.contact_friction, _MIN_FRICTION)
+        contact = dataclasses.replace(contact, friction=(friction, friction))
     # The direct format of solref, scaled by the impedance as MuJoCo does.
     max_impedance = contact.solimp[1]
     if p.contact_stiffness is not None:
@@ -120,6 +135,7 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
         paddle_origin=_given(p.paddle_position, model.paddle_origin),
         paddle_rotation=model.paddle_rotation if rotation is None else quaternion_matrix(rotation),
         ball_mass=_given(p.ball_mass, model.ball_mass),
+        ball_inertia=ball_inertia,
         contact=contact,
     )
 
@@ -213,6 +229,9 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
     else:
         stiffness, damping = -solref[0] / dmax**2, -solref[1] / dmax
     power = max(1.0, float(solimp[4]))
+    frictional = mj_model.pair_dim[0] > 1
+    friction = np.maximum(mj_model.pair_friction[0, :2], _MIN_FRICTION)
+    elliptic = mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     paddle_body = mj_model.geom_bodyid[addresses.paddle_geom]
     weights = mj_model.body_invweight0
     return ContactModel(
@@ -229,4 +248,18 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
         ),
         paddle_inverse_weight=float(weights[paddle_body, 0]),
         ball_inverse_weight=float(weights[addresses.ball_body, 0]),
+        friction=_floats(friction) if frictional else None,
+        elliptic=bool(elliptic),
+        impratio=max(_MIN_VALUE, float(mj_model.opt.impratio)),
+        tangent_damping=_tangent_damping(mj_model, float(dmax)) if elliptic else None,
     )
+
+
+def _tangent_damping(mj_model: mujoco.MjModel, max_impedance: float) -> float | None:
+    """b of the pair's `solreffriction`; None where the pair's `solref` holds."""
+    first, second = (float(x) for x in mj_model.pair_solreffriction[0])
+    if (first > 0.0) != (second > 0.0) or (first == 0.0 and second == 0.0):
+        return None
+    if first > 0.0:
+        return 2.0 / (max_impedance * max(first, 2.0 * mj_model.opt.timestep))
+    return -second / max_impedance

@@ -7,12 +7,15 @@ time of `jax.numpy`.
 """
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
 
 Scalar = float | jax.Array
+Tree = Any
 Vec3 = tuple[Scalar, Scalar, Scalar]
 Mat3 = tuple[Vec3, Vec3, Vec3]
 
@@ -192,3 +195,18 @@ def polynomial(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
     for coefficient in reversed(coefficients[:-1]):
         value = add(coefficient, mul(x, value))
     return value
+
+
+def stored(values: Tree) -> Tree:
+    """The same scalars, each computed once.
+
+    XLA on a CPU makes one loop for each result, and in each computes again all that it needs, if
+    that is cheap by the operation. A call that it may not inline ends its loops.
+    """
+    leaves, tree = jax.tree.flatten(values)
+    with set_xla_metadata(inlineable="false"):
+        return tree.unflatten(_times_one(*leaves))
+
+
+# JAX returns the argument of a function that does nothing with it.
+_times_one = jax.jit(lambda *leaves: tuple(lax.mul(x, jnp.ones_like(x)) for x in leaves))

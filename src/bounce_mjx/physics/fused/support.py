@@ -125,7 +125,10 @@ def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
         pair == {addresses.paddle_geom, addresses.ball_geom},
         "a pair other than of the ball and the paddle",
     )
-    _require(m.pair_dim[0] == 1, f"a pair with friction (condim {m.pair_dim[0]}; only condim 1)")
+    _require(
+        m.pair_dim[0] in (1, 3),
+        f"torsional or rolling friction (condim {m.pair_dim[0]}; only condim 1 and 3)",
+    )
     _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(m.pair_adhesion[0] == 0.0, "adhesion")
     solref, width = m.pair_solref[0], m.pair_solimp[0, 2]

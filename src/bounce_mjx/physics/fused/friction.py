@@ -1,0 +1,381 @@
+"""The one contact with sliding friction (MuJoCo's `condim="3"`), as MuJoCo computes it.
+
+Sources: MuJoCo's documentation, "Computation" (constraint model: friction cones, the dual problem,
+impedance, the diagonal regulariser), and its engine for the regulariser of each cone. The force f
+along the normal and the two tangents minimises
+
+    1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)    over the friction cone
+
+with a0 the acceleration without the contact. In units of the cone, x = (f_n, f_1 / mu_1,
+f_2 / mu_2), the cone is |(x_1, x_2)| <= x_0 or the sum of four edges (1, +-1, 0), (1, 0, +-1).
+Both solutions take the same operations in every state, as a kernel's threads need.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.contact import Contact, ContactModel, impedance, softness
+from bounce_mjx.physics.fused.model import FusedModel
+from bounce_mjx.physics.fused.scalars import (
+    Scalar,
+    Vec3,
+    add,
+    cross,
+    dot,
+    matvec,
+    mul,
+    quaternion_matrix,
+    scale,
+    sine_cosine,
+    stored,
+    transpose,
+    vadd,
+    vsub,
+)
+
+Quaternion = tuple[Scalar, Scalar, Scalar, Scalar]
+
+# Newton's steps to the direction in which the ball slips, and the longest one (rad). The shipped
+# ball needs four of them; a ball as heavy as the arm's links needs all.
+_SLIP_ITERATIONS = 8
+_LONGEST_STEP = 0.5
+
+
+class Turning(NamedTuple):
+    """The coordinates of the ball that only friction changes."""
+
+    spin: Vec3
+    """Angular velocity in the world, rad/s. That of a sphere is constant without a torque, in the
+    world as in the ball's frame."""
+    orientation: Quaternion
+    """w, x, y, z."""
+
+
+class Response(NamedTuple):
+    """The effect of the contact's force."""
+
+    joint_torque: list[Scalar]
+    """N m."""
+    ball_acceleration: Vec3
+    """Without gravity, m/s^2."""
+    spin_acceleration: Vec3
+    """In the world, rad/s^2."""
+
+
+class Problem(NamedTuple):
+    """The problem in units of the cone, without the regulariser: 1/2 x.Q x + c.x."""
+
+    q: tuple[Scalar, ...]
+    """Q00, Q01, Q02, Q11, Q12, Q22, 1/kg."""
+    c: Vec3
+    """m/s^2."""
+
+
+def contact_response(
+    fused_model: FusedModel,
+    pose: chain.Pose,
+    factor: tuple[chain.SquareMatrix, list[jax.Array]],
+    contact: Contact,
+    joint_velocity: Sequence[Scalar],
+    half_applied: Sequence[Scalar],
+    ball: tuple[Vec3, Vec3, Vec3],
+    free_acceleration: Vec3,
+) -> Response:
+    """Effect of the contact's force on the joints and the ball.
+
+    Args:
+      factor: Cholesky factor L of the arm's inertia matrix.
+      half_applied: L^-1 times the joint torques without the contact.
+      ball: position, velocity and spin in the world.
+      free_acceleration: the ball's acceleration without the contact.
+    """
+    model, links = fused_model.contact, fused_model.links
+    ball_mass, ball_inertia = fused_model.ball_mass, fused_model.ball_inertia
+    position, velocity, spin = ball
+    contact = stored(contact)
+    normal = contact.normal
+    first, second = tangents(normal)
+    first, second = stored((first, second))
+    # From the contact's point, midway between the surfaces, to the ball's centre.
+    lever = model.radius + 0.5 * contact.distance
+    point = vsub(position, scale(normal, lever))
+    # Torques on the ball of unit forces along the tangents.
+    torques = (scale(second, -lever), scale(first, lever))
+    columns = list(chain.point_velocities(links, pose, point))
+    rows = [[-dot(axis, column) for column in columns] for axis in (normal, first, second)]
+    rows = stored(rows)
+    factor = stored(factor)
+    half = [chain.solve_lower(factor, row) for row in rows]
+    half, half_applied = stored((half, list(half_applied)))
+
+    def inverse_inertia(i: int, j: int) -> Scalar:
+        return functools.reduce(add, map(mul, half[i], half[j]))
+
+    along_tangent = 1.0 / ball_mass + lever * lever / ball_inertia
+    matrix = (
+        inverse_inertia(0, 0) + 1.0 / ball_mass,
+        inverse_inertia(0, 1),
+        inverse_inertia(0, 2),
+        inverse_inertia(1, 1) + along_tangent,
+        inverse_inertia(1, 2),
+        inverse_inertia(2, 2) + along_tangent,
+    )
+    d = impedance(model, contact.distance)
+    damping = model.damping if model.tangent_damping is None else model.tangent_damping
+    offsets = []
+    for axis, torque, row, half_row, b in zip(
+        (normal, first, second),
+        (None, *torques),
+        rows,
+        half,
+        (model.damping, damping, damping),
+        strict=True,
+    ):
+        speed, acceleration = dot(axis, velocity), dot(axis, free_acceleration)
+        if torque is not None:
+            speed = speed + dot(torque, spin)
+        for j, v, half_j, half_a in zip(row, joint_velocity, half_row, half_applied, strict=True):
+            speed, acceleration = speed + j * v, acceleration + half_j * half_a
+        offsets.append(acceleration + b * speed)
+    offsets[0] = offsets[0] + model.stiffness * d * contact.distance
+
+    matrix, offsets = stored((matrix, tuple(offsets)))
+    force = contact_force(model, matrix, tuple(offsets), softness(model, d))
+    force = tuple(jnp.where(contact.distance < 0.0, f, 0.0) for f in force)
+    force = stored(force)
+    along = vadd(scale(normal, force[0]), vadd(scale(first, force[1]), scale(second, force[2])))
+    torque = vadd(scale(torques[0], force[1]), scale(torques[1], force[2]))
+    return Response(
+        [dot(column, force) for column in zip(*rows, strict=True)],
+        scale(along, 1.0 / ball_mass),
+        scale(torque, 1.0 / ball_inertia),
+    )
+
+
+def tangents(normal: Vec3) -> tuple[Vec3, Vec3]:
+    """The tangents of MuJoCo's contact frame (mju_makeFrame), the second one up to its sign: y, or
+    z where the normal is near y, made orthogonal to the normal."""
+    x, y, z = normal
+    from_y = jnp.abs(y) < 0.5
+    along = jnp.where(from_y, y, z)
+    inverse = lax.rsqrt(1.0 - along * along)
+    first = scale(
+        (
+            -x * along,
+            jnp.where(from_y, 1.0, 0.0) - y * along,
+            jnp.where(from_y, 0.0, 1.0) - z * along,
+        ),
+        inverse,
+    )
+    return first, cross(normal, first)
+
+
+def contact_force(
+    model: ContactModel, matrix: tuple[Scalar, ...], offsets: Vec3, regulariser: Scalar
+) -> Vec3:
+    """Force [normal, first and second tangent] (N) that solves the problem above.
+
+    Args:
+      matrix: J M^-1 J^T, the entries 00, 01, 02, 11, 12, 22, 1/kg.
+      offsets: J a0 - aref, m/s^2.
+      regulariser: that of the normal in a contact without friction, 1/kg.
+    """
+    m1, m2 = model.friction
+    units = (1.0, m1, m2)
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    problem = Problem(
+        tuple(
+            mul(entry, mul(units[i], units[j])) for entry, (i, j) in zip(matrix, pairs, strict=True)
+        ),
+        tuple(map(mul, offsets, units)),
+    )
+    tangential = mul(mul(m1, m1), 1.0 / model.impratio) * regulariser
+    if model.elliptic:
+        x = in_elliptic_cone(problem, regulariser, tangential)
+    else:
+        x = in_pyramidal_cone(problem, 2.0 * tangential * add(1.0, mul(m1, m1)))
+    return tuple(map(mul, x, units))
+
+
+def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Vec3:
+    """x in the cone |(x_1, x_2)| <= x_0, with regularisers along the axis and across it."""
+    (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
+    q00, q11, q22 = q00 + normal, q11 + tangential, q22 + tangential
+    squared = c1 * c1 + c2 * c2
+    open_ = (c0 >= 0.0) & (c0 * c0 >= squared)
+
+    # The ball sticks: the solution without the cone.
+    inverse = 1.0 / q00
+    a, b = q01 * inverse, q02 * inverse
+    k11, k12, k22 = q11 - a * q01, q12 - a * q02, q22 - b * q02
+    e1, e2 = c1 - a * c0, c2 - b * c0
+    inverse_determinant = 1.0 / (k11 * k22 - k12 * k12)
+    s1 = (k12 * e2 - k22 * e1) * inverse_determinant
+    s2 = (k12 * e1 - k11 * e2) * inverse_determinant
+    s0 = -(c0 * inverse + a * s1 + b * s2)
+    sticks = (s0 >= 0.0) & (s1 * s1 + s2 * s2 <= s0 * s0)
+
+    # It slips: x = n (1, u) on the cone's surface, with the unit vector u that minimises
+    # c.w / sqrt(w.Q w) over w = (1, u). Newton's method on the angle of u.
+    pressed = c0 < 0.0
+    u1, u2 = -jnp.where(pressed, e1, c1), -jnp.where(pressed, e2, c2)
+    u1, u2 = _unit(u1, u2)
+
+    def newton_step(_, u: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        u1, u2 = u
+        r1, r2 = q01 + q11 * u1 + q12 * u2, q02 + q12 * u1 + q22 * u2
+        along, across = u1 * r1 + u2 * r2, u1 * r2 - u2 * r1
+        size = q00 + q01 * u1 + q02 * u2 + along
+        c_along, c_across = c1 * u1 + c2 * u2, c2 * u1 - c1 * u2
+        value = c0 + c_along
+        curved = q11 * u2 * u2 - 2.0 * q12 * u1 * u2 + q22 * u1 * u1
+        slope = c_across * size - value * across
+        curvature = c_across * across - c_along * size - value * (curved - along)
+        least = jnp.maximum(jnp.abs(slope) * (1.0 / _LONGEST_STEP), _tiny(slope))
+        step = -slope / jnp.maximum(curvature, least)
+        u1, u2 = u1 - step * u2, u2 + step * u1
+        longer = lax.rsqrt(1.0 + step * step)
+        return u1 * longer, u2 * longer
+
+    u1, u2 = lax.fori_loop(0, _SLIP_ITERATIONS, newton_step, (u1, u2))
+    size = (q00 + 2.0 * (q01 * u1 + q02 * u2)) + (
+        q11 * u1 * u1 + 2.0 * q12 * u1 * u2 + q22 * u2 * u2
+    )
+    n = jnp.maximum(-(c0 + c1 * u1 + c2 * u2) / size, 0.0)
+
+    def chosen(stuck: jax.Array, slipping: jax.Array) -> jax.Array:
+        return jnp.where(open_, 0.0, jnp.where(sticks, stuck, slipping))
+
+    return chosen(s0, n), chosen(s1, n * u1), chosen(s2, n * u2)
+
+
+def in_pyramidal_cone(problem: Problem, regulariser: Scalar) -> Vec3:
+    """x as a sum of nonnegative multiples of the four edges, with a regulariser on each.
+
+    Edges are active or not. The second tangent's pair of edges is solved with each of the four
+    choices for the first one's put in; one choice agrees with the signs. The pairs are in sums and
+    differences, and no term cancels where the friction is small.
+    """
+    (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
+    h = 0.5 * regulariser
+
+    # Neither edge of the first pair.
+    s2, t2 = _pair(q00, q02, q22, c0, c2, regulariser)
+    push = c0 + q00 * s2 + q02 * t2
+    pull = c1 + q01 * s2 + q12 * t2
+    none = (s2, jnp.zeros_like(t2), t2), push - jnp.abs(pull)
+
+    # Both.
+    k00, k11 = q00 + h, q11 + h
+    i = 1.0 / (k00 * k11 - q01 * q01)
+    p00 = h * (q00 * k11 - q01 * q01) * i
+    p02 = h * (k11 * q02 - q01 * q12) * i
+    p22 = q22 - (k11 * q02 * q02 - 2.0 * q01 * q02 * q12 + k00 * q12 * q12) * i
+    g0 = h * (k11 * c0 - q01 * c1) * i
+    g2 = c2 - (k11 * q02 * c0 - q01 * (q02 * c1 + q12 * c0) + k00 * q12 * c1) * i
+    s2, t2 = _pair(p00, p02, p22, g0, g2, regulariser)
+    push = c0 + q00 * s2 + q02 * t2
+    pull = c1 + q01 * s2 + q12 * t2
+    s1 = (q01 * pull - k11 * push) * i
+    t1 = (q01 * push - k00 * pull) * i
+    both = (s1 + s2, t1, t2), (s1 - jnp.abs(t1)) * q00
+
+    # One: the first edge, or its opposite.
+    def one(i: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        sign = 1.0 - 2.0 * lax.convert_element_type(i, q01.dtype)
+        q_01, q_12, c_1 = sign * q01, sign * q12, sign * c1
+        r0, r2, g = q00 + q_01, q02 + q_12, c0 + c_1
+        rest = q_01 + q11 + regulariser
+        inverse = 1.0 / (r0 + rest)
+        s2, t2 = _pair(
+            (q00 * (q11 + regulariser) - q01 * q01) * inverse,
+            (q02 * rest - q_12 * r0) * inverse,
+            q22 - r2 * r2 * inverse,
+            (c0 * rest - c_1 * r0) * inverse,
+            c2 - r2 * g * inverse,
+            regulariser,
+        )
+        lack = g + r0 * s2 + r2 * t2
+        f = -lack * inverse
+        n = s2 + f
+        other = (c0 + q00 * n + q_01 * f + q02 * t2) - (c_1 + q_01 * n + q11 * f + q_12 * t2)
+        return _better(best, ((n, sign * f, t2), jnp.minimum(-lack, other)))
+
+    return lax.fori_loop(0, 2, one, _better(none, both))[0]
+
+
+def _better(a: tuple[Vec3, jax.Array], b: tuple[Vec3, jax.Array]) -> tuple[Vec3, jax.Array]:
+    """The candidate with the higher score."""
+    (x, x_score), (y, y_score) = a, b
+    chosen = tuple(jnp.where(y_score > x_score, j, i) for i, j in zip(x, y, strict=True))
+    return chosen, jnp.maximum(x_score, y_score)
+
+
+def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
+    """Sum s and difference t of two nonnegative multiples of the edges (1, 1) and (1, -1)."""
+    h = 0.5 * regulariser
+    k00, k22 = p00 + h, p22 + h
+    inverse_determinant = 1.0 / (k00 * k22 - p02 * p02)
+    s = (p02 * g2 - k22 * g0) * inverse_determinant
+    t = (p02 * g0 - k00 * g2) * inverse_determinant
+    both = s >= jnp.abs(t)
+    diagonal, off = p00 + p22 + regulariser, p00 - p22
+    plus = jnp.maximum(-(g0 + g2) / (diagonal + 2.0 * p02), 0.0)
+    minus = jnp.maximum(-(g0 - g2) / (diagonal - 2.0 * p02), 0.0)
+    # The one that leaves the other edge nothing to do.
+    first = g0 - g2 + off * plus >= g0 + g2 + off * minus
+    s_one = jnp.where(first, plus, minus)
+    t_one = jnp.where(first, plus, -minus)
+    return jnp.where(both, s, s_one), jnp.where(both, t, t_one)
+
+
+def _unit(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The direction of a vector; any for a vector without length."""
+    squared = x * x + y * y
+    short = squared < _tiny(squared)
+    inverse = lax.rsqrt(jnp.where(short, 1.0, squared))
+    return jnp.where(short, 1.0, x * inverse), jnp.where(short, 0.0, y * inverse)
+
+
+def _tiny(x: jax.Array) -> float:
+    return float(jnp.finfo(x.dtype).tiny)
+
+
+def turning_of(quaternion: Quaternion, spin: Vec3) -> Turning:
+    """The ball's spin in the world and its orientation, of length 1, from MuJoCo's coordinates."""
+    w, x, y, z = quaternion
+    inverse_norm = lax.rsqrt(w * w + x * x + y * y + z * z)
+    quaternion = tuple(c * inverse_norm for c in quaternion)
+    return Turning(matvec(quaternion_matrix(quaternion), spin), quaternion)
+
+
+def spin_in_ball(turning: Turning) -> Vec3:
+    """MuJoCo's coordinates of the spin: in the ball's frame."""
+    matrix = quaternion_matrix(turning.orientation)
+    return matvec(transpose(matrix), turning.spin)
+
+
+def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
+    """Spin, then orientation, one step later."""
+    spin = vadd(turning.spin, scale(acceleration, dt))
+    squared = dot(spin, spin)
+    still = squared < _tiny(squared)
+    inverse_speed = lax.rsqrt(jnp.where(still, 1.0, squared))
+    sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
+    a, b, c = scale(spin, sine * inverse_speed)
+    w, x, y, z = turning.orientation
+    return Turning(
+        spin,
+        (
+            cosine * w - a * x - b * y - c * z,
+            cosine * x + a * w + b * z - c * y,
+            cosine * y + b * w + c * x - a * z,
+            cosine * z + c * w + a * y - b * x,
+        ),
+    )

@@ -1,0 +1,223 @@
+"""The frictional contact of the fused engine against MuJoCo's C step."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    fused,
+    make_engine,
+)
+from bounce_mjx.robot.model import find_addresses
+from random_worlds import random_parameters
+from test_physics import (
+    BATCH,
+    DT,
+    HALF_SIZE,
+    MODEL,
+    ONE_STEP,
+    RADIUS,
+    XML,
+    CEngine,
+    States,
+    bouncing_states,
+    difference,
+    drop_ball,
+    paddle_frame,
+    random_states,
+)
+
+CONES = ("pyramidal", "elliptic")
+# One edit each of the MJCF with a frictional pair.
+MODELS = {
+    "as it is": ("condim", "condim"),
+    "little friction": ('friction="0.3 0.3"', 'friction="0.01 0.01"'),
+    "much friction": ('friction="0.3 0.3"', 'friction="2 2"'),
+    "no friction": ('friction="0.3 0.3"', 'friction="0 0"'),
+    "another one along each tangent": ('friction="0.3 0.3"', 'friction="0.2 0.9"'),
+    "impratio": ("<option ", '<option impratio="10" '),
+    "solreffriction": ("<pair ", '<pair solreffriction="-1000 -300" '),
+    "standard solreffriction": ("<pair ", '<pair solreffriction="0.02 1" '),
+    "standard solref": ('solref="-98696 -31.4"', 'solref="0.02 0.3"'),
+    "soft": ('solimp="0.95 0.99 0.001"', 'solimp="0.5 0.99 0.02 0.3 3"'),
+    "ball as heavy as the arm": ('size="0.019" mass="0.0027"', 'size="0.019" mass="3"'),
+}
+
+
+def frictional(cone: str, old: str = "condim", new: str = "condim") -> mujoco.MjModel:
+    """The shipped model with friction, one edit, and a C solver that converges to rounding."""
+    xml = XML.replace('cone="pyramidal"', f'cone="{cone}"')
+    xml = xml.replace('condim="1"', 'condim="3" friction="0.3 0.3"')
+    assert old in xml
+    return converged(mujoco.MjModel.from_xml_string(xml.replace(old, new, 1)))
+
+
+def converged(model: mujoco.MjModel) -> mujoco.MjModel:
+    model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 500, 200
+    return model
+
+
+def touching_states(model: mujoco.MjModel, count: int, seed: int) -> States:
+    """`random_states`; every third ball rolls on the paddle, a part of which slips or leaves."""
+    states, _ = random_states(model, count, seed)
+    rng = np.random.default_rng(seed)
+    at = find_addresses(model)
+    for i in range(0, count, 3):
+        data = mujoco.MjData(model)
+        states.qvel[i, :6] *= 0.1
+        data.qpos[:], data.qvel[:] = states.qpos[i], states.qvel[i]
+        mujoco.mj_fwdPosition(model, data)
+        centre, axes = paddle_frame(model, states.qpos[i, :6])
+        gap = -rng.uniform(0.0, 0.002)
+        local = np.array([0.8, 0.8, 0.0]) * rng.uniform(-1.0, 1.0, 3) * HALF_SIZE
+        local[2] = HALF_SIZE[2] + RADIUS + gap
+        states.qpos[i, 6:9] = centre + axes @ local
+        contact = states.qpos[i, 6:9] - axes[:, 2] * (RADIUS + 0.5 * gap)
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, contact, model.geom_bodyid[at.paddle_geom])
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, states.qpos[i, 9:])
+        turning = np.cross(
+            rotation.reshape(3, 3) @ states.qvel[i, 9:], contact - states.qpos[i, 6:9]
+        )
+        slip = rng.uniform(-1.0, 1.0, 3) * [0.3, 0.3, 0.1] * (i % 2)
+        states.qvel[i, 6:9] = jacobian @ states.qvel[i] - turning + axes @ slip
+    return states
+
+
+def c_steps(models: list[mujoco.MjModel], states: States) -> tuple[PhysicsState, np.ndarray]:
+    """One mj_step from each state, and the contact's force [N, 3] on the ball in its frame; NaN
+    without a contact."""
+    after, forces = [], []
+    for model, *start in zip(models, *states, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start
+        mujoco.mj_step(model, data)
+        wrench = np.full(6, np.nan)
+        if data.ncon:
+            mujoco.mj_contactForce(model, data, 0, wrench)
+        after.append((data.qpos.copy(), data.qvel.copy()))
+        forces.append(wrench[:3])
+    return PhysicsState(*map(np.array, zip(*after, strict=True))), np.array(forces)
+
+
+def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
+    """One fused step from each state, operation by operation."""
+    step = partial(fused.step, fused.read_model(model), num_substeps=1)
+    axes = jax.tree.map(lambda x: 0 if np.ndim(x) else None, parameters)
+    with jax.disable_jit():
+        return jax.vmap(step, in_axes=(axes, 0, 0))(
+            jax.tree.map(jnp.asarray, parameters),
+            PhysicsState(jnp.asarray(states.qpos), jnp.asarray(states.qvel)),
+            Control(jnp.asarray(states.ctrl)),
+        )
+
+
+def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
+    """Each state within ONE_STEP of its largest speed; the largest part."""
+    fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
+    error = np.max(np.abs(np.asarray(actual.qvel) - expected.qvel) / fastest)
+    assert error < ONE_STEP
+    # An orientation has no unit of length: angles.
+    assert np.max(np.abs(np.asarray(actual.qpos) - expected.qpos) / fastest) < ONE_STEP * DT + 1e-15
+    return float(error)
+
+
+@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.usefixtures("float64")
+def test_one_step_of_a_frictional_model_is_mujocos(name, cone, record_property):
+    """From states that stick, slip and separate, on faces, edges and corners."""
+    model = frictional(cone, *MODELS[name])
+    states = touching_states(model, 240, seed=0)
+    expected, force = c_steps([model] * 240, states)
+    if name == "as it is":
+        loads = np.abs(force[:, 1:]) / 0.3
+        load = np.hypot(*loads.T) if cone == "elliptic" else loads.sum(axis=1)
+        pressed = force[:, 0] > 0.0
+        assert np.sum(pressed & (load < 0.99 * force[:, 0])) >= 20
+        assert np.sum(pressed & (load > 0.99 * force[:, 0])) >= 20
+        assert np.sum(force[:, 0] == 0.0) >= 20
+        assert np.sum(np.isnan(force[:, 0])) >= 5
+    error = assert_same_step(fused_steps(model, MODEL, states), expected)
+    record_property("largest_difference", error)
+    print(f"{cone}, {name}: {error:.1e} of the largest speed")
+
+
+@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.usefixtures("float64")
+def test_one_step_with_a_given_friction_is_mujocos(mj_model, cone):
+    """Alone in a frictionless model, and with every other number; `edited_model` defines it."""
+    model = mujoco.MjModel.from_xml_string(XML.replace('"pyramidal"', f'"{cone}"'))
+    states = touching_states(model, 96, seed=1)
+    coefficients = 10.0 ** np.random.default_rng(0).uniform(-3.0, 0.5, 96)
+    alone = PhysicsParameters(contact_friction=coefficients)
+    together = random_parameters(model, 96, seed=2)._replace(contact_friction=coefficients)
+    for parameters in (alone, together):
+        models = [
+            converged(edited_model(model, jax.tree.map(lambda x, i=i: x[i], parameters)))
+            for i in range(96)
+        ]
+        expected, _ = c_steps(models, states)
+        assert_same_step(fused_steps(model, parameters, states), expected)
+    without, _ = c_steps([model] * 96, states)
+    assert np.max(np.abs(without.qvel - expected.qvel)) > 1.0
+
+
+@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.usefixtures("float64")
+def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property):
+    """64 random worlds, free-running: neither engine ever sees the other's state. A ball that fell
+    is dropped again."""
+    count = 64
+    base = mujoco.MjModel.from_xml_string(XML.replace('"pyramidal"', f'"{cone}"'))
+    base.opt.timestep = DT
+    rng = np.random.default_rng(0)
+    parameters = random_parameters(base, count, seed=7)
+    parameters = parameters._replace(
+        gravity=parameters.gravity * [0.1, 0.1, 1.0],
+        contact_friction=rng.uniform(0.0, 1.0, count),
+    )
+    models = [
+        converged(edited_model(base, jax.tree.map(lambda x, i=i: x[i], parameters)))
+        for i in range(count)
+    ]
+    halves = [bouncing_states(base, rng) for _ in range(count // BATCH)]
+    state = PhysicsState(*map(np.concatenate, zip(*(h[:2] for h in halves), strict=True)))
+    reference = [
+        CEngine(m, PhysicsState(*(x[i : i + 1] for x in state[:2]))) for i, m in enumerate(models)
+    ]
+    engine = make_engine(base, "fused")
+    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 1)))
+    contacts, drops, error = 0, 0, 0.0
+    for i in range(2000):
+        if i % 10 == 0:
+            action = rng.uniform(-0.03, 0.03, (count, 6))
+            state = PhysicsState(*(np.array(x) for x in state[:2]))
+            for c, qpos, qvel in zip(reference, *state[:2], strict=True):
+                data = c.data[0]
+                if data.qpos[8] < paddle_frame(c.model, data.qpos[:6])[0][2] - 0.1:
+                    drop_ball(c.model, data.qpos, data.qvel, rng)
+                    qpos[6:], qvel[6:] = data.qpos[6:], data.qvel[6:]
+                    drops += 1
+            ctrl = state.qpos[:, :6] + action
+            c_ctrl = np.concatenate([c.state.qpos[:, :6] for c in reference]) + action
+        state = step(parameters, state, ctrl)
+        for j, c in enumerate(reference):
+            contacts += c.step(c_ctrl[j : j + 1], 1)
+        there = PhysicsState(
+            *(np.concatenate(x) for x in zip(*(c.state[:2] for c in reference), strict=True))
+        )
+        error = max(error, *difference(state, there))
+    record_property("largest_difference", error)
+    print(f"{cone}, 2,000 steps x {count}: {contacts} contacts, {drops} drops, {error:.1e}")
+    assert contacts >= 1000
+    assert error < 1e-6
