@@ -163,9 +163,12 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     """The checkpoint to show or to evaluate; prints the choice where the user made none.
 
     Args:
-      path: see `find_checkpoint`. Where it is None and the default folder of runs is empty, the
-        choice is the checkpoint that comes with the package.
+      path: see `find_checkpoint`; or `PRETRAINED`, the checkpoint that comes with the package,
+        unless there is a folder of that name. Where it is None and the default folder of runs is
+        empty, the choice is the checkpoint that comes with the package.
     """
+    if path == Path(PRETRAINED) and not path.is_dir():
+        return pretrained_checkpoint()
     if path is not None:
         return find_checkpoint(path, log_dir)
     try:
