@@ -48,8 +48,8 @@ from test_physics import (
 )
 
 MODEL = PhysicsParameters()
-# The numbers of a frictionless world; test_friction.py has the contact's friction.
-FIELDS = [field for field in PhysicsParameters._fields if field != "contact_friction"]
+# The numbers that the shipped model has; test_friction.py has the contact's friction.
+FIELDS = [f for f in PhysicsParameters._fields if f not in ("contact_friction", "force_limit")]
 NUM_WORLDS = 16
 
 
@@ -167,6 +167,24 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
     print(f"500 steps x {NUM_WORLDS} worlds: {contacts} contact steps, difference {error:.1e}")
     assert contacts >= 200
     assert error < 1e-9
+
+
+@pytest.mark.usefixtures("float64")
+def test_given_force_limits_are_mujocos(mj_model):
+    """Some servos at their limits, which have no implicit damping there, and some not."""
+    states, _ = random_states(mj_model, 128, seed=11)
+    limits = 10.0 ** np.random.default_rng(0).uniform(1.0, 3.5, (128, 6))
+    alone = PhysicsParameters(force_limit=limits)
+    for parameters in (alone, random_parameters(mj_model, 128, 12)._replace(force_limit=limits)):
+        expected, _ = c_steps(mj_model, parameters, states)
+        assert_same_step(uncompiled_steps(mj_model, parameters, states), expected)
+    data = mujoco.MjData(edited_model(mj_model, world(alone, 0)))
+    at_limit = []
+    for i, start in enumerate(zip(*states, strict=True)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start
+        mujoco.mj_forward(edited_model(mj_model, world(alone, i)), data)
+        at_limit.append(np.abs(data.actuator_force) == limits[i])
+    assert 0.2 < np.mean(at_limit) < 0.8
 
 
 def test_nothing_given_leaves_the_program_alone(mj_model):
