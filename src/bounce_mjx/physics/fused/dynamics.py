@@ -17,7 +17,17 @@ from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.fused import chain, friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
-from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
+from bounce_mjx.physics.fused.scalars import (
+    Scalar,
+    Vec3,
+    add,
+    dot,
+    matmul,
+    matvec,
+    scale,
+    stored,
+    vadd,
+)
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 
@@ -184,9 +194,10 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
     """One physics step: mj_step of this kind of model."""
-    pose = chain.forward_kinematics(model.links, motion.q)
-    bias = chain.bias_force(model.links, pose, motion.v, model.gravity)
-    inertia = chain.mass_matrix(model.links, pose)
+    keep = stored if motion.turning is not None else lambda values: values
+    pose = keep(chain.forward_kinematics(model.links, motion.q))
+    bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
+    inertia = keep(chain.mass_matrix(model.links, pose))
     applied, servo_damping = [], []
     for link, servo, target, q, v, b in zip(
         model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
@@ -238,7 +249,7 @@ def contact_response(
     )
     ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     if motion.turning is not None:
-        factor = chain.cholesky(inertia)
+        factor = stored(chain.cholesky(inertia))
         response = friction.contact_response(
             model,
             pose,
@@ -290,6 +301,8 @@ def integrate(
     for i, (link, derivative) in enumerate(zip(model.links, servo_damping, strict=True)):
         implicit[i][i] = add(implicit[i][i], dt * (link.damping - derivative))
     factor = chain.cholesky(implicit)
+    if motion.turning is not None:
+        factor = stored(factor)
     acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
     v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
