@@ -22,6 +22,9 @@ class PPOConfig(StrictModel):
     """Environments that run in parallel."""
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
+    training_episode_seconds: Positive | None = None
+    """Time limit of the training's episodes, s; null for the environment's. A shorter one trains
+    more starts and more drawn worlds; a time-out is bootstrapped and no end."""
     num_epochs: Count = 4
     """Passes over the data of one iteration."""
     num_minibatches: Count = 8

@@ -13,7 +13,7 @@ import numpy as np
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, StrictModel, whole_number
+from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
 from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
 from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
 
@@ -23,7 +23,7 @@ World = dict[str, jax.Array]
 """The numbers that an episode drew, by the names of the terms that are on."""
 
 Ranges = dict[str, tuple[jax.Array, jax.Array]]
-"""Lower and upper ends [] of the terms that are on."""
+"""Lower and upper ends of the terms that are on, each a number [] or of the term's shape."""
 
 
 class Term(NamedTuple):
@@ -154,6 +154,9 @@ class RandomizationConfig(StrictModel):
     """Displacement of each coordinate of the ball at a reset, m."""
     joint_start: Range | None = None
     """Displacement of each joint angle at a reset, rad."""
+    share: UnitInterval = 1.0
+    """Probability that a term with a nominal value is drawn in an episode; else it is nominal. A
+    small share trains for wide ranges of single terms whose extremes together no policy masters."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps of the training over which the ranges grow from the nominal values."""
 
@@ -189,15 +192,27 @@ class RandomizationConfig(StrictModel):
         return {name: tuple(grown(name, end) for end in getattr(self, name)) for name in self.terms}
 
 
-def draw_world(ranges: Ranges, key: jax.Array, dtype: jnp.dtype) -> World:
-    """The world of one episode; consumes the key."""
-    sizes = {name: int(np.prod(TERMS[name].shape)) for name in ranges}
+def draw_world(
+    ranges: Ranges, key: jax.Array, dtype: jnp.dtype, share: float | jax.Array = 1.0
+) -> World:
+    """The world of one episode; consumes the key.
+
+    Args:
+      share: probability of each term with a nominal value to be drawn [].
+    """
+    # In one order, though a traced dictionary has its keys sorted.
+    sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
     # One draw for all: the keys of separate draws would cost more than the numbers.
-    uniform, world, start = jax.random.uniform(key, (sum(sizes.values()),), dtype), {}, 0
-    for name, (low, high) in ranges.items():
-        shares = uniform[start : start + sizes[name]].reshape(TERMS[name].shape)
-        world[name] = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
-        start += sizes[name]
+    uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
+    world, start = {}, len(sizes)
+    for i, (name, size) in enumerate(sizes.items()):
+        term, (low, high) = TERMS[name], ranges[name]
+        shares = uniform[start : start + size].reshape(term.shape)
+        drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
+        if term.nominal is not None:
+            drawn = jnp.where(uniform[i] < share, drawn, jnp.asarray(term.nominal, dtype))
+        world[name] = drawn
+        start += size
     return world
 
 

@@ -28,7 +28,7 @@ class PPOTrainer:
         """
         self._config, self._observation_size = config, env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        trainer = make_trainer(config.ppo, env, config.env.episode_steps)
+        trainer = make_trainer(config.ppo, env, episode_steps(config))
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self._seeds = seeds[0] if config.num_seeds == 1 else seeds
@@ -76,6 +76,14 @@ class PPOTrainer:
         return Snapshot(policy_of(state, self._observation_size), state)
 
     def _initial_state(self, seeds: jax.Array) -> TrainingState:
-        """The first state of the training of a seed [], or of those of several [S]."""
+        """The first training state of one seed [] or of S seeds [S]."""
         key = jax.random.PRNGKey
         return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
+
+
+def episode_steps(config: TrainConfig) -> int:
+    """Control steps after which the training truncates an episode."""
+    limit = config.ppo.training_episode_seconds
+    if limit is None:
+        return config.env.episode_steps
+    return min(config.env.episode_steps, max(1, round(limit / config.env.control_dt)))
