@@ -40,6 +40,8 @@ class PhysicsParameters(NamedTuple):
     """Stiffness [6] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
     """Damping [6] of the position servos, N m s/rad: `kv`."""
+    force_limit: Array | None = None
+    """Largest forces [6] of the position servos, N m: the symmetrical `forcerange`."""
     armature: Array | None = None
     """Rotor inertia [6] at the joints, kg m^2."""
     damping: Array | None = None
@@ -67,6 +69,7 @@ SHAPES = PhysicsParameters(
     contact_friction=(),
     servo_gain=(_NUM_JOINTS,),
     servo_damping=(_NUM_JOINTS,),
+    force_limit=(_NUM_JOINTS,),
     armature=(_NUM_JOINTS,),
     damping=(_NUM_JOINTS,),
     link_mass=(_NUM_JOINTS,),
@@ -148,6 +151,10 @@ def edited_fields(
         put("actuator_biasprm", (servos, 1), -p.servo_gain)
     if p.servo_damping is not None:
         put("actuator_biasprm", (servos, 2), -p.servo_damping)
+    if p.force_limit is not None:
+        put("actuator_forcelimited", servos, True)
+        put("actuator_forcerange", (servos, 0), -p.force_limit)
+        put("actuator_forcerange", (servos, 1), p.force_limit)
     if p.armature is not None:
         put("dof_armature", dofs, p.armature)
     if p.damping is not None:
