@@ -398,7 +398,11 @@ def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> N
     newer = onnx.load_from_string(shipped)
     (entry,) = (prop for prop in newer.metadata_props if prop.key == "format")
     entry.value = "2"
+    unknown = onnx.load_from_string(shipped)
+    for prop in unknown.metadata_props:
+        prop.value = prop.value.replace("ball_velocity", "ball_colour")
     broken = {
+        "its input ball_colour is unknown": unknown.SerializeToString(),
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),

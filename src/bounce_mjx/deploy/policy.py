@@ -54,6 +54,7 @@ class DeployedPolicy:
             )
             entries = self._session.get_modelmeta().custom_metadata_map
             self.metadata: Metadata = from_entries(entries)
+            self._shapes = _shapes(len(self.metadata.joint_names))
             self._check_inputs()
         # onnxruntime raises many types for a damaged file; all of them mean the same here.
         except Exception as error:
@@ -62,18 +63,6 @@ class DeployedPolicy:
                 f"{source} is no policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
-        count = len(self.metadata.joint_names)
-        self._shapes = {
-            "joint_angles": (count,),
-            "joint_velocities": (count,),
-            "ball_position": (3,),
-            "ball_velocity": (3,),
-            "ball_age": (1,),
-            "ball_quaternion": (4,),
-            "ball_angular_velocity": (3,),
-            "target_height": (1,),
-            "time": (1,),
-        }
         self.needs = self._needs()
         """Measurements that every step must be given; `UNITS` has their units."""
         self.reset()
@@ -162,6 +151,9 @@ class DeployedPolicy:
         stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
         actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
         outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
+        known = self._shapes.keys() | OF_BOUNCES | {"past_actions", "paddle_position"}
+        if unknown := stated.keys() - known:
+            raise ValueError(f"its input {min(unknown)} is unknown here")
         if stated != actual or outputs != {"action": [len(self.metadata.joint_names)]}:
             raise ValueError("its inputs or outputs are not as its metadata states")
 
@@ -230,6 +222,14 @@ class DeployedPolicy:
                 f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
             )
         return max(0, round(elapsed / self.metadata.control_dt))
+
+
+def _shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the measurements, in the order of `UNITS`."""
+    shapes = dict.fromkeys(UNITS, (1,))
+    shapes |= {"joint_angles": (num_joints,), "joint_velocities": (num_joints,)}
+    shapes |= dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), (3,))
+    return shapes | {"ball_quaternion": (4,)}
 
 
 def _words(name: str, shape: tuple[int, ...]) -> str:
