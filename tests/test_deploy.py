@@ -16,7 +16,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy import loading
-from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import describe, export_jax, export_onnx
 from bounce_mjx.deploy.metadata import from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
@@ -217,13 +217,13 @@ def test_paddle_position_is_that_of_mujoco(edited: bool, tmp_path: Path) -> None
     (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
     metadata = describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
     model = load_model(tmp_path / "arm.xml", 0.001)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data, rng, chain = mujoco.MjData(model), np.random.default_rng(0), Chain(metadata)
     for _ in range(20):
         angles = rng.uniform(-2.0, 2.0, 6)
         data.qpos[:6] = angles
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(
-            paddle_position(metadata, angles), data.geom("blocker").xpos, atol=1e-12
+            chain.paddle_position(angles), data.geom("blocker").xpos, atol=1e-12
         )
 
 
@@ -416,6 +416,17 @@ def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> N
     monkeypatch.setattr(loading, "resource_path", lambda name: tmp_path / name)
     with pytest.raises(UserError, match="the policy robust is not in this version .*pretrained"):
         load_policy("robust")
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    use = {
+        "onnx": lambda: export_onnx(pretrained_checkpoint()),
+        "onnxruntime": lambda: load_policy("pretrained"),
+    }
+    with pytest.raises(UserError, match=f"the package {package} is missing.*pip install"):
+        use[package]()
 
 
 # Everything of the project but NumPy and onnxruntime.

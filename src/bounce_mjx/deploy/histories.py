@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.metadata import Metadata
 
 Measurements = dict[str, np.ndarray]
@@ -31,7 +31,7 @@ class Histories:
 
     def __init__(self, metadata: Metadata, measured: Measurements):
         """The past of the first control step is as its present."""
-        self._metadata = metadata
+        self._metadata, self._chain = metadata, Chain(metadata)
         self._ball = measured.get("ball_position", np.zeros(3))
         self._ball_velocity = np.zeros(3)
         self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
@@ -50,7 +50,7 @@ class Histories:
             "bounce_interval": zero,
             "bounce_joint_angles": angles,
             "bounce_joint_velocities": measured.get("joint_velocities", joints),
-            "paddle_position": paddle_position(metadata, angles),
+            "paddle_position": self._chain.paddle_position(angles),
         } | measured
         self.values = {
             part.name: np.tile(start[part.name], (part.history, 1)) for part in metadata.observation
@@ -61,7 +61,7 @@ class Histories:
         """Adds the measurements of the next control step, before which the action [J] was taken."""
         metadata = self._metadata
         angles = measured.get("joint_angles")
-        paddle = np.zeros(3) if angles is None else paddle_position(metadata, angles)
+        paddle = np.zeros(3) if angles is None else self._chain.paddle_position(angles)
         measured = measured | {"past_actions": action, "paddle_position": paddle}
         if "ball_position" in measured:
             measured |= self._picture(measured)

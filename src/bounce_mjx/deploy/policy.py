@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
 from bounce_mjx.deploy.metadata import Metadata, from_entries
@@ -42,8 +41,14 @@ class DeployedPolicy:
           source: its name, for messages.
 
         Raises:
-          UserError: it is not a policy that `bounce-mjx export` wrote.
+          UserError: it is not a policy that `bounce-mjx export` wrote, or onnxruntime is missing.
         """
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise UserError(
+                "the package onnxruntime is missing, which runs a policy; pip install onnxruntime"
+            ) from error
         options = onnxruntime.SessionOptions()
         # The network is too small to share between threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
