@@ -36,7 +36,9 @@ def interpret():
 
 
 def random_params(key: jax.Array):
-    networks = make_networks(CONFIG, NUM_OBSERVATIONS, NUM_ACTIONS)
+    networks = make_networks(
+        CONFIG, NUM_OBSERVATIONS, NUM_ACTIONS, NUM_CRITIC_INPUTS - NUM_OBSERVATIONS
+    )
     params = networks.policy_network.init(key), networks.value_network.init(key)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))

@@ -1,4 +1,7 @@
-"""The console script: `bounce-mjx train|eval|play|view|plot|report|export|train-torch`."""
+"""The console script.
+
+`bounce-mjx train|eval|robustness|play|view|plot|report|export|train-torch`
+"""
 
 import contextlib
 import difflib
@@ -14,6 +17,7 @@ from bounce_mjx.interrupt import INTERRUPTED
 COMMANDS = {
     "train": "train a policy that keeps the ball bouncing",
     "eval": "measure the five results of a trained policy",
+    "robustness": "measure the five results in perturbed worlds",
     "play": "show a trained policy",
     "view": "show the environment under random, zero or scripted actions",
     "plot": "draw the learning curves of runs, and an evaluation",

@@ -1,8 +1,65 @@
 """Settings as YAML."""
 
+import stat
+from pathlib import Path
+from typing import Any
+
 import yaml
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError, shorten
+
+_MAX_BYTES = 2**16
+_MAX_ALIASES = 10
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses YAML whose size multiplies, as groups that repeat groups do."""
+
+    _aliases = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        is_alias = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        self._aliases += is_alias and isinstance(node, yaml.CollectionNode)
+        if self._aliases > _MAX_ALIASES:
+            raise yaml.YAMLError(f"it repeats a group more than {_MAX_ALIASES} times")
+        return node
+
+
+def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
+    """Reads a YAML file of keys and values; an empty file has none.
+
+    Args:
+      kind: of the file, such as "config file", for the errors.
+      example: a file of that kind, for the errors.
+
+    Raises:
+      UserError: the file is missing or is no YAML mapping.
+    """
+    try:
+        # To open a pipe would wait for a writer, and a device may have no end.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError("it is not a regular file")
+        data = path.read_bytes()
+        if len(data) > _MAX_BYTES:
+            raise ValueError(f"it is longer than {_MAX_BYTES} bytes")
+        values = _Loader(data.decode("utf-8")).get_single_data()
+    # PyYAML raises many types where a value has the form of a number or a date but is none.
+    except Exception as error:
+        reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())
+        raise UserError(
+            f"the {kind} {shorten(str(path))} cannot be read ({shorten(reason, 300)}); give a "
+            f"YAML file such as {example}"
+        ) from error
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise UserError(
+            f"the {kind} {shorten(str(path))} holds a {type(values).__name__}, not a mapping "
+            f"of keys to values; write it like {example}"
+        )
+    return values
 
 
 def dump_config(config: StrictModel) -> str:

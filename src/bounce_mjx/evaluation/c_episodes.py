@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import (
@@ -20,6 +21,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
@@ -28,7 +30,7 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 def make_mujoco_evaluator(
     env: BounceBall, networks: Networks, episodes: int
-) -> Callable[[Policy, jax.Array], Statistics]:
+) -> Callable[..., Statistics]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
@@ -36,8 +38,8 @@ def make_mujoco_evaluator(
     num_threads = os.cpu_count() or 1
 
     @jax.jit
-    def start(key):
-        return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
+    def start(key, ranges):
+        return reset_episodes(env, key, episodes, ranges)
 
     @jax.jit
     def decide(policy, states):
@@ -50,8 +52,8 @@ def make_mujoco_evaluator(
         states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(states, actions, physics)
         return states, accumulate(env, statistics, states, step)
 
-    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
-        states = start(key)
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
+        states = start(key, ranges)
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
         ball_velocity = np.array(find_addresses(env.mj_model).ball_qvel[:3]) + 1 + env.mj_model.nq
         models = episode_models(env, states.pipeline_state.parameters)

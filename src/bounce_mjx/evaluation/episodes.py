@@ -9,28 +9,33 @@ from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.randomization import Ranges
+from bounce_mjx.task.state import State
 
 
-def make_evaluator(
-    env: BounceBall, networks: Networks, episodes: int
-) -> Callable[[Policy, jax.Array], Statistics]:
-    """A jitted function (policy, key) -> statistics of `episodes` deterministic episodes, each
-    from its own reset; it stops when all have ended or the time is over."""
+def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callable[..., Statistics]:
+    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
+    each from its own reset (`reset_episodes`); it stops when all have ended or the time is over.
+
+    The ranges may be left out.
+    """
     recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
 
-    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
-        return recording_evaluator(policy, key)[0]
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
+        return recording_evaluator(policy, key, ranges)[0]
 
     return jax.jit(evaluate)
 
 
 def make_recording_evaluator(
     env: BounceBall, networks: Networks, episodes: int, recorded: int
-) -> Callable[[Policy, jax.Array], tuple[Statistics, Recording]]:
+) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `make_evaluator`, with a recording of the first `recorded` episodes too."""
 
-    def evaluate(policy: Policy, key: jax.Array) -> tuple[Statistics, Recording]:
-        states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
+    def evaluate(
+        policy: Policy, key: jax.Array, ranges: Ranges | None = None
+    ) -> tuple[Statistics, Recording]:
+        states = reset_episodes(env, key, episodes, ranges)
 
         def unfinished(carry):
             _, statistics, _, step = carry
@@ -49,3 +54,23 @@ def make_recording_evaluator(
         return statistics, recording
 
     return jax.jit(evaluate)
+
+
+def reset_episodes(
+    env: BounceBall, key: jax.Array, episodes: int, ranges: Ranges | None = None
+) -> State:
+    """The starts of N episodes, batch last; consumes the key.
+
+    Args:
+      ranges: of several conditions, each end [C, ...]: every condition has N / C episodes, from the
+        same keys as the others, so that conditions differ in their ranges alone. The default is one
+        condition, the config's ranges.
+    """
+    if ranges is None:
+        return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
+    conditions = len(jax.tree.leaves(ranges)[0])
+    each = episodes // conditions
+    index = jnp.arange(episodes)
+    keys = jax.random.split(key, each)[index % each]
+    ranges = jax.tree.map(lambda end: jnp.asarray(end)[index // each], ranges)
+    return jax.vmap(env.reset, out_axes=-1)(keys, ranges)

@@ -49,6 +49,8 @@ def evaluate_policy(
     changes = {}
     if target_height is not None:
         changes["target_height_range"] = (target_height, target_height)
+        fixed = {"target_height": None, "target_interval": None}
+        changes["randomization"] = env_config.randomization.model_copy(update=fixed)
     if physics in ("fused", "mjx"):
         changes["physics"] = physics
     env = BounceBall(validate(EnvConfig, dict(env_config) | changes, "evaluation"))

@@ -80,8 +80,16 @@ class Report(NamedTuple):
         }
 
 
-def judge(env: BounceBall, statistics: Statistics) -> Report:
-    """The report of an evaluation: the five expected results, from the statistics of E episodes."""
+def judge(
+    env: BounceBall,
+    statistics: Statistics,
+    target_heights: tuple[float, float] | None = None,
+) -> Report:
+    """The report of an evaluation: the five expected results, from the statistics of E episodes.
+
+    Args:
+      target_heights: their range in these episodes, m; the config's by default.
+    """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     episodes = len(s.running)
     enough_bounces = float((s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).mean())
@@ -105,7 +113,8 @@ def judge(env: BounceBall, statistics: Statistics) -> Report:
             "height", f"bounces with |apex error| <= {MAX_APEX_ERROR} m", accurate, MIN_STEP_SHARE
         ),
         _speed_result(
-            _ratio(s.rising_speed.sum(), s.rising_steps.sum()), env.config.target_height_range
+            _ratio(s.rising_speed.sum(), s.rising_steps.sum()),
+            target_heights or env.config.target_heights,
         ),
         _share_result(
             "stable",
@@ -135,12 +144,12 @@ def _share_result(name: str, measured: str, share: float | None, minimum: float)
     )
 
 
-def _speed_result(speed: float | None, target_height_range: tuple[float, float]) -> Result:
+def _speed_result(speed: float | None, target_heights: tuple[float, float]) -> Result:
     """The upward speed, which is judged only for targets between `UPWARD_SPEED_TARGETS`."""
     low, high = UPWARD_SPEED_RANGE
     bound = f"{low} to {high}"
     lowest, highest = UPWARD_SPEED_TARGETS
-    judged = lowest <= target_height_range[0] and target_height_range[1] <= highest
+    judged = lowest <= target_heights[0] and target_heights[1] <= highest
     passed = speed is not None and low <= speed <= high
     return Result(
         "upward speed",

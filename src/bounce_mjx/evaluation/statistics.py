@@ -9,7 +9,8 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
 
 SETTLING_SECONDS = 2.0
-"""Start of an episode that the horizontal position and the height leave out, s."""
+"""Start of an episode that the horizontal position and the height leave out, s; the height also
+leaves out the time after a change of the target."""
 
 MAX_X_ERROR = 0.05
 """Largest distance of a centred ball from the target point along x, m."""
@@ -34,7 +35,7 @@ class Statistics(NamedTuple):
     centred_steps: jax.Array
     """Settled steps with the ball's x within `MAX_X_ERROR` of the target point [E]."""
     settled_bounces: jax.Array
-    """Bounces after `SETTLING_SECONDS` [E]."""
+    """Bounces after `SETTLING_SECONDS`, and that long after a change of the target [E]."""
     accurate_bounces: jax.Array
     """Settled bounces with an apex within `MAX_APEX_ERROR` of the target height [E]."""
     apex_error: jax.Array
@@ -64,11 +65,15 @@ def accumulate(
     """
     s, metrics = statistics, states.metrics
     running = s.running
-    settled = running & (step >= round(SETTLING_SECONDS / env.dt))
+    settling_steps = round(SETTLING_SECONDS / env.dt)
+    settled = running & (step >= settling_steps)
     kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
     x, vz = kinematics.ball_position[0], kinematics.ball_velocity[2]
     centred = jnp.abs(x - env.config.reward.target_x) <= MAX_X_ERROR
     bounced = settled & (metrics["bounced"] > 0)
+    if "target_interval" in states.pipeline_state.world:
+        age = states.pipeline_state.memory.target_age / env.dt
+        bounced &= jnp.round(age) > settling_steps
     accurate = metrics["apex_error"] <= MAX_APEX_ERROR
     rising = running & (vz > 0.0)
     return Statistics(

@@ -48,7 +48,7 @@ _STYLE = {
 def curves_figure(groups: Sequence[Group]) -> Figure:
     """Return, bounces and apex error over the training, with a dotted line where a run first met
     all five results."""
-    with _style():
+    with style():
         figure = Figure(figsize=(10.0, 3.2))
         grid = figure.subplots(
             1, 3, gridspec_kw=dict(left=0.06, right=0.985, top=0.91, bottom=0.26, wspace=0.22)
@@ -69,7 +69,7 @@ def rewards_figure(groups: Sequence[Group]) -> Figure:
     columns = 5
     rows = -(-len(TERM_NAMES) // columns)
     height = 1.8 * rows
-    with _style():
+    with style():
         figure = Figure(figsize=(10.0, height))
         # The margins, in inches, do not depend on the number of rows.
         margins = dict(top=1.0 - 0.7 / height, bottom=0.6 / height)
@@ -96,7 +96,7 @@ def evaluation_figure(env: BounceBall, recording: Recording) -> Figure:
     the hits on the paddle of all recorded episodes."""
     recording = jax.device_get(recording)
     bounces = settled_bounces(recording, round(SETTLING_SECONDS / env.dt))
-    with _style():
+    with style():
         figure = Figure(figsize=(10.0, 5.6))
         grid = figure.add_gridspec(
             2,
@@ -117,7 +117,7 @@ def evaluation_figure(env: BounceBall, recording: Recording) -> Figure:
 def image(figure: Figure, suffix: str) -> bytes:
     """A figure as an image file of the format `suffix`, "png" or "svg"."""
     buffer = io.BytesIO()
-    with _style():
+    with style():
         figure.savefig(
             buffer, format=suffix, dpi=150, metadata={"Date": None} if suffix == "svg" else None
         )
@@ -126,14 +126,15 @@ def image(figure: Figure, suffix: str) -> bytes:
 
 def pixels(figure: Figure) -> np.ndarray:
     """A figure as a picture [height, width, 3] (uint8)."""
-    with _style():
+    with style():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
 @contextlib.contextmanager
-def _style() -> Iterator[None]:
+def style() -> Iterator[None]:
+    """The look of all figures."""
     with matplotlib.rc_context(_STYLE):
         yield
 

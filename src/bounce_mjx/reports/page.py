@@ -25,6 +25,7 @@ from bounce_mjx.reports.figures import (
     image,
     rewards_figure,
 )
+from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, verdict
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
@@ -55,7 +56,8 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
       The page's path, and its figure of the evaluation.
 
     Raises:
-      UserError: the run has no results or no log yet, or the page cannot be written.
+      UserError: the run has no results or no log yet, a file of them is damaged, or the page cannot
+        be written.
     """
     results = load_results(run)
     if results is None:
@@ -63,9 +65,11 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     config = load_run_config(run)
     groups = group_runs([run])
     evaluation = evaluation_figure(BounceBall(config.env), recording)
+    robustness = load_robustness(run)
     figures = {
         "Learning curves": curves_figure(groups),
         "The best checkpoint": evaluation,
+        **({} if robustness is None else {"Perturbed worlds": robustness_figure(robustness)}),
         "Reward terms": rewards_figure(groups),
     }
     page = run / REPORT_FILE

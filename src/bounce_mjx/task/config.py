@@ -98,6 +98,11 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
 
     @property
+    def target_heights(self) -> tuple[float, float]:
+        """Range of all target heights, m."""
+        return self.randomization.target_height or self.target_height_range
+
+    @property
     def num_substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.control_dt / self.physics_dt)

@@ -70,6 +70,8 @@ class Memory(NamedTuple):
     """Shares of an interval that were over at the reset [3]: camera, pushes, targets."""
     target_age: jax.Array
     """Time since the target height was drawn [], s."""
+    target_range: tuple[jax.Array, jax.Array] | None
+    """Range of the later target heights, m; None where the target stays."""
     actuation: Actuation | None
     sensing: Sensing | None
 
@@ -169,7 +171,8 @@ class BounceBall:
 
         Args:
           rng: consumed.
-          ranges: other ranges of the terms that are on; the config's by default.
+          ranges: other ranges of the terms that are on, within the config's; the default. The
+            memories of late actions and pictures are as long as the config's ranges need.
           share: other probability of each term to be drawn; the config's by default.
         """
         check_unedited(self.mj_model, self._fingerprint)
@@ -226,7 +229,12 @@ class BounceBall:
         state = BounceState(physics, task, parameters, world)
         truth = self.kinematics(state)
         if world or self._needs_sensing:
-            state = state._replace(memory=self._first_memory(state, truth, memory_rng))
+            memory = self._first_memory(state, truth, memory_rng)
+            if "target_interval" in world:
+                target_range = ranges.get("target_height", config.target_height_range)
+                later = tuple(jnp.asarray(end, dtype) for end in target_range)
+                memory = memory._replace(target_range=later)
+            state = state._replace(memory=memory)
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
@@ -283,7 +291,7 @@ class BounceBall:
         now = actuation.passes(
             world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
         )
-        low, high = self.config.randomization.target_height or self.config.target_height_range
+        low, high = memory.target_range
         share = noise.uniform(memory.counter, _TARGET_STREAM, (), task.target_height.dtype)
         drawn = jnp.where(now, low + (high - low) * share, task.target_height)
         return task._replace(target_height=drawn), memory._replace(
@@ -433,6 +441,7 @@ class BounceBall:
             step=jnp.zeros((), jnp.int32),
             phases=noise.uniform(counter, _TARGET_STREAM, (3,), dtype),
             target_age=jnp.zeros((), dtype),
+            target_range=None,
             actuation=actuation.start_actuation(
                 config.randomization,
                 config.control_dt,

@@ -23,7 +23,7 @@ World = dict[str, jax.Array]
 """The numbers that an episode drew, by the names of the terms that are on."""
 
 Ranges = dict[str, tuple[jax.Array, jax.Array]]
-"""Lower and upper ends [] of the terms that are on."""
+"""Lower and upper ends of the terms that are on, each a number [] or of the term's shape."""
 
 
 class Term(NamedTuple):
@@ -200,18 +200,19 @@ def draw_world(
     Args:
       share: probability of each term with a nominal value to be drawn [].
     """
-    sizes = {name: int(np.prod(TERMS[name].shape)) for name in ranges}
+    # In one order, though a traced dictionary has its keys sorted.
+    sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
     # One draw for all: the keys of separate draws would cost more than the numbers.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
-    for i, (name, (low, high)) in enumerate(ranges.items()):
-        term = TERMS[name]
-        shares = uniform[start : start + sizes[name]].reshape(term.shape)
+    for i, (name, size) in enumerate(sizes.items()):
+        term, (low, high) = TERMS[name], ranges[name]
+        shares = uniform[start : start + size].reshape(term.shape)
         drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
         if term.nominal is not None:
             drawn = jnp.where(uniform[i] < share, drawn, jnp.asarray(term.nominal, dtype))
         world[name] = drawn
-        start += sizes[name]
+        start += size
     return world
 
 

@@ -1,0 +1,141 @@
+"""Measures the five results in perturbed worlds: `bounce-mjx robustness [CHECKPOINT]`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation.results import DEFAULT_SEED
+from bounce_mjx.evaluation.robustness import (
+    DEFAULT_EPISODES,
+    Outcome,
+    Physics,
+    RobustnessReport,
+    computed,
+    measure_conditions,
+)
+from bounce_mjx.evaluation.suite import load_suite
+from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.reports.figures import image
+from bounce_mjx.reports.robustness import ROBUSTNESS_FILE, robustness_figure, robustness_table
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.files import to_json, write_atomically
+from bounce_mjx.runs.folders import choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.training.setup import set_up_jax
+
+
+class RobustnessCommand(StrictModel):
+    """The command line."""
+
+    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder (its best checkpoint), or a checkpoint in it. The default is the newest run,
+    or the policy that comes with the package if there is no run."""
+    suite: Path | None = None
+    """YAML file of the perturbations; the default is configs/robustness.yaml."""
+    episodes: Count = DEFAULT_EPISODES
+    """Episodes in each condition."""
+    seed: NonNegativeInt = DEFAULT_SEED
+    """Seed of the resets."""
+    physics: Physics = "config"
+    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    out: Path | None = None
+    """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
+    for the policy that comes with the package."""
+    log_dir: Path = Path("runs/bounce_ball")
+    """Folder of runs in which to find the newest."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
+    not, 2 on a mistake."""
+    with exit_on_user_error():
+        args = sys.argv[1:] if args is None else args
+        command = parse(
+            RobustnessCommand,
+            args,
+            prog="bounce-mjx robustness",
+            description="Measures the five results of a trained policy in perturbed worlds.",
+        )
+        set_up_jax()
+        console = Console()
+        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
+        config = load_run_config(checkpoint.run)
+        policy = load_policy(checkpoint, config)
+        suite = command.suite or resource_path("configs/robustness.yaml")
+        shipped = checkpoint == pretrained_checkpoint()
+        out = command.out or (Path("robustness") if shipped else checkpoint.run)
+        _make_folder(out)
+        outcomes, engine = run_interruptible(_measure, command, config, policy, suite, console)
+        report = RobustnessReport(
+            checkpoint=str(checkpoint.folder),
+            steps=checkpoint.steps,
+            suite=str(suite),
+            physics=engine,
+            episodes=command.episodes,
+            seed=command.seed,
+            outcomes=outcomes,
+        )
+        console.print(robustness_table(report))
+        _write(out, report)
+    sys.exit(0 if report.passed else 1)
+
+
+def _measure(
+    command: RobustnessCommand, config: TrainConfig, policy: Policy, suite: Path, console: Console
+) -> tuple[list[Outcome], str]:
+    """Measures all conditions, with a bar of their progress."""
+    all_conditions = load_suite(suite, config.env)
+    conditions = computed(all_conditions)
+    if skipped := {c.perturbation.name for c in all_conditions} - {
+        c.perturbation.name for c in conditions
+    }:
+        console.print(f"skipped, as the physics lacks them: {', '.join(sorted(skipped))}")
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
+        task = bar.add_task("conditions", total=len(conditions))
+        return measure_conditions(
+            policy,
+            config.ppo,
+            conditions,
+            episodes=command.episodes,
+            seed=command.seed,
+            physics=command.physics,
+            progress=lambda done: bar.update(task, completed=done),
+        )
+
+
+def _make_folder(out: Path) -> None:
+    """Spares the user an evaluation whose results could not be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _not_writable(out, error) from error
+
+
+def _write(out: Path, report: RobustnessReport) -> None:
+    """Writes the results and the pictures, and prints their paths."""
+    figure = robustness_figure(report)
+    try:
+        write_atomically(out / ROBUSTNESS_FILE, to_json(report.model_dump()))
+        for suffix in ("png", "svg"):
+            (out / f"robustness.{suffix}").write_bytes(image(figure, suffix))
+    except OSError as error:
+        raise _not_writable(out, error) from error
+    for suffix in ("json", "png", "svg"):
+        print(out / f"robustness.{suffix}")
+
+
+def _not_writable(out: Path, error: OSError) -> UserError:
+    return UserError(
+        f"{out} cannot be written ({error.strerror}); choose another folder with --out"
+    )

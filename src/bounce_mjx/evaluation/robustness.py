@@ -1,0 +1,195 @@
+"""The five results of a policy in every condition of a suite."""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pydantic
+
+from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
+from bounce_mjx.evaluation.suite import Condition, neutral_range
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.physics import PhysicsParameters
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.randomization import RandomizationConfig, Ranges
+
+DEFAULT_EPISODES = 64
+
+Physics = Literal["config", "fused", "mjx", "mujoco"]
+
+# Terms that have no neutral value, or that cost the physics much: only the conditions that need one
+# are simulated with it.
+_SEPARATE_TERMS = frozenset(
+    ("camera_rate", "contact_friction", "torque_limit", "joint_frictionloss")
+)
+# Episodes of one call: more would not be faster, and fewer would not show the progress.
+_CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH = 1024, 16_384, 256
+
+
+class Outcome(pydantic.BaseModel):
+    """The five results in one condition."""
+
+    perturbation: str
+    group: str
+    unit: str
+    strength: float | None
+    trained: bool
+    """Whether the ranges of the policy's training contain the condition."""
+    values: dict[str, float | None]
+    """The five results by name; None where there was nothing to measure."""
+    failed: list[str]
+    """Names of the results that miss their bounds."""
+    mean_length_s: float
+    """Mean length of the episodes, s."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether no result failed."""
+        return not self.failed
+
+
+class RobustnessReport(pydantic.BaseModel):
+    """The results of a policy in all conditions: `robustness.json`."""
+
+    checkpoint: str
+    steps: int
+    """Environment steps of the policy's training."""
+    suite: str
+    physics: str
+    episodes: int
+    """Episodes of each condition."""
+    seed: int
+    outcomes: list[Outcome]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all conditions meet all judged results."""
+        return all(outcome.passed for outcome in self.outcomes)
+
+    @property
+    def met(self) -> int:
+        """Number of the conditions that meet all judged results."""
+        return sum(outcome.passed for outcome in self.outcomes)
+
+
+def measure_conditions(
+    policy: Policy,
+    ppo_config: PPOConfig,
+    conditions: Sequence[Condition],
+    *,
+    episodes: int = DEFAULT_EPISODES,
+    seed: int = DEFAULT_SEED,
+    physics: Physics = "config",
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[list[Outcome], str]:
+    """Measures the five results of a policy without its noise, in the order of the conditions.
+
+    Conditions of the same structure are simulated by one compiled program, which takes their ranges
+    as inputs. The episodes of all conditions start from the same keys.
+
+    Args:
+      ppo_config: of the policy's training; it gives the networks.
+      episodes: of each condition.
+      physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
+      progress: called with the number of conditions that are done.
+
+    Returns:
+      The outcomes, and the name of the engine: fused, mjx or mujoco.
+
+    Raises:
+      UserError: the engine does not support the model.
+    """
+    programs = defaultdict(list)
+    for index, condition in enumerate(conditions):
+        key = json.dumps(condition.env.model_dump(mode="json"))
+        programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
+    outcomes: list[Outcome | None] = [None] * len(conditions)
+    done, engine = 0, physics
+    for indices in programs.values():
+        members = [conditions[index] for index in indices]
+        env = BounceBall(_spanning_config(members, physics))
+        engine = physics if physics == "mujoco" else env.engine.name
+        networks = make_networks(ppo_config, env.observation_size, env.action_size)
+        size = _batch_size(len(members), episodes, physics)
+        make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
+        evaluate = make(env, networks, size * episodes)
+        for start in range(0, len(members), size):
+            batch = members[start : start + size]
+            # The last call has a part of its conditions twice: another shape would be compiled.
+            padded = batch + [batch[-1]] * (size - len(batch))
+            statistics = evaluate(policy, jax.random.PRNGKey(seed), _stacked_ranges(env, padded))
+            for i, condition in enumerate(batch):
+                own = slice(i * episodes, (i + 1) * episodes)
+                of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
+                report = judge(env, of_condition, condition.target_heights)
+                outcomes[indices[start + i]] = Outcome(
+                    perturbation=condition.perturbation.name,
+                    group=condition.perturbation.group,
+                    unit=condition.perturbation.unit,
+                    strength=condition.strength,
+                    trained=condition.trained,
+                    values={result.name: result.value for result in report.results},
+                    failed=[r.name for r in report.results if r.passed is False],
+                    mean_length_s=report.details["mean_length_s"],
+                )
+            done += len(batch)
+            progress(done)
+    return outcomes, engine
+
+
+def computed(conditions: Sequence[Condition]) -> list[Condition]:
+    """The conditions whose terms the physics has a parameter for."""
+    parameters = {"torque_limit": "force_limit", "joint_frictionloss": "frictionloss"}
+    lacking = {term for term, name in parameters.items() if name not in PhysicsParameters._fields}
+    return [condition for condition in conditions if lacking.isdisjoint(condition.ranges)]
+
+
+def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:
+    """The task with all terms of the conditions on, in ranges that contain theirs."""
+    env = conditions[0].env
+    spans = {}
+    for name in sorted({name for condition in conditions for name in condition.ranges}):
+        ranges = [_range(condition, name) for condition in conditions]
+        spans[name] = (
+            min(float(np.min(low)) for low, _ in ranges),
+            max(float(np.max(high)) for _, high in ranges),
+        )
+    changes = {"randomization": RandomizationConfig(**spans)}
+    if physics in ("fused", "mjx"):
+        changes["physics"] = physics
+    return env.model_copy(update=changes)
+
+
+def _range(condition: Condition, term: str) -> tuple[np.ndarray, np.ndarray]:
+    given = condition.ranges.get(term)
+    return neutral_range(term, condition.env) if given is None else given
+
+
+def _stacked_ranges(env: BounceBall, conditions: Sequence[Condition]) -> Ranges | None:
+    """The ranges of C conditions, each end [C, ...]; None where no term is on."""
+    terms = env.config.randomization.terms
+    return {
+        name: tuple(
+            jnp.asarray(np.stack(ends), jnp.float32)
+            for ends in zip(*(_range(condition, name) for condition in conditions), strict=True)
+        )
+        for name in terms
+    } or None
+
+
+def _batch_size(conditions: int, episodes: int, physics: Physics) -> int:
+    """Conditions in one call, about as many in each."""
+    accelerated = jax.default_backend() != "cpu"
+    batch = _GPU_BATCH if accelerated else _CPU_BATCH
+    if physics == "mujoco":
+        batch = _MUJOCO_BATCH
+    calls = -(-conditions // max(1, batch // episodes))
+    return -(-conditions // calls)

@@ -1,0 +1,270 @@
+"""A suite of perturbations: the conditions of a robustness report, from a YAML file.
+
+`configs/robustness.yaml` explains the format.
+"""
+
+import difflib
+import math
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from bounce_mjx.config.files import differing_keys, read_mapping
+from bounce_mjx.config.settings import Finite, StrictModel
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.task.actuation import DEFAULT_PUSH_INTERVAL
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.randomization import TERMS, RandomizationConfig
+
+UNITS = {
+    "": 1.0,
+    "factor": 1.0,
+    "%": 0.01,
+    "s": 1.0,
+    "ms": 1e-3,
+    "Hz": 1.0,
+    "m": 1.0,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "m/s": 1.0,
+    "1/m": 1.0,
+    "rad": 1.0,
+    "deg": math.radians(1.0),
+    "rad/s": 1.0,
+    "kg": 1.0,
+    "N m": 1.0,
+    "N m s/rad": 1.0,
+}
+"""Units of strengths, and their factors to the units of the config."""
+
+NOMINAL = "nominal"
+"""Name of the condition without a perturbation, which is always measured."""
+
+_SIGNS = {"strength": 1.0, "-strength": -1.0}
+# Seconds between two changes of a target that does not change.
+_NEVER = 1e9
+
+Bounds = tuple[np.ndarray, np.ndarray]
+
+
+class Perturbation(StrictModel):
+    """One change of the world, at several strengths."""
+
+    name: str = ""
+    group: str = "others"
+    """Heading in the picture and in the table."""
+    unit: str = ""
+    """Unit of the strengths, one of `UNITS`."""
+    strengths: tuple[Finite, ...] = ()
+    terms: dict[str, Any] = {}
+    """Values of terms of `env.randomization`: see `configs/robustness.yaml`."""
+    settings: dict[str, Any] = {}
+    """Other values of settings of `env`, by dotted names."""
+    trained_ranges: bool = False
+    """All ranges of the policy's training at once, in the place of terms."""
+
+
+class Suite(StrictModel):
+    """The file."""
+
+    perturbations: Annotated[tuple[Perturbation, ...], Field(min_length=1)] = ()
+
+
+class Condition(NamedTuple):
+    """A perturbation at one strength."""
+
+    perturbation: Perturbation
+    strength: float | None
+    """In the perturbation's unit."""
+    env: EnvConfig
+    """The task, without randomisation."""
+    ranges: dict[str, Bounds]
+    """Lower and upper ends of the perturbed terms, each of the term's shape."""
+    trained: bool
+    """Whether the ranges of the policy's training contain it."""
+
+    @property
+    def target_heights(self) -> tuple[float, float]:
+        """Range of all target heights, m."""
+        low, high = self.ranges.get("target_height", self.env.target_height_range)
+        return float(low), float(high)
+
+
+def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
+    """The conditions of a suite file, the nominal one first.
+
+    Args:
+      trained: the task of the policy's training. Each condition replaces its randomisation.
+
+    Raises:
+      UserError: the file is missing or wrong.
+    """
+    values = read_mapping(path, "suite", "configs/robustness.yaml")
+    suite = validate(Suite, values, str(path))
+    nominal = Perturbation(name=NOMINAL, group=NOMINAL)
+    names, conditions = {NOMINAL}, [_condition(nominal, None, trained, NOMINAL)]
+    for perturbation in suite.perturbations:
+        source = f"{shorten(str(path))}, perturbation {shorten(perturbation.name)!r}"
+        if not perturbation.name.strip() or perturbation.name in names:
+            reason = "is taken" if perturbation.name in names else "is empty"
+            raise UserError(f"{source}: the name {reason}; give each perturbation its own name")
+        names.add(perturbation.name)
+        _check(perturbation, source)
+        if perturbation.trained_ranges and not trained.randomization.terms:
+            continue
+        for strength in perturbation.strengths or (None,):
+            at = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
+            conditions.append(_condition(perturbation, strength, trained, at.rstrip()))
+    return conditions
+
+
+def neutral_range(term: str, env: EnvConfig) -> Bounds | None:
+    """The range of a term that leaves the world as it is; None where there is none."""
+    low = high = TERMS[term].nominal
+    if term == "push_interval":
+        low = high = DEFAULT_PUSH_INTERVAL
+    elif term == "target_interval":
+        low = high = _NEVER
+    elif term == "target_height":
+        low, high = env.target_height_range
+    return None if low is None else _shaped(term, low, high)
+
+
+def _check(p: Perturbation, source: str) -> None:
+    """Checks a perturbation's own keys."""
+    if p.unit not in UNITS:
+        known = ", ".join(unit for unit in UNITS if unit)
+        raise UserError(f"{source}: the unit {shorten(p.unit)!r} is unknown; give one of {known}")
+    changes = bool(p.terms or p.settings)
+    if changes == p.trained_ranges:
+        reason = "has both terms and trained_ranges" if changes else "changes nothing"
+        raise UserError(f"{source}: it {reason}; give terms, settings or trained_ranges: true")
+    uses = _uses_strength(p.terms) or _uses_strength(p.settings)
+    if uses and not p.strengths:
+        raise UserError(f"{source}: it has no strengths; give a list such as strengths: [1, 2]")
+    if p.strengths and not uses:
+        raise UserError(
+            f"{source}: no value is the word strength, so all its strengths are alike; write "
+            "strength for a value, or leave strengths out"
+        )
+    for term in p.terms:
+        if term not in TERMS:
+            near = difflib.get_close_matches(term, TERMS, n=1)
+            advice = f"did you mean {near[0]}?" if near else f"known terms are {', '.join(TERMS)}"
+            raise UserError(f"{source}: unknown term {shorten(term)}; {advice}")
+
+
+def _condition(
+    perturbation: Perturbation, strength: float | None, trained: EnvConfig, source: str
+) -> Condition:
+    scale = UNITS[perturbation.unit]
+    value = None if strength is None else strength * scale
+    plain = trained.model_copy(update={"randomization": RandomizationConfig()})
+    env = _with_settings(plain, perturbation.settings, value, source)
+    if perturbation.trained_ranges:
+        config = trained.randomization
+        ranges = {name: _shaped(name, *getattr(config, name)) for name in config.terms}
+    else:
+        ranges = {
+            term: _bounds(term, entry, value, source) for term, entry in perturbation.terms.items()
+        }
+    spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
+    # Reports values that are out of a term's limits.
+    validate(EnvConfig, dict(env) | {"randomization": spans}, source)
+    contained = not differing_keys(env, plain) and all(
+        _contains(trained, name, bounds) for name, bounds in ranges.items()
+    )
+    return Condition(perturbation, strength, env, ranges, contained)
+
+
+def _with_settings(
+    env: EnvConfig, settings: dict[str, Any], strength: float | None, source: str
+) -> EnvConfig:
+    """The task with other settings."""
+    if not settings:
+        return env
+    values = env.model_dump()
+    for name, value in settings.items():
+        *groups, key = name.split(".")
+        group = values
+        for part in groups:
+            group = group.setdefault(part, {}) if isinstance(group, dict) else group
+        if "randomization" in (*groups, key) or not isinstance(group, dict):
+            raise UserError(
+                f"{source}: {shorten(name)} is not a setting to perturb; give a key of env, and "
+                "terms of the randomisation under terms"
+            )
+        group[key] = _SIGNS[value] * strength if value in _SIGNS else value
+    changed = validate(EnvConfig, values, source)
+    if changed.observation.layout != env.observation.layout:
+        raise UserError(
+            f"{source}: it changes the quantities of the observation, which the policy's network "
+            "fixes; remove that setting"
+        )
+    return changed
+
+
+def _bounds(term: str, entry: Any, strength: float | None, source: str) -> Bounds:
+    """The range of a term: of a value, of a list with a value for each entry of the term, or of
+    such a {from, to}."""
+    size = math.prod(TERMS[term].shape)
+    ends = [entry, entry]
+    if isinstance(entry, dict):
+        if entry.keys() != {"from", "to"}:
+            raise UserError(f"{source}: {term} has other keys than from and to; give both")
+        ends = [entry["from"], entry["to"]]
+
+    def number(value: Any) -> float:
+        if isinstance(value, str) and value in _SIGNS:
+            return _SIGNS[value] * strength
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+            raise UserError(
+                f"{source}: {term} is {shorten(repr(value))}, but must be a number, strength or "
+                "-strength"
+            )
+        return float(value)
+
+    def numbers(end: Any) -> Any:
+        if not isinstance(end, list):
+            return number(end)
+        if len(end) != size:
+            raise UserError(f"{source}: {term} has {len(end)} values, but must have {size}")
+        return [number(value) for value in end]
+
+    low, high = _shaped(term, *map(numbers, ends))
+    if np.any(low > high):
+        raise UserError(f"{source}: {term} is from a value to a lower one; swap from and to")
+    return low, high
+
+
+def _shaped(term: str, low: Any, high: Any) -> Bounds:
+    """Ends of the term's shape; a list of one value serves for a term that is one number."""
+    shape = TERMS[term].shape
+
+    def shaped(end: Any) -> np.ndarray:
+        array = np.asarray(end, np.float64)
+        return (
+            array.reshape(shape) if array.size == 1 and not shape else np.broadcast_to(array, shape)
+        )
+
+    return shaped(low), shaped(high)
+
+
+def _contains(trained: EnvConfig, term: str, bounds: Bounds) -> bool:
+    """Whether a policy's training drew a term from a range that contains another."""
+    drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
+    if drawn is None:
+        return False
+    (low, high), tolerance = drawn, 1e-9
+    return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))
+
+
+def _uses_strength(values: Any) -> bool:
+    if isinstance(values, dict):
+        return any(map(_uses_strength, values.values()))
+    if isinstance(values, list):
+        return any(map(_uses_strength, values))
+    return isinstance(values, str) and values in _SIGNS

@@ -1,0 +1,243 @@
+"""The results of a policy in perturbed worlds, as a table and as a picture."""
+
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
+from bounce_mjx.evaluation.suite import NOMINAL
+from bounce_mjx.reports.figures import style
+from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.runs.files import read_json
+
+ROBUSTNESS_FILE = "robustness.json"
+
+# Names of the results, and their initials in the picture.
+_INITIALS = {
+    "consecutive bounces": "B",
+    "horizontal position": "X",
+    "height": "H",
+    "upward speed": "V",
+    "stable": "S",
+}
+_HEADERS = {
+    "stable": "stable",
+    "consecutive bounces": "bounce",
+    "horizontal position": "x",
+    "height": "height",
+    "upward speed": "speed",
+}
+# From vermilion over sand to blue, which the colour-blind can tell apart.
+_COLOURS = LinearSegmentedColormap.from_list("stable", ["#c2451e", "#f4e3c3", "#2b7bba"])
+# Most of the colours are for the shares that matter, near 100%.
+_SCALE = PowerNorm(2.5, 0.0, 100.0)
+_INK, _PAPER = "#222222", "#ffffff"
+
+# Inches.
+_WIDTH, _LINE, _LABEL = 10.0, 0.29, 1.95
+_TOP, _BOTTOM = 0.65, 0.95
+
+
+def load_robustness(folder: Path) -> RobustnessReport | None:
+    """The report that `bounce-mjx robustness` wrote into a folder; None if there is none.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    path = folder / ROBUSTNESS_FILE
+    if not path.is_file():
+        return None
+    try:
+        return read_json(path, RobustnessReport)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}); delete it, or write it again with bounce-mjx "
+            "robustness"
+        ) from error
+
+
+def summary(report: RobustnessReport) -> str:
+    """One sentence on a report."""
+    return (
+        f"{report.met} of {len(report.outcomes)} conditions meet all judged results, with "
+        f"{report.episodes} episodes each"
+    )
+
+
+def robustness_table(report: RobustnessReport) -> Table:
+    """The five results in each condition; an asterisk marks a figure that misses its bound."""
+    table = Table(
+        title=f"{summary(report)} (shares in %, speed in m/s, * misses its bound)",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
+        pad_edge=False,
+    )
+    table.add_column("condition")
+    table.add_column("strength", justify="right")
+    for header in (*_HEADERS.values(), ""):
+        table.add_column(header, justify="right")
+    for rows in _perturbations(report.outcomes):
+        for i, outcome in enumerate(rows):
+            name = escape(outcome.perturbation) if i == 0 else ""
+            strength = "" if outcome.strength is None else f"{outcome.strength:g} {outcome.unit}"
+            verdict = "[green]pass" if outcome.passed else "[red]FAIL"
+            table.add_row(name, strength.rstrip(), *_figures(outcome), verdict)
+    return table
+
+
+def robustness_figure(report: RobustnessReport) -> Figure:
+    """Perturbations by strength: a cell has the colour of the share of stable episodes, a tick or
+    the initials of the missed results, and a frame where the training's ranges contain it."""
+    columns = _columns(report.outcomes)
+    lines = max(sum(_lines(group) for group in column) for column in columns)
+    height = _LINE * lines + _TOP + _BOTTOM
+    with style():
+        figure = Figure(figsize=(_WIDTH, height))
+        title = f"{report.met} of {len(report.outcomes)} conditions meet all judged results"
+        below = (
+            f"{report.episodes} episodes in each condition, on the physics engine {report.physics}"
+        )
+        figure.text(0.02, 1 - 0.25 / height, title, va="center", fontsize=11, fontweight="bold")
+        figure.text(0.02, 1 - 0.48 / height, below, va="center", fontsize=8.5)
+        cells = max(len(row) for column in columns for _, rows in column for row in rows)
+        for i, column in enumerate(columns):
+            axes = figure.add_axes(
+                (
+                    (i * _WIDTH / 2 + _LABEL) / _WIDTH,
+                    _BOTTOM / height,
+                    (_WIDTH / 2 - _LABEL - 0.12) / _WIDTH,
+                    _LINE * lines / height,
+                )
+            )
+            axes.set_xlim(0.0, max(8, cells))
+            axes.set_ylim(lines, 0.0)
+            axes.axis("off")
+            _draw_column(axes, column)
+        _draw_legend(figure, height, any(outcome.trained for outcome in report.outcomes[1:]))
+    return figure
+
+
+def _figures(outcome: Outcome) -> Iterable[str]:
+    """The five results of a table's row."""
+    for name in _HEADERS:
+        text = figure_text(outcome.values[name], ".2f" if name == "upward speed" else ".1f")
+        yield f"[red]{text}*" if name in outcome.failed else f"{text} "
+
+
+def _perturbations(outcomes: Sequence[Outcome]) -> list[list[Outcome]]:
+    """The outcomes of each perturbation, in the suite's order."""
+    return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
+
+
+Group = tuple[str, list[list[Outcome]]]
+
+
+def _columns(outcomes: Sequence[Outcome]) -> list[list[Group]]:
+    """The groups of perturbations in two columns of about the same length."""
+    rows = _perturbations(outcomes)
+    groups = [(name, list(of)) for name, of in groupby(rows, lambda row: row[0].group)]
+    lengths = [_lines(group) for group in groups]
+    splits = range(1, len(groups) + 1)
+    split = min(splits, key=lambda i: max(sum(lengths[:i]), sum(lengths[i:])))
+    return [groups[:split], groups[split:]] if groups[split:] else [groups[:split]]
+
+
+def _lines(group: Group) -> float:
+    """Height of a group in lines, with its heading and a gap."""
+    name, rows = group
+    return len(rows) + (0.3 if name == NOMINAL else 1.6)
+
+
+def _draw_column(axes: Axes, groups: Sequence[Group]) -> None:
+    y = 0.0
+    for name, rows in groups:
+        if name != NOMINAL:
+            axes.text(-0.15, y + 0.75, name, ha="right", va="center", fontsize=9, fontweight="bold")
+            y += 1.3
+        for row in rows:
+            unit = row[0].unit
+            label = f"{row[0].perturbation}, {unit}" if unit else row[0].perturbation
+            axes.text(-0.15, y + 0.5, label, ha="right", va="center", fontsize=8, color=_INK)
+            for x, outcome in enumerate(row):
+                _draw_cell(axes, x, y, outcome)
+            _draw_frames(axes, y, [outcome.trained for outcome in row])
+            y += 1.0
+        y += 0.3
+
+
+def _draw_cell(axes: Axes, x: float, y: float, outcome: Outcome) -> None:
+    share = outcome.values["stable"]
+    shade = float(_SCALE(share))
+    axes.add_patch(
+        Rectangle((x + 0.03, y + 0.04), 0.94, 0.92, facecolor=_COLOURS(shade), edgecolor="none")
+    )
+    ink = _INK if 0.2 < shade < 0.8 else _PAPER
+    if outcome.strength is not None:
+        text = f"{outcome.strength:g}".replace("-", "\u2212")
+        axes.text(x + 0.5, y + 0.3, text, ha="center", va="center", fontsize=7.5, color=ink)
+    missed = "".join(initial for name, initial in _INITIALS.items() if name in outcome.failed)
+    axes.text(
+        x + 0.5,
+        y + (0.5 if outcome.strength is None else 0.71),
+        missed or "\u2713",
+        ha="center",
+        va="center",
+        fontsize=6 if missed else 8,
+        fontweight="normal" if missed else "bold",
+        color=ink,
+    )
+
+
+def _draw_frames(axes: Axes, y: float, trained: Sequence[bool]) -> None:
+    """One frame around neighbouring cells that the training's ranges contain."""
+    x = 0
+    for inside, cells in groupby(trained):
+        width = len(list(cells))
+        if inside:
+            axes.add_patch(
+                Rectangle(
+                    (x + 0.03, y + 0.04),
+                    width - 0.06,
+                    0.92,
+                    fill=False,
+                    edgecolor=_INK,
+                    linewidth=1.5,
+                    clip_on=False,
+                )
+            )
+        x += width
+
+
+def _draw_legend(figure: Figure, height: float, framed: bool) -> None:
+    bar = figure.add_axes((0.02, 0.52 / height, 0.22, 0.14 / height))
+    scale = ScalarMappable(_SCALE, _COLOURS)
+    figure.colorbar(scale, cax=bar, orientation="horizontal", ticks=(0, 50, 75, 90, 100))
+    bar.set_title("stable episodes, %", fontsize=8)
+    bar.tick_params(labelsize=8, length=0)
+    initials = "   ".join(f"{initial} {name}" for name, initial in _INITIALS.items())
+    handles = [
+        Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
+        Line2D([], [], marker="$H$", linestyle="", color=_INK, label=f"missed: {initials}"),
+    ]
+    if framed:
+        handles.insert(
+            2,
+            Patch(
+                facecolor="none", edgecolor=_INK, linewidth=1.5, label="within the trained ranges"
+            ),
+        )
+    figure.legend(
+        handles=handles, loc="lower left", bbox_to_anchor=(0.27, 0.0), fontsize=8, ncols=1
+    )
