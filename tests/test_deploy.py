@@ -168,7 +168,7 @@ def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations)
         np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
 
 
-def test_metadata_tells_what_the_network_takes_and_gives(runs: dict[str, Path]) -> None:
+def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) -> None:
     model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"], runs["sensors"])))
     metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
     config = load_run_config(runs["sensors"])
@@ -387,7 +387,7 @@ def test_the_shipped_file_is_a_fresh_export() -> None:
     )
 
 
-def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> None:
+def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(UserError, match="nowhere.onnx cannot be read .*robust or pretrained"):
         load_policy("nowhere.onnx")
     with pytest.raises(UserError, match="not in a run's folder"):
@@ -474,7 +474,7 @@ def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
     assert bounces >= 10 and survived == pytest.approx(8.0)
 
 
-def test_the_example_prints_what_it_measured(monkeypatch, capsys) -> None:
+def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:
     source = CHECKOUT / "examples" / "deploy.py"
     assert len(source.read_text(encoding="utf-8").splitlines()) <= 80
     monkeypatch.setattr(sys, "argv", ["deploy.py", "pretrained", "--seconds", "0.6"])

@@ -314,7 +314,7 @@ def test_packages_import_in_the_order_of_the_map():
 
 def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:
     page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
-    section = page.split("## What can be randomised\n")[1].split("\n## ")[0]
+    section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
     assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
     section = page.split("## Export a policy\n")[1].split("\n## ")[0]

@@ -24,7 +24,7 @@ _SHORTEST = 1e-3
 class Histories:
     """The last values of each observed quantity.
 
-    The measurements of a step are those that the policy needs: `joint_angles` [J],
+    The measurements of a step are all that the policy needs: `joint_angles` [J],
     `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `target_height` [1],
     `ball_age` [1], and so on; units m, rad and s.
     """
@@ -101,7 +101,7 @@ class Histories:
     ) -> dict[str, tuple[bool, np.ndarray]]:
         """The quantities of bounces that change: whether a bounce starts, and the value.
 
-        A bounce starts when the ball is first measured near the paddle, and its values are those of
+        A bounce starts when the ball is first measured near the paddle, and its values belong to
         the ball's lowest measured point.
         """
         if not OF_BOUNCES & self.values.keys():

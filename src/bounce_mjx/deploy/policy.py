@@ -178,7 +178,7 @@ class DeployedPolicy:
         return tuple(name for name, users in needs.items() if users & seen)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
-        """The measurements as arrays of their own, with the defaults of those that are missing."""
+        """The measurements as arrays of their own, with defaults for the missing ones."""
         for name in measurements:
             if name not in self._shapes:
                 raise UserError(f"{name} is no measurement; a step takes {', '.join(self._shapes)}")
