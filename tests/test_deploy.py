@@ -18,6 +18,7 @@ from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy import loading
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import describe, export_jax, export_onnx
+from bounce_mjx.deploy.histories import Histories
 from bounce_mjx.deploy.metadata import from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
@@ -29,8 +30,8 @@ from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.observation import QUANTITIES
-from bounce_mjx.task.sensing import Sensing
+from bounce_mjx.task.observation import QUANTITIES, Kinematics
+from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
@@ -274,6 +275,73 @@ def test_histories_are_those_of_the_environment(name: str, policies) -> None:
     still = range(env.layout["ball_quaternion"].start + 1, env.layout["ball_quaternion"].stop)
     still = {*still, *range(*env.layout["ball_angular_velocity"].indices(env.layout.size))}
     assert set(range(env.layout.size)) - reached <= still
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: int) -> None:
+    """Random numbers of past values, and a ball on a made-up path over a moving paddle."""
+    rng = np.random.default_rng(seed)
+    lengths = {quantity.name: int(rng.integers(0, 5)) for quantity in QUANTITIES}
+    lengths["bounce_interval"] += 1
+    env = TrainConfig(env={"observation": lengths}).env
+    metadata = describe(TrainConfig(env=env), 0)
+    chain, times = Chain(metadata), np.arange(200) * env.control_dt
+    angles = np.array(env.default_joint_angles) + 0.05 * np.sin(times[:, None] * np.arange(3, 9))
+    paddle = np.array([chain.paddle_position(a) for a in angles])
+    ball = paddle + rng.normal(scale=0.01, size=paddle.shape)
+    ball[:, 2] += 0.4 * np.abs(np.sin(5.0 * times)) + 0.02
+    actions = rng.uniform(-1.0, 1.0, (200, 6))
+    truth = Kinematics(
+        joint_angles=angles,
+        ball_position=ball,
+        ball_quaternion=rng.normal(size=(200, 4)),
+        joint_velocities=rng.normal(size=(200, 6)),
+        ball_velocity=rng.normal(size=(200, 3)),
+        ball_angular_velocity=rng.normal(size=(200, 3)),
+        paddle_position=paddle,
+    )
+    targets, ages = rng.uniform(0.4, 0.6, (200, 1)), 0.03 - 0.0001 * np.arange(200)[:, None]
+    measured = truth._asdict() | {"target_height": targets, "action": actions, "ball_age": ages}
+    given = {name: values for name, values in measured.items() if name != "action"}
+
+    def at(i: int, values: dict) -> dict:
+        return {name: array[i] for name, array in values.items()}
+
+    @jax.jit
+    def remembered(memory, measured, near_height):
+        picture = memory.picture._replace(position=measured["ball_position"])
+        target = measured["target_height"][0]
+        return remember(memory, measured, picture, near_height, target, env.control_dt)
+
+    with jax.enable_x64(True):
+        start = Kinematics(*(jnp.asarray(values[0]) for values in truth))
+        memory = start_sensing(
+            env.randomization, env.observation, env.control_dt, start, jnp.asarray(targets[0, 0])
+        )
+        histories = Histories(metadata, at(0, given) | {"ball_age": np.zeros(1)})
+        for i in range(1, 200):
+            near_height = paddle[i, 2] + env.bounce_max_distance
+            memory = remembered(memory, at(i, measured), near_height)
+            histories.add(at(i, given), actions[i])
+            for name, values in memory.seen.items():
+                seen = histories.values[input_name(name)]
+                np.testing.assert_allclose(seen, values, atol=1e-9, err_msg=f"{name} at {i}")
+    # The ball came down three times at least.
+    intervals = histories.values["bounce_interval"]
+    assert np.count_nonzero(intervals) >= min(3, len(intervals))
+
+
+def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> None:
+    """Without the age of a picture, a picture is new where the ball has moved."""
+    observation = dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
+    observation |= {"ball_velocity": 1, "velocity": "differences"}
+    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
+    assert policy.needs == ("ball_position",)
+    speeds = []
+    for x in (0.0, 0.001, 0.001, 0.005, 0.005, 0.005, 0.002):
+        policy.step({"ball_position": [x, 0.0, 0.3]})
+        speeds.append(policy.observation[0])
+    np.testing.assert_allclose(speeds, [0.0, 0.1, 0.1, 0.2, 0.2, 0.2, -0.1], atol=1e-12)
 
 
 def measured_once() -> dict:
