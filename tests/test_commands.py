@@ -1,4 +1,4 @@
-"""The two commands: what they leave behind, and what they say to a mistake."""
+"""The commands: the files that they leave, and their answers to mistakes."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The five expected results: what is counted, how it is judged, and by which engine."""
+"""The five results: counting, judging, and both engines."""
 
 import functools
 import io

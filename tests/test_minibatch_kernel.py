@@ -140,7 +140,7 @@ def test_gradient_and_metrics_are_those_of_the_loss(interpret, monkeypatch):
 
 
 def test_shuffling_keeps_samples_together():
-    """Each sample's numbers stay together, and the minibatches are those of the order."""
+    """Each sample's numbers stay together, and the minibatches follow the order."""
     _, params = random_params(jax.random.PRNGKey(0))
     gradients = minibatch_kernel.kernel_gradients(CONFIG, NUM_ACTIONS, params)
     groups, size = 4, CONFIG.batch_steps // 4

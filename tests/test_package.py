@@ -1,4 +1,4 @@
-"""The wheel: what is in it, and that it works where there is no source checkout."""
+"""The wheel: its content, and that it works without a source checkout."""
 
 import os
 import shutil

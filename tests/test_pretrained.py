@@ -1,4 +1,4 @@
-"""The policy that comes with the package: what it promises, who takes it, and how it is made."""
+"""The shipped policy: its results, its users, and the command that ships it."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ LOG_DIR = TrainConfig().log_dir
 
 @pytest.fixture(scope="module")
 def shipped() -> dict:
-    """What results.json promises."""
+    """The results in results.json."""
     return json.loads((FOLDER / "results.json").read_text(encoding="utf-8"))
 
 

@@ -6,8 +6,8 @@
         results.json                    all evaluations, and where the time went
         checkpoints/latest/<steps>/     the newest state
         checkpoints/best/<steps>/       the state with the best evaluation
-            policy/                     what acting needs, written by orbax
-            training/                   what resuming needs, written by orbax; optional
+            policy/                     the policy, written by orbax
+            training/                   the training state, written by orbax; optional
             run.json                    the steps, the config, the evaluations so far
             manifest.json               size and SHA-256 of every other file
 
