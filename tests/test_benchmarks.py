@@ -1,4 +1,4 @@
-"""The comparison of the trainers on a tiny scale, and what it makes of its records."""
+"""The comparison of the trainers on a tiny scale, and the summary of its records."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A checkpoint is data, and is what was written: or it is refused in one sentence."""
+"""A checkpoint is plain data and loads unchanged, or one sentence refuses it."""
 
 import hashlib
 import json
@@ -117,7 +117,7 @@ def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingStat
 
 
 def mutate(step: Path, other: Path, draw: random.Random) -> str:
-    """Damages one file of a checkpoint; what was done."""
+    """Damages one file of a checkpoint, and names the damage."""
     files = sorted(p for p in step.rglob("*") if p.is_file())
     path = draw.choice(files)
     data = path.read_bytes()
@@ -148,7 +148,7 @@ def mutate(step: Path, other: Path, draw: random.Random) -> str:
 def test_damage_is_refused_or_does_no_harm(
     written: Path, tmp_path: Path, state: TrainingState
 ) -> None:
-    """200 mutations: what loads is bit for bit what was saved; all else is one sentence."""
+    """200 mutations: a checkpoint loads bit for bit as saved, or one sentence refuses it."""
     other_state = state._replace(params=jax.tree.map(lambda x: x + 1.0, state.params))
     other = step_of(write_run(tmp_path / "other", other_state))
     draw = random.Random(1)
@@ -213,7 +213,7 @@ def test_nothing_is_read_that_could_run(run: Path) -> None:
 
 
 class Payload:
-    """What pickle would run."""
+    """Code that pickle would run."""
 
     def __init__(self, target: Path):
         self.target = target

@@ -1,4 +1,4 @@
-"""The two commands: what they leave behind, and what they say to a mistake."""
+"""The commands: the files that they leave, and their answers to mistakes."""
 
 import json
 import re
@@ -423,7 +423,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
         value = result["value"]
         assert value is None or isinstance(value, float)
         figure = "none" if value is None else f"{value:.2f}"
-        assert f"{figure} │ {result['bound']}" in shown
+        assert f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown
 
 

@@ -43,7 +43,7 @@ def test_unknown_command(args: list[str], words: tuple[str, ...], capsys) -> Non
     assert re.fullmatch(r"error: .+\n", error) and all(word in error for word in words), error
 
 
-@pytest.mark.parametrize("name", ["eval", "play", "view", "plot", "report"])
+@pytest.mark.parametrize("name", ["eval", "play", "view", "plot", "report", "export"])
 def test_help_of_a_command_names_it(name: str, capsys) -> None:
     with pytest.raises(SystemExit) as exit_info:
         console_script.main([name, "--help"])

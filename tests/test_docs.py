@@ -1,4 +1,4 @@
-"""The documentation: links resolve, commands and flags exist, and what it quotes is true."""
+"""The documentation: links resolve, commands and flags exist, and quotations are true."""
 
 import ast
 import importlib

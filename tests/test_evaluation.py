@@ -1,8 +1,10 @@
-"""The five expected results: what is counted, how it is judged, and by which engine."""
+"""The five results: counting, judging, and both engines."""
 
 import functools
 import io
 import json
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -296,7 +298,7 @@ def test_nothing_to_measure_is_shown_as_none(env):
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     rows = show(results_table(report, "exp[lr]")).splitlines()
     assert "exp[lr]" in rows[0]
-    (row,) = [row for row in rows if " height " in row]
+    (row,) = [row for row in rows if row.startswith("height ")]
     assert "none" in row and "FAIL" in row
     (row,) = [row for row in results_markdown(report).splitlines() if "| height |" in row]
     assert row.split(" | ")[2:] == ["none", ">= 95", "FAIL |"]
@@ -304,7 +306,7 @@ def test_nothing_to_measure_is_shown_as_none(env):
 
     good = judge(env, statistics())
     rows = show(seeds_table({0: report, 1: good, 2: None})).splitlines()
-    cells = {row.split("│")[1].strip(): row for row in rows if row.count("│") == 10}
+    cells = {row.split()[0]: row for row in rows}
     assert cells["0"].count("none") == 2
     assert cells["1"].count("none") == 0
     # The seeds that have a figure do not speak for the one that has none.
@@ -313,10 +315,38 @@ def test_nothing_to_measure_is_shown_as_none(env):
 
 
 def show(table) -> str:
-    """A table as rich prints it."""
-    console = Console(width=150, file=io.StringIO())
+    """A table as rich prints it on a terminal of 80 columns."""
+    console = Console(width=80, file=io.StringIO())
     console.print(table)
     return console.file.getvalue()
+
+
+def test_a_result_has_one_line_of_80_columns(env):
+    report = judge(env, statistics())
+    rows = [row.rstrip() for row in show(results_table(report, "title")).splitlines()]
+    assert len(rows) == 2 + len(report.results)
+    for row, result in zip(rows[2:], report.results, strict=True):
+        assert row.startswith(result.name) and result.measured in row
+        assert row.endswith(f"{result.bound:10} pass") and len(row) <= 80
+
+
+def test_readme_shows_the_table_as_it_is_printed(env):
+    shown = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    table = re.search(r"(?m)^    result +measured.+\n(?:    \S.+\n)+", shown)[0]
+    values = [float(re.search(r" (\S+) (?:>=|0.1 to)", row)[1]) for row in table.split("\n")[1:-1]]
+    report = judge(env, statistics())
+    results = [r._replace(value=v) for r, v in zip(report.results, values, strict=True)]
+    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()[1:]
+    assert "".join(f"    {row.rstrip()}\n" for row in rows) == table
+
+
+def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
+    report = judge(env, statistics())
+    changed = {"bound": "0.1 to 1.5 (targets 0.4 only)", "passed": None}
+    results = [r._replace(**changed) if i == SPEED else r for i, r in enumerate(report.results)]
+    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
+    assert rows[2 + SPEED].split()[-4:] == ["0.1", "to", "1.5", "-"]
+    assert rows[-1].strip() == "upward speed: not judged (targets 0.4 only)"
 
 
 def test_fresh_statistics_fail_without_a_crash(env):

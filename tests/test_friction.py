@@ -197,7 +197,7 @@ def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property
     ]
     engine = make_engine(base, "fused")
     step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 1)))
-    contacts, drops, error = 0, 0, 0.0
+    contacts, drops, errors = 0, 0, np.zeros(count)
     for i in range(2000):
         if i % 10 == 0:
             action = rng.uniform(-0.03, 0.03, (count, 6))
@@ -213,11 +213,13 @@ def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property
         state = step(parameters, state, ctrl)
         for j, c in enumerate(reference):
             contacts += c.step(c_ctrl[j : j + 1], 1)
-        there = PhysicsState(
-            *(np.concatenate(x) for x in zip(*(c.state[:2] for c in reference), strict=True))
-        )
-        error = max(error, *difference(state, there))
-    record_property("largest_difference", error)
-    print(f"{cone}, 2,000 steps x {count}: {contacts} contacts, {drops} drops, {error:.1e}")
+        for j, c in enumerate(reference):
+            here = PhysicsState(*(x[j : j + 1] for x in state[:2]))
+            errors[j] = max(errors[j], *difference(here, c.state))
+    record_property("largest_difference", errors.max())
+    print(f"{cone}, 2,000 steps x {count}: {contacts} contacts, {drops} drops, {errors.max():.1e}")
     assert contacts >= 1000
-    assert error < 1e-6
+    # A bounce off an edge amplifies rounding: C from an arm turned by 1e-15 rad ends as far from C,
+    # 2e-8 in the worst of these worlds and 1e-10 in nine of ten.
+    assert np.quantile(errors, 0.9) < 1e-9
+    assert errors.max() < 1e-6

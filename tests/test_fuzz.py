@@ -52,7 +52,7 @@ def cases(number: int) -> Callable:
 
 
 def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
-    """What a command line gives; None for one that is refused in one sentence or asks for help."""
+    """The command of a command line; None where one sentence refuses it or it asks for help."""
     before = contents(folder)
     out, err = io.StringIO(), io.StringIO()
     try:

@@ -70,7 +70,9 @@ def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
     """Every number of the world given, the batch last; all environments share the gravity."""
     drawn = random_parameters(env.mj_model, batch, seed=0)
     drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
-    return drawn._replace(gravity=jnp.array([0.5, -0.5, -9.0]))
+    return drawn._replace(
+        gravity=jnp.array([0.5, -0.5, -9.0]), contact_friction=jnp.linspace(0.0, 1.0, batch)
+    )
 
 
 def in_worlds(env: BounceBall) -> Callable[..., PhysicsState]:

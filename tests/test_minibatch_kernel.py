@@ -36,7 +36,9 @@ def interpret():
 
 
 def random_params(key: jax.Array):
-    networks = make_networks(CONFIG, NUM_OBSERVATIONS, NUM_ACTIONS)
+    networks = make_networks(
+        CONFIG, NUM_OBSERVATIONS, NUM_ACTIONS, NUM_CRITIC_INPUTS - NUM_OBSERVATIONS
+    )
     params = networks.policy_network.init(key), networks.value_network.init(key)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))
@@ -138,7 +140,7 @@ def test_gradient_and_metrics_are_those_of_the_loss(interpret, monkeypatch):
 
 
 def test_shuffling_keeps_samples_together():
-    """Each sample's numbers stay together, and the minibatches are those of the order."""
+    """Each sample's numbers stay together, and the minibatches follow the order."""
     _, params = random_params(jax.random.PRNGKey(0))
     gradients = minibatch_kernel.kernel_gradients(CONFIG, NUM_ACTIONS, params)
     groups, size = 4, CONFIG.batch_steps // 4

@@ -49,7 +49,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path, name):
 
 
 def test_the_plain_model_moves_as_the_pictured_one():
-    """Without what is only there for pictures, in a fraction of the memory."""
+    """The model drops the parts for pictures, and takes a fraction of the memory."""
     pictured, plain = (load_model(None, 0.001, visual=visual) for visual in (True, False))
     assert mujoco.mj_sizeModel(plain) < 0.1 * mujoco.mj_sizeModel(pictured)
     after = []

@@ -1,4 +1,4 @@
-"""The wheel: what is in it, and that it works where there is no source checkout."""
+"""The wheel: its content, and that it works without a source checkout."""
 
 import os
 import shutil
@@ -66,7 +66,9 @@ print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
     )
-    assert done.stdout.splitlines() == ["False", "fused", "BounceBall EnvConfig"], done.stderr
+    assert done.stdout.splitlines() == ["False", "fused", "BounceBall EnvConfig load_policy"], (
+        done.stderr
+    )
 
 
 def test_trainer_needs_neither_brax_nor_mjx(tmp_path: Path) -> None:

@@ -211,7 +211,8 @@ def test_paddle_position_follows_its_parameter(mj_model):
 
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
-    """Filtered servos in random worlds, free-running over control steps, against C."""
+    """Filtered servos in random worlds with friction, free-running over control steps, against
+    C."""
     count, num_substeps = 4, 5
     model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     assert model.na == 6
@@ -221,6 +222,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
         *(jnp.asarray(x[:count]) for x in start[:2]), jnp.asarray(start.qpos[:count, :6])
     )
     parameters = random_parameters(model, count, seed=9)
+    parameters = parameters._replace(contact_friction=np.array([0.01, 0.1, 0.4, 1.0]))
     data = []
     for i in range(count):
         c_model = edited_model(model, world(parameters, i))

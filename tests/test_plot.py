@@ -1,4 +1,4 @@
-"""Learning curves, pictures, the report of a run, and what TensorBoard reads."""
+"""Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""The policy that comes with the package: what it promises, who takes it, and how it is made."""
+"""The shipped policy: its results, its users, and the command that ships it."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ LOG_DIR = TrainConfig().log_dir
 
 @pytest.fixture(scope="module")
 def shipped() -> dict:
-    """What results.json promises."""
+    """The results in results.json."""
     return json.loads((FOLDER / "results.json").read_text(encoding="utf-8"))
 
 
@@ -118,6 +118,8 @@ def test_shipping_keeps_the_policy(tmp_path: Path, measure, shipped: dict) -> No
     assert config == load_run_config(FOLDER)
     policies = (load_policy(best_checkpoint(run), config) for run in (out, FOLDER))
     jax.tree.map(np.testing.assert_array_equal, *policies)
+    onnx_file = f"{FOLDER.name}.onnx"
+    assert (out / onnx_file).read_bytes() == (FOLDER / onnx_file).read_bytes()
     made = json.loads((out / "results.json").read_text())
     assert made.keys() == shipped.keys()
     assert [made[key] for key in ("command", "seed", "device", "best_steps")] == [

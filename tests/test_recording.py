@@ -1,4 +1,4 @@
-"""Recordings of an evaluation's episodes: what they hold, and what is read off them."""
+"""Recordings of an evaluation's episodes: their content, and the figures from them."""
 
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,5 @@
-"""What a training survives: an end between any two steps, signals, full disks, numbers that are
-not finite. Going on leads to the very state of a training that nothing happened to."""
+"""A training survives an end between any two steps, signals, full disks and numbers that are not
+finite. The resumed training reaches the very state of an undisturbed one."""
 
 import concurrent.futures
 import contextlib

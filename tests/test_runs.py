@@ -1,4 +1,4 @@
-"""Files of a run that came from somewhere else: each is what it should be, or one sentence."""
+"""Files of a run from elsewhere: each is valid, or one sentence refuses it."""
 
 import concurrent.futures
 import json

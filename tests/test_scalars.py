@@ -85,11 +85,14 @@ def test_rows_hold_every_type():
         "float": jax.random.normal(jax.random.PRNGKey(0), (2, 3, 5)),
         "int": jnp.array([0, 1, -7, 2**31 - 1, -(2**31)], jnp.int32),
         "bool": jnp.array([[True, False, True, True, False]]),
+        "single": jnp.arange(5.0),
     }
-    rows = Rows(tree)
-    packed = rows.pack(tree)
-    assert packed.shape == (8, 5) and packed.dtype == jnp.float32
-    twice = rows.unpack(jnp.stack([packed, packed]))
+    numbers = {"float": jnp.float32(0.5), "int": jnp.int32(-7)}
+    assert Rows.of(numbers).tree() == numbers
+    packed = Rows.of(tree)
+    assert packed.rows.shape == (9, 5) and packed.rows.dtype == jnp.float32
+    _, stacked = jax.lax.scan(lambda carry, _: (carry, carry), packed, length=2)
+    twice = stacked.tree()
     for name, expected in tree.items():
         assert twice[name].dtype == expected.dtype
         np.testing.assert_array_equal(twice[name][1], expected)

@@ -347,7 +347,7 @@ def test_skrl_trainer_trains(learners):
 
 
 def test_skrl_bootstraps_time_outs_from_the_terminal_observations(learners):
-    """What its memory holds is the reward plus the discounted value of the old episode's end."""
+    """Its memory holds the reward plus the discounted value of the old episode's end."""
     learner, _ = learners["skrl"]
     agent, at = learner.agent, learner.agent.memory.memory_index
     learner.vector.clock = torch.full((PPO.num_envs,), EPISODE_STEPS - 1, dtype=torch.int32)
@@ -383,7 +383,7 @@ def test_gymnasium_vector_env_stays_on_the_device(env):
 
 
 def test_normalizer_is_that_of_jax():
-    """Over batches: the statistics and what they make of an observation, a constant one too."""
+    """Over batches: the statistics, and the normalised observation, also of a constant."""
     rng = np.random.default_rng(0)
     normalizer, statistics = Normalizer(3), init_statistics(3)
     for count in (5, 40, 7):

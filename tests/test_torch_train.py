@@ -1,4 +1,4 @@
-"""train_torch.py: what it leaves behind, and that the rest of the package can use it."""
+"""train_torch.py: its files, and that the rest of the package can use them."""
 
 import json
 import re

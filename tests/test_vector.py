@@ -1,4 +1,4 @@
-"""The batch: fresh resets, time-outs, and what a step reports at the end of an episode."""
+"""The batch: fresh resets, time-outs, and the report of a step that ends an episode."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What the viewers show: the simulated frames, the model's geometry, the clock, the recordings."""
+"""The viewers: the simulated frames, the model's geometry, the clock, the recordings."""
 
 import contextlib
 import io

@@ -57,7 +57,7 @@ class Job:
 
     @property
     def said(self) -> str:
-        """What the process has printed."""
+        """The output of the process so far."""
         return self._log.read_text()
 
     def wait_until_said(self, text: str, times: int = 1) -> None:

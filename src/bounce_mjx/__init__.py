@@ -5,16 +5,18 @@ from typing import TYPE_CHECKING, Any
 from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
 if TYPE_CHECKING:
+    from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.task.config import EnvConfig
     from bounce_mjx.task.env import BounceBall
 
-__all__ = ["BounceBall", "EnvConfig"]
+__all__ = ["BounceBall", "EnvConfig", "load_policy"]
 
 register_when_imported()
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the public classes on first use, as JAX takes two seconds to import (PEP 562)."""
+    """Imports the public names on first use, as JAX takes two seconds to import (PEP 562), and a
+    deployed policy does without it."""
     if name == "BounceBall":
         from bounce_mjx.task.env import BounceBall
 
@@ -23,6 +25,10 @@ def __getattr__(name: str) -> Any:
         from bounce_mjx.task.config import EnvConfig
 
         return EnvConfig
+    if name == "load_policy":
+        from bounce_mjx.deploy.loading import load_policy
+
+        return load_policy
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,4 +1,7 @@
-"""The console script: `bounce-mjx train|eval|robustness|play|view|plot|report|train-torch`."""
+"""The console script.
+
+`bounce-mjx train|eval|robustness|play|view|plot|report|export|train-torch`
+"""
 
 import contextlib
 import difflib
@@ -19,6 +22,7 @@ COMMANDS = {
     "view": "show the environment under random, zero or scripted actions",
     "plot": "draw the learning curves of runs, and an evaluation",
     "report": "write the report of a run, report.html",
+    "export": "write a trained policy as an ONNX file",
     "train-torch": "train with a PyTorch library",
 }
 _HELP = """usage: bounce-mjx COMMAND [ARGUMENTS]

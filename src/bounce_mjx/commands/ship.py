@@ -14,13 +14,14 @@ from rich.console import Console
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import DEFAULT_SEED
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.folders import PRETRAINED, find_checkpoint, save_config
+from bounce_mjx.runs.folders import PRETRAINED, best_checkpoint, find_checkpoint, save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.runs.writing import CheckpointWriter
@@ -50,7 +51,8 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def ship(run: Path, out: Path, console: Console) -> None:
-    """Evaluates the policy of a run, and writes it with its config and results to `out`.
+    """Evaluates the policy of a run, and writes it with its config, its results and its ONNX file
+    to `out`.
 
     Raises:
       UserError: there is no policy, it misses a result, or the folder cannot be written.
@@ -99,6 +101,8 @@ def ship(run: Path, out: Path, console: Console) -> None:
             writer.close()
             if writer.problem():
                 raise UserError(f"{writer.problem()}; free space or give another --out")
+            onnx_file = export_onnx(best_checkpoint(made))
+            (made / f"{PRETRAINED}.onnx").write_bytes(onnx_file)
             shutil.rmtree(out, ignore_errors=True)
             made.rename(out)
     except OSError as error:

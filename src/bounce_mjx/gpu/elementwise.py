@@ -17,9 +17,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.custom_partitioning import custom_partitioning
+from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.batches import batch_by, partition_by
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
@@ -42,8 +43,7 @@ def elementwise(
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
     """
 
-    @jax.custom_batching.custom_vmap
-    def call(*args: jax.Array) -> Arrays:
+    def on_batch(*args: jax.Array) -> Arrays:
         if args[0].ndim == 0:
             return function(*args)
         if interpret:
@@ -52,14 +52,7 @@ def elementwise(
             *args, cuda=lambda *args: in_kernel(function, num_results, args), default=function
         )
 
-    @call.def_vmap
-    def batched(axis_size: int, in_batched: list[bool], *args: jax.Array):
-        args = [
-            x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            for x, is_batched in zip(args, in_batched, strict=True)
-        ]
-        results = call(*args)
-        return results, (True,) * len(results)
+    call = batch_by(on_batch, lambda *args: call(*args))
 
     def chosen(*args: jax.Array) -> Arrays:
         float32 = all(x.dtype == jnp.float32 for x in args)
@@ -160,30 +153,14 @@ def in_kernel(
         flat = packed.reshape(rows, math.prod(batch))
         return _run_packed(function, flat, num_results, interpret).reshape(num_results, *batch)
 
-    packed = jnp.stack(args)
-    # On one device a partitioning would only keep the program out of the compilation cache.
-    results = run(packed) if jax.device_count() == 1 else _partitioned(run, packed)
+    def specs(packed: PartitionSpec) -> tuple[tuple[PartitionSpec], PartitionSpec]:
+        kept = PartitionSpec(None, *packed[1:])
+        return (kept,), kept
+
+    axes = " ".join(f"b{i}" for i in range(args[0].ndim))
+    rule = f"rows {axes} -> results {axes}"
+    results = partition_by(run, specs, rule, ("rows", "results"))(jnp.stack(args))
     return tuple(results[i] for i in range(num_results))
-
-
-def _partitioned(run: Callable[[jax.Array], jax.Array], packed: jax.Array) -> jax.Array:
-    """`run` on an array [rows, ...], the shards of which need nothing of each other."""
-    partitioned = custom_partitioning(run)
-
-    def partition(mesh, arg_shapes, result_shape):
-        del result_shape
-        spec = jax.sharding.PartitionSpec(None, *arg_shapes[0].sharding.spec[1:])
-        kept = jax.sharding.NamedSharding(mesh, spec)
-        return mesh, run, kept, (kept,)
-
-    axes = " ".join(f"b{i}" for i in range(packed.ndim - 1))
-    partitioned.def_partition(
-        partition=partition,
-        infer_sharding_from_operands=lambda mesh, args, _: args[0].sharding,
-        sharding_rule=f"rows {axes} -> results {axes}",
-        need_replication_factors=("rows", "results"),
-    )
-    return partitioned(packed)
 
 
 def _run_packed(

@@ -1,52 +1,57 @@
 """Many arrays of one batch as the rows of one array, as on a GPU each array that a loop carries
 costs a kernel an iteration."""
 
+import dataclasses
+import functools
 import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.elementwise import KERNEL_TYPES, from_float, to_float
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["structure", "types"]
+)
+@dataclasses.dataclass(frozen=True)
 class Rows:
-    """A form of a pytree of arrays [..., B]: an array of rows [R, B], float32."""
+    """A pytree of numbers, or of arrays [..., B], in one array; a loop may carry it."""
 
-    def __init__(self, example: Any):
-        """
-        Args:
-          example: the pytree, or its shapes; float32, int32 and bool.
-        """
-        self._leaves, self._tree = jax.tree.flatten(example)
-        unknown = {x.dtype for x in self._leaves} - KERNEL_TYPES
+    rows: jax.Array
+    """The numbers [R, B] of the pytree, float32. A number on its own is an array [1]."""
+    structure: Any
+    types: tuple[tuple[tuple[int, ...], jnp.dtype], ...]
+    """Shape and type of each array of the pytree."""
+
+    @classmethod
+    def of(cls, tree: Any) -> "Rows":
+        """Packs a pytree of float32, int32 and bool."""
+        leaves, structure = jax.tree.flatten(tree)
+        unknown = {x.dtype for x in leaves} - KERNEL_TYPES
         if unknown:
             raise TypeError(f"rows hold {', '.join(map(str, KERNEL_TYPES))}, but not {unknown}")
+        rows = [to_float(x).reshape(-1, x.shape[-1] if x.ndim else 1) for x in leaves]
+        return cls(jnp.concatenate(rows), structure, tuple((x.shape, x.dtype) for x in leaves))
 
-    def pack(self, tree: Any) -> jax.Array:
-        """The rows [R, B] of a pytree."""
-        leaves = self._tree.flatten_up_to(tree)
-        return jnp.concatenate([to_float(x).reshape(-1, x.shape[-1]) for x in leaves])
-
-    def unpack(self, rows: jax.Array) -> Any:
-        """The pytree of rows [..., R, B]; further axes come first in each array."""
+    def tree(self) -> Any:
+        """The pytree; axes that a loop has put in front of the rows come first in each array."""
         arrays, start = [], 0
-        for leaf in self._leaves:
-            stop = start + math.prod(leaf.shape[:-1])
-            shape = (*rows.shape[:-2], *leaf.shape[:-1], rows.shape[-1])
-            arrays.append(from_float(rows[..., start:stop, :].reshape(shape), leaf.dtype))
+        for shape, dtype in self.types:
+            stop = start + math.prod(shape[:-1])
+            array = self.rows[..., start:stop, :].reshape(*self.rows.shape[:-2], *shape)
+            arrays.append(from_float(array, dtype))
             start = stop
-        return self._tree.unflatten(arrays)
+        return self.structure.unflatten(arrays)
 
 
-class Unpacked:
-    """The pytree as it is."""
+def pack(tree: Any) -> Any:
+    """The pytree as `Rows` where the package's GPU kernels run, else as it is."""
+    return Rows.of(tree) if has_kernels() else tree
 
-    def __init__(self, example: Any):
-        del example
 
-    def pack(self, tree: Any) -> Any:
-        return tree
-
-    def unpack(self, tree: Any) -> Any:
-        return tree
+def unpack(packed: Any) -> Any:
+    """The pytree that was packed."""
+    return packed.tree() if isinstance(packed, Rows) else packed

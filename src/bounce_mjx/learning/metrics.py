@@ -1,8 +1,6 @@
 """Metrics of a rollout: means over its steps and over the episodes that ended in it."""
 
-import dataclasses
 import fnmatch
-import functools
 from collections.abc import Iterable, Sequence
 
 import jax
@@ -15,25 +13,6 @@ Metrics = dict[str, jax.Array]
 
 PRIVILEGED = ("world/", "true/")
 """Beginnings of the names of metrics that are there for a critic alone."""
-
-
-@functools.partial(jax.tree_util.register_dataclass, data_fields=["columns"], meta_fields=["names"])
-@dataclasses.dataclass(frozen=True)
-class Packed:
-    """Metrics in one array, as on a GPU each small array of a loop costs a kernel."""
-
-    names: tuple[str, ...]
-    columns: jax.Array
-    """The metrics in the order of their names [..., M]."""
-
-    @classmethod
-    def of(cls, metrics: Metrics) -> "Packed":
-        """Packs metrics of one shape [...]."""
-        return cls(tuple(metrics), jnp.stack(list(metrics.values()), axis=-1))
-
-    def metrics(self) -> Metrics:
-        """The metrics, each [...]."""
-        return dict(zip(self.names, jnp.moveaxis(self.columns, -1, 0), strict=True))
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:

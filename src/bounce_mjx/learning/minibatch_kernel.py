@@ -11,14 +11,15 @@ sizes that tensor cores take, and the bias of the first layer belongs to an inpu
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.custom_partitioning import custom_partitioning
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import PartitionSpec
 
+from bounce_mjx.gpu.batches import batch_by, partition_by
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gradients import MinibatchGradients
 
@@ -194,23 +195,14 @@ def loss_gradient(
 def _batched_call(config: PPOConfig, num_actions: int, interpret: Any):
     """The kernel as a function that `jax.vmap` may batch, as of several seeds."""
 
-    @jax.custom_batching.custom_vmap
-    def call(*args: jax.Array):
-        return tuple(x[0] for x in _call(config, num_actions, interpret, [x[None] for x in args]))
+    def batched(*args: jax.Array) -> tuple[jax.Array, ...]:
+        return _call(config, num_actions, interpret, args)
 
-    @call.def_vmap
-    def batched(axis_size: int, in_batched: list[bool], *args: jax.Array):
-        args = [
-            x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            for x, is_batched in zip(args, in_batched, strict=True)
-        ]
-        return tuple(_call(config, num_actions, interpret, args)), (True,) * 3
-
-    return call
+    return batch_by(lambda *args: tuple(x[0] for x in batched(*(x[None] for x in args))), batched)
 
 
 def _call(
-    config: PPOConfig, num_actions: int, interpret: Any, args: list[jax.Array]
+    config: PPOConfig, num_actions: int, interpret: Any, args: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
     """The kernel on several devices, each with its samples of every minibatch."""
     num_samples = args[0].shape[2]
@@ -218,31 +210,17 @@ def _call(
     def run(*args: jax.Array) -> tuple[jax.Array, ...]:
         return _run(config, num_actions, interpret, num_samples, *args)
 
-    if jax.device_count() == 1:
-        return run(*args)
-    partitioned = custom_partitioning(run)
+    def specs(inputs: PartitionSpec) -> tuple[tuple[PartitionSpec, ...], ...]:
+        axis = inputs[2] if len(inputs) > 2 else None
+        samples, whole = PartitionSpec(None, None, axis), PartitionSpec()
+        arguments = (samples, samples, PartitionSpec(None, None, None, axis), *[whole] * 4)
+        return arguments, (samples,) * 3
 
-    def partition(mesh, arg_shapes, result_shape):
-        del result_shape
-        axis = arg_shapes[0].sharding.spec[2] if len(arg_shapes[0].sharding.spec) > 2 else None
-
-        def sharding(*spec) -> NamedSharding:
-            return NamedSharding(mesh, PartitionSpec(*spec))
-
-        samples = sharding(None, None, axis)
-        kept = (samples, samples, sharding(None, None, None, axis), *[sharding()] * 4)
-        return mesh, run, (sharding(None, None, axis),) * 3, kept
-
-    partitioned.def_partition(
-        partition=partition,
-        sharding_rule=(
-            "s m (t i) d, s m (t i) a, s m r (t i), s k h w, s k o a, s k o a, s -> "
-            "s k t h w, s k t o a, s k t e"
-        ),
-        i=TILE,
-        need_replication_factors=("s", "m", "i", "d", "a", "r", "k", "h", "w", "o", "e"),
+    rule = (
+        "s m (t i) d, s m (t i) a, s m r (t i), s k h w, s k o a, s k o a, s -> "
+        "s k t h w, s k t o a, s k t e"
     )
-    return partitioned(*args)
+    return partition_by(run, specs, rule, tuple("smidarkhwoe"), i=TILE)(*args)
 
 
 def _run(

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.rows import Rows, Unpacked
+from bounce_mjx.gpu.rows import pack, unpack
 from bounce_mjx.learning import minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
@@ -23,7 +23,6 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.gradients import MinibatchGradients
 from bounce_mjx.learning.metrics import (
     Metrics,
-    Packed,
     matching_metrics,
     rollout_metrics,
     step_metrics,
@@ -159,7 +158,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
     )
 
-    loop_form = Rows if has_kernels() else Unpacked
     casts = config.compute_dtype != "float32"
 
     def cast_inputs(inputs: jax.Array) -> jax.Array:
@@ -215,10 +213,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         params, normalizer = cast_params(state.params), state.statistics.normalizer
 
         first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
-        carry_form = loop_form((state.env, first_inputs.T))
 
         def one_step(carry, draws):
-            env_state, timeout_inputs = carry_form.unpack(carry)
+            env_state, timeout_inputs = unpack(carry)
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
             distribution = policy_apply(params, cast_inputs(normalize(raw_inputs, normalizer)))
@@ -237,10 +234,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
-            step_forms.append(loop_form(step_of_rollout))
-            metrics = Packed.of(step_metrics(result, groups))
-            carry = carry_form.pack((env_state, timeout_inputs))
-            return carry, (step_forms[-1].pack(step_of_rollout), metrics)
+            metrics = step_metrics(result, groups)
+            return pack((env_state, timeout_inputs)), (pack(step_of_rollout), pack(metrics))
 
         # An environment times out at most once in a rollout, as no episode is shorter than it.
         noise_key, reset_key = jax.random.split(key)
@@ -251,11 +246,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
         )
-        step_forms: list = []
-        carry = carry_form.pack((state.env, first_inputs.T))
+        carry = pack((state.env, first_inputs.T))
         carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, fresh))
-        env_state, timeout_inputs = carry_form.unpack(carry)
-        steps = step_forms[-1].unpack(steps)
+        env_state, timeout_inputs = unpack(carry)
+        steps = unpack(steps)
         raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)
         rollout = Rollout(
             inputs=normalize(raw_inputs, normalizer),
@@ -274,7 +268,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             last_inputs=normalize(last_inputs, normalizer),
             timeout_inputs=normalize(timeout_inputs.T, normalizer),
         )
-        return collection, rollout_metrics(metrics.metrics())
+        return collection, rollout_metrics(unpack(metrics))
 
     def prepare(params: Params, collection: Collection) -> Samples:
         """Computes values and advantages of the rollout, and groups its samples."""
@@ -369,7 +363,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 )
                 squares = [jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradient)]
                 metrics["loss/gradient_norm"] = jnp.sqrt(sum(squares))
-                return (params, optimizer_state, learning_rate), Packed.of(metrics)
+                return (params, optimizer_state, learning_rate), pack(metrics)
 
             return jax.lax.scan(step, carry, minibatches)
 
@@ -378,7 +372,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
         )
         carry = (gradients.pack(state.params), moments, state.learning_rate)
-        (params, moments, learning_rate), packed = jax.lax.scan(
+        (params, moments, learning_rate), metrics = jax.lax.scan(
             epoch, carry, jax.random.split(key, config.num_epochs)
         )
         optimizer_state = jax.tree.map(
@@ -386,7 +380,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             state.optimizer,
             moments,
         )
-        metrics = packed.metrics()
+        metrics = unpack(metrics)
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
         return (gradients.unpack(params), optimizer_state, learning_rate), means, metrics

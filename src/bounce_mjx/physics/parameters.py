@@ -13,6 +13,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
 
 Array = np.ndarray | jax.Array
+# MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
+MIN_FRICTION = 1e-5
 
 
 class PhysicsParameters(NamedTuple):
@@ -138,7 +140,9 @@ def edited_fields(
     if p.contact_friction is not None:
         pair = _contact_pair(m)
         put("pair_dim", pair, max(3, int(m.pair_dim[pair])))
-        put("pair_friction", (pair, slice(0, 2)), p.contact_friction)
+        numpy = jnp if isinstance(p.contact_friction, jax.Array) else np
+        friction = numpy.maximum(p.contact_friction, MIN_FRICTION)
+        put("pair_friction", (pair, slice(0, 2)), friction)
     if p.servo_gain is not None:
         put("actuator_gainprm", (servos, 0), p.servo_gain)
         put("actuator_biasprm", (servos, 1), -p.servo_gain)

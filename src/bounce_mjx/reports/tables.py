@@ -12,26 +12,28 @@ def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit
     return "none" if value is None else f"{scale * value:{spec}}{unit}"
 
 
+def _plain_table(title: str) -> Table:
+    """A table without lines, so that the five results fit into 80 columns."""
+    return Table(
+        title=escape(title), title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
+    )
+
+
 def results_table(report: Report, title: str) -> Table:
     """The five results as a table."""
-    table = Table(title=escape(title), title_justify="left")
-    for column, justify in (
-        ("result", "left"),
-        ("measured", "left"),
-        ("value", "right"),
-        ("bound", "left"),
-        ("", "left"),
-    ):
-        table.add_column(column, justify=justify)
+    table = _plain_table(title)
+    for column in ("result", "measured"):
+        table.add_column(column)
+    table.add_column("value", justify="right")
+    table.add_column("bound")
+    table.add_column()
     for result in report.results:
-        colour = {True: "[green]", False: "[red]", None: ""}[result.passed]
-        table.add_row(
-            result.name,
-            result.measured,
-            figure_text(result.value),
-            result.bound,
-            colour + verdict(result),
-        )
+        bound, _, condition = result.bound.partition(" (")
+        if result.passed is None:
+            table.caption = f"{result.name}: {verdict(result)} ({condition}"
+            table.caption_justify = "left"
+        colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
+        table.add_row(result.name, result.measured, figure_text(result.value), bound, colour)
     return table
 
 
@@ -43,7 +45,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
       reports: by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
-    table = Table(title="best checkpoint of each seed", title_justify="left")
+    table = _plain_table("best checkpoint of each seed")
     table.add_column("seed", justify="right")
     for result in known[0].results:
         table.add_column(result.name.split()[0], justify="right")

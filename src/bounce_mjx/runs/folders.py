@@ -6,8 +6,8 @@
         results.json                    all evaluations, and where the time went
         checkpoints/latest/<steps>/     the newest state
         checkpoints/best/<steps>/       the state with the best evaluation
-            policy/                     what acting needs, written by orbax
-            training/                   what resuming needs, written by orbax; optional
+            policy/                     the policy, written by orbax
+            training/                   the training state, written by orbax; optional
             run.json                    the steps, the config, the evaluations so far
             manifest.json               size and SHA-256 of every other file
 
@@ -163,9 +163,12 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     """The checkpoint to show or to evaluate; prints the choice where the user made none.
 
     Args:
-      path: see `find_checkpoint`. Where it is None and the default folder of runs is empty, the
-        choice is the checkpoint that comes with the package.
+      path: see `find_checkpoint`; or `PRETRAINED`, the checkpoint that comes with the package,
+        unless there is a folder of that name. Where it is None and the default folder of runs is
+        empty, the choice is the checkpoint that comes with the package.
     """
+    if path == Path(PRETRAINED) and not path.is_dir():
+        return pretrained_checkpoint()
     if path is not None:
         return find_checkpoint(path, log_dir)
     try:

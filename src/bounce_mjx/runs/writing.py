@@ -69,7 +69,7 @@ class CheckpointWriter:
         self.retry()
 
     def retry(self) -> None:
-        """Starts to save what could not be saved."""
+        """Starts to save again after a failed save."""
         self._writing = self._pool.submit(self._write)
 
     def problem(self, wait: bool = True) -> str | None:
@@ -166,7 +166,7 @@ def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Removes what a killed process left incomplete in a folder of checkpoints."""
+    """Removes the incomplete checkpoints that a killed process left in a folder."""
     complete = stored_checkpoints(folder).values()
     for path in folder.glob("*"):
         if path.name.endswith(PARTIAL) and path in complete:

@@ -88,7 +88,7 @@ def train(
     resume: Path | None = None,
     report: bool = True,
 ) -> list[Outcome]:
-    """Trains as the config says; an outcome of each seed.
+    """Trains by the config, and returns an outcome for each seed.
 
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
@@ -115,7 +115,7 @@ def train(
 
 @dataclasses.dataclass
 class _Member:
-    """One seed of a training."""
+    """One seed of the training."""
 
     run: Path
     """Folder of its best checkpoint and its log; with one seed, the run's folder itself."""
@@ -184,7 +184,7 @@ class _Job:
         return f"go on with: {self.command} --resume {shlex.quote(str(self.run))}"
 
     def _advice(self) -> str:
-        """How to go on after the death of a process."""
+        """The advice after the death of a process."""
         try:
             latest = latest_checkpoint(self.run) if self.run else None
         except UserError:
@@ -213,7 +213,7 @@ class _Job:
         return list(zip(seed_folders(self.run, seeds), alone, strict=True))
 
     def _lock(self) -> None:
-        """Takes the run's folder for this training; a refusal ends all processes."""
+        """Locks the run's folder for this training; a refusal ends all processes."""
         refusal = ""
         if hosts.is_leader():
             try:
@@ -240,7 +240,7 @@ class _Job:
             _write_config(self.run, self.config)
 
     def compile(self, report: bool) -> None:
-        """Compiles the programs; logs are opened and modules imported meanwhile."""
+        """Compiles the programs, and meanwhile opens logs and imports modules."""
         with self.console.status("compiling"):
             compiling = self.pool.submit(self._compile, report)
             if not self.stop.wait_for(compiling):
@@ -290,7 +290,7 @@ class _Job:
         return [open_log(m.run, first_step, config=m.config) for m in self.members]
 
     def train(self) -> None:
-        """Trains until all is done, or a stop is requested."""
+        """Trains until the last step, or until a stop is requested."""
         for i, member in enumerate(self.members):
             missing = member.progress.best_steps == self.steps > 0 and not has_checkpoint(
                 member.run, "best", self.steps
@@ -309,7 +309,7 @@ class _Job:
             self._run_block()
 
     def finish(self) -> None:
-        """Waits until all is saved, and evaluates the best policy on fresh resets.
+        """Waits until everything is saved, and evaluates the best policy on fresh resets.
 
         Raises:
           TrainingStopped: a stop was requested.
@@ -326,7 +326,7 @@ class _Job:
         hosts.disconnect()
 
     def outcomes(self) -> list[Outcome]:
-        """What became of each seed."""
+        """The outcome of each seed."""
         return [
             Outcome(
                 m.run,
@@ -385,7 +385,7 @@ class _Job:
             for member in self.members
             if member.progress.best is not None
         ]
-        # The place of a seed that diverged before its first evaluation is filled by another's.
+        # Another seed's policy takes the place of one that diverged before its first evaluation.
         filled = iter(policies)
         policies = [
             policies[0] if member.progress.best is None else next(filled) for member in self.members
@@ -440,7 +440,7 @@ class _Job:
         self.clock.lap("train")
 
     def _check_faults(self, faults: np.ndarray) -> None:
-        """Ends a training that diverged, as its state is worth nothing any more; of several seeds,
+        """Ends a training that diverged, as its state is worthless; of several seeds,
         the others go on.
 
         Args:
@@ -477,7 +477,7 @@ class _Job:
           snapshot: the latest state, if it is at hand.
         """
         policy, state = snapshot or self.trainer.snapshot()
-        # A second signal may end the process: the log must not lack what the checkpoint holds.
+        # A second signal may end the process: the log must hold every step of the checkpoint.
         self.reporter.flush()
         several = self.config.num_seeds > 1
         library = {"library": self.trainer.library}
@@ -499,7 +499,7 @@ class _Job:
         self.clock.lap("save")
 
     def _of_seed(self, tree: Tree, index: int) -> Tree:
-        """The part of one seed in a policy or a state."""
+        """One seed's part of a policy or a state."""
         return tree if self.config.num_seeds == 1 else jax.tree.map(lambda x: x[index], tree)
 
     def _results(self, member: _Member) -> dict[str, Any] | None:
@@ -517,7 +517,7 @@ class _Job:
 
 
 def check_library(checkpoint: Checkpoint, library: str) -> None:
-    """Compares the library that began a run with the one that is to go on.
+    """Compares the library that began a run with the library that resumes it.
 
     Raises:
       UserError: they differ, or the checkpoint is damaged.
@@ -543,7 +543,7 @@ def library_of(checkpoint: Checkpoint) -> str:
 def _wait_until_saved(
     writers: Sequence[CheckpointWriter], reporter: Reporter, stop: StopRequest
 ) -> None:
-    """Keeps the process, and with it the training's state, until the state is on the disk."""
+    """Keeps the process, and so the training's state, until the state is on the disk."""
     stopping = stop.requested
     for writer in writers:
         while (problem := writer.problem()) is not None:
@@ -569,12 +569,12 @@ def _write_config(run: Path, config: TrainConfig) -> None:
 
 
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> Progress:
-    """The evaluations from which a seed goes on."""
+    """The evaluations of a seed before it is resumed."""
     progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
         return progress
-    # The best checkpoint itself knows best what it holds: it may be older than the latest one
-    # says, or newer, where the process was killed between the two.
+    # The best checkpoint's own record counts: it may be older or newer than the latest
+    # checkpoint says, if the process was killed between the two saves.
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = best_checkpoint(run)

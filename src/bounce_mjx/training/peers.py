@@ -1,4 +1,4 @@
-"""The connection between the processes of one training, beside JAX's own.
+"""The connection between the processes of one training, apart from JAX's own.
 
 Process 0 holds a socket to every other process. Three things go over them: values that all
 processes exchange, heartbeats, and the news that a process has died. JAX notices a death too, but

@@ -76,7 +76,7 @@ class PPOTrainer:
         return Snapshot(policy_of(state, self._observation_size), state)
 
     def _initial_state(self, seeds: jax.Array) -> TrainingState:
-        """The first state of the training of a seed [], or of those of several [S]."""
+        """The first training state of one seed [] or of S seeds [S]."""
         key = jax.random.PRNGKey
         return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
 

@@ -18,13 +18,11 @@ from bounce_mjx.physics.fused.scalars import (
     scale,
 )
 from bounce_mjx.physics.fused.support import check_supported
-from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
 from bounce_mjx.robot.model import Addresses, find_addresses
 
 # MuJoCo's mjMINVAL.
 _MIN_VALUE = 1e-15
-# MuJoCo's mjMINMU, the least coefficient of friction that its engine computes with.
-_MIN_FRICTION = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +109,7 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
         contact = dataclasses.replace(contact, radius=p.ball_radius)
         ball_inertia = mul(ball_inertia, mul(ratio, ratio))
     if p.contact_friction is not None:
-        friction = jnp.maximum(p.contact_friction, _MIN_FRICTION)
+        friction = jnp.maximum(p.contact_friction, MIN_FRICTION)
         contact = dataclasses.replace(contact, friction=(friction, friction))
     # The direct format of solref, scaled by the impedance as MuJoCo does.
     max_impedance = contact.solimp[1]
@@ -230,7 +228,7 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
         stiffness, damping = -solref[0] / dmax**2, -solref[1] / dmax
     power = max(1.0, float(solimp[4]))
     frictional = mj_model.pair_dim[0] > 1
-    friction = np.maximum(mj_model.pair_friction[0, :2], _MIN_FRICTION)
+    friction = np.maximum(mj_model.pair_friction[0, :2], MIN_FRICTION)
     elliptic = mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     paddle_body = mj_model.geom_bodyid[addresses.paddle_geom]
     weights = mj_model.body_invweight0

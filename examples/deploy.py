@@ -1,0 +1,80 @@
+"""A policy in the control loop of a robot; here a simulated one, with a late and noisy camera.
+
+`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX.
+"""
+
+import argparse
+
+import mujoco
+import numpy as np
+
+from bounce_mjx import load_policy
+from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.resources import resource_path
+
+
+class Camera:
+    """Pictures of the ball: their rate (Hz), noise (m) and delay (s)."""
+
+    def __init__(self, rate: float = 120.0, noise: float = 0.002, delay: float = 0.020):
+        self.rate, self.noise, self.delay = rate, noise, delay
+        self.random = np.random.default_rng(0)
+        self.pictures: list[tuple[float, np.ndarray]] = []
+
+    def look(self, time: float, ball: np.ndarray) -> None:
+        """Takes a picture of the ball if one is due."""
+        if time * self.rate > len(self.pictures) - 1e-6:
+            self.pictures.append((time, ball + self.noise * self.random.standard_normal(3)))
+
+    def measure(self, time: float) -> dict:
+        """The newest picture that has arrived, and the velocity by the last two."""
+        arrived = [p for p in self.pictures if p[0] < time - self.delay + 1e-6]
+        taken, position = arrived[-1] if arrived else self.pictures[0]
+        velocity = np.zeros(3)
+        if len(arrived) > 1:
+            velocity = (position - arrived[-2][1]) / (taken - arrived[-2][0])
+        return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
+
+
+def simulate(policy, camera: Camera, seconds: float, target_height: float) -> tuple[int, float]:
+    """The number of bounces, and the time (s) until the ball is lost."""
+    model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+    data = mujoco.MjData(model)
+    joints = [data.joint(name) for name in policy.metadata.joint_names]
+    ball = data.joint("ball_link")
+    for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
+        joint.qpos = angle
+    control_steps = round(policy.metadata.control_dt / model.opt.timestep)
+    bounces, falling = 0, False
+    policy.reset()
+    for step in range(round(seconds / model.opt.timestep)):
+        camera.look(data.time, ball.qpos[:3])
+        if step % control_steps == 0:
+            action = policy.step(
+                {
+                    "joint_angles": [joint.qpos[0] for joint in joints],
+                    "joint_velocities": [joint.qvel[0] for joint in joints],
+                    "target_height": target_height,
+                    "time": data.time,
+                    **camera.measure(data.time),
+                }
+            )
+            data.ctrl[:] = policy.servo_targets(action)
+        mujoco.mj_step(model, data)
+        bounces += falling and ball.qvel[2] > 0.0
+        falling = ball.qvel[2] < 0.0
+        if ball.qpos[2] < 0.05 or np.any(np.abs(ball.qpos[:2]) > 1.5):
+            break
+    return int(bounces), data.time
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("policy", nargs="?", default="pretrained", help="name, file or run")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--target-height", type=float, default=0.5, help="m")
+    given = parser.parse_args()
+    with exit_on_user_error():
+        robot = load_policy(given.policy)
+        count, survived = simulate(robot, Camera(), given.seconds, given.target_height)
+        print(f"{count} bounces in {survived:.1f} s of {given.seconds:g} s")

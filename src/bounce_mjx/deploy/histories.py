@@ -1,0 +1,129 @@
+"""The observation from the measurements of each control step: the NumPy twin of `task/sensing.py`.
+
+`remember` there is the reference for every history, and a test compares the two.
+"""
+
+import numpy as np
+
+from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.metadata import Metadata
+
+Measurements = dict[str, np.ndarray]
+
+# The quantities that have a value for each bounce, by the moment of it.
+OF_FLIGHT = frozenset(("apex_error", "bounce_interval"))
+OF_LOWEST = frozenset(("bounce_position", "bounce_joint_angles", "bounce_joint_velocities"))
+OF_BOUNCES = OF_FLIGHT | OF_LOWEST
+
+# A picture counts as another one if it was taken later by more than this, s.
+_SAME_PICTURE = 1e-4
+# Shortest time between two pictures in a difference quotient, s.
+_SHORTEST = 1e-3
+
+
+class Histories:
+    """The last values of each observed quantity.
+
+    The measurements of a step are those that the policy needs: `joint_angles` [J],
+    `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `target_height` [1],
+    `ball_age` [1], and so on; units m, rad and s.
+    """
+
+    def __init__(self, metadata: Metadata, measured: Measurements):
+        """The past of the first control step is as its present."""
+        self._metadata = metadata
+        self._ball = measured.get("ball_position", np.zeros(3))
+        self._ball_velocity = np.zeros(3)
+        self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
+        height = self._ball[2]
+        self._flight_apex, self._lowest = height, height
+        self._is_low = False
+        self._flight_time = 0.0
+        zero, joints = np.zeros(1), np.zeros(len(metadata.joint_names))
+        angles = measured.get("joint_angles", joints)
+        start = {
+            "past_actions": joints,
+            "ball_age": np.array([self._age]),
+            "ball_velocity": self._ball_velocity,
+            "apex_error": zero,
+            "bounce_position": self._ball[:2],
+            "bounce_interval": zero,
+            "bounce_joint_angles": angles,
+            "bounce_joint_velocities": measured.get("joint_velocities", joints),
+            "paddle_position": paddle_position(metadata, angles),
+        } | measured
+        self.values = {
+            part.name: np.tile(start[part.name], (part.history, 1)) for part in metadata.observation
+        }
+        """The last values of each quantity [history, size], the newest first."""
+
+    def add(self, measured: Measurements, action: np.ndarray) -> None:
+        """Adds the measurements of the next control step, before which the action [J] was taken."""
+        metadata = self._metadata
+        angles = measured.get("joint_angles")
+        paddle = np.zeros(3) if angles is None else paddle_position(metadata, angles)
+        measured = measured | {"past_actions": action, "paddle_position": paddle}
+        if "ball_position" in measured:
+            measured |= self._picture(measured)
+        bounces = self._bounces(measured, paddle[2] + metadata.bounce_max_distance)
+        for name, past in self.values.items():
+            if name not in OF_BOUNCES:
+                past[1:] = past[:-1].copy()
+                past[0] = measured[name]
+            elif name in bounces:
+                starts, value = bounces[name]
+                if starts:
+                    past[1:] = past[:-1].copy()
+                past[0] = value
+
+    def _picture(self, measured: Measurements) -> Measurements:
+        """Age of the ball's picture, and the velocity by the last two pictures if the policy wants
+        it. Where the age is not measured, a picture is new as soon as the position differs."""
+        held_age = self._age + self._metadata.control_dt
+        position = measured["ball_position"]
+        if "ball_age" in measured:
+            age = float(measured["ball_age"][0])
+            is_new = held_age - age > _SAME_PICTURE
+        else:
+            is_new = bool(np.any(position != self._ball))
+            age = 0.0 if is_new else held_age
+        if is_new:
+            elapsed = max(held_age - age, _SHORTEST)
+            self._ball_velocity = (position - self._ball) / elapsed
+            self._ball = position
+        self._age = age
+        if self._metadata.velocity == "differences":
+            return {"ball_velocity": self._ball_velocity}
+        return {}
+
+    def _bounces(
+        self, measured: Measurements, near_height: float
+    ) -> dict[str, tuple[bool, np.ndarray]]:
+        """The quantities of bounces that change: whether a bounce starts, and the value.
+
+        A bounce starts when the ball is first measured near the paddle, and its values are those of
+        the ball's lowest measured point.
+        """
+        if not OF_BOUNCES & self.values.keys():
+            return {}
+        ball = measured["ball_position"]
+        height = ball[2]
+        is_low = bool(height < near_height)
+        starts = is_low and not self._is_low
+        at_lowest = starts or (is_low and height < self._lowest)
+        flight_time = self._flight_time + self._metadata.control_dt
+        changed = {}
+        if starts:
+            changed["bounce_interval"] = starts, np.array([flight_time])
+            if "target_height" in measured:
+                changed["apex_error"] = starts, self._flight_apex - measured["target_height"]
+        if at_lowest:
+            changed["bounce_position"] = starts, ball[:2]
+            for name in ("joint_angles", "joint_velocities"):
+                if name in measured:
+                    changed[f"bounce_{name}"] = starts, measured[name]
+            self._lowest = height
+        self._flight_apex = height if is_low else max(self._flight_apex, height)
+        self._is_low = is_low
+        self._flight_time = 0.0 if starts else flight_time
+        return changed

@@ -1,0 +1,55 @@
+"""`load_policy`: a policy by its name, from an ONNX file, or from a run."""
+
+import os
+from pathlib import Path
+
+from bounce_mjx.deploy.policy import DeployedPolicy
+from bounce_mjx.errors import UserError
+from bounce_mjx.resources import resource_path
+
+NAMES = ("robust", "pretrained")
+"""Policies of the package, as `pretrained/<name>.onnx`."""
+
+
+def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
+    """Loads a policy that runs without JAX.
+
+    Args:
+      policy: "robust" or "pretrained", the policies of the package; a `.onnx` file that
+        `bounce-mjx export` wrote; or a run's folder or a checkpoint in it, which needs JAX to be
+        exported first.
+
+    Raises:
+      UserError: there is no such policy, or the file is damaged.
+    """
+    if policy in NAMES:
+        path = resource_path(f"pretrained/{policy}.onnx")
+        if not path.is_file():
+            raise UserError(
+                f"the policy {policy} is not in this version of the package; give one of "
+                f"{', '.join(n for n in NAMES if n != policy)}, a .onnx file or a run's folder"
+            )
+        return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
+    path = Path(policy)
+    if os.path.isdir(path):
+        return DeployedPolicy(_exported(path), str(path))
+    try:
+        return DeployedPolicy(path.read_bytes(), str(path))
+    except OSError as error:
+        raise UserError(
+            f"the policy {path} cannot be read ({error.strerror}); give {' or '.join(NAMES)}, a "
+            ".onnx file or a run's folder"
+        ) from error
+
+
+def _exported(run: Path) -> bytes:
+    """The ONNX file of a run's policy."""
+    try:
+        from bounce_mjx.deploy.export import export_onnx
+        from bounce_mjx.runs.folders import find_checkpoint
+    except ImportError as error:
+        raise UserError(
+            f"the run {run} must be exported, for which {error.name} is missing; use bounce-mjx "
+            "export on the machine of the training, and give the .onnx file"
+        ) from error
+    return export_onnx(find_checkpoint(run, run))

@@ -1,0 +1,117 @@
+"""The facts that an exported policy carries with it, as the ONNX file's `metadata_props`.
+
+Every entry is JSON, under the name of its field here.
+"""
+
+import json
+import math
+from typing import Any, NamedTuple
+
+FORMAT = 1
+"""Version of the entries; a reader refuses any other."""
+
+
+class Part(NamedTuple):
+    """One input of the network."""
+
+    name: str
+    """The quantity; `past_actions` are the outputs of the last steps."""
+    history: int
+    """Number of values, the newest first."""
+    size: int
+    """Number of entries of one value."""
+    unit: str
+    """Unit of the entries; empty for a pure number."""
+
+
+class Link(NamedTuple):
+    """A hinge on the way from the world to the paddle, in the frame of the hinge before it."""
+
+    joint: int
+    """Index of its joint."""
+    position: tuple[float, float, float]
+    """A point on the axis, m."""
+    quaternion: tuple[float, float, float, float]
+    """Orientation at the angle `reference`, in the order w, x, y, z."""
+    axis: tuple[float, float, float]
+    """Unit vector."""
+    reference: float
+    """Joint angle at which the hinge is not turned, rad."""
+
+
+class Metadata(NamedTuple):
+    """Everything that acting with the network needs."""
+
+    format: int
+    steps: int
+    """Environment steps of the training."""
+    joint_names: tuple[str, ...]
+    """Order of the joints in every array of J = 6 joints."""
+    observation: tuple[Part, ...]
+    """The inputs of the network, each [N, history, size]."""
+    velocity: str
+    """Source of ball_velocity: `measured`, or `differences` of the measured positions."""
+    control_dt: float
+    """Time between two actions, s."""
+    action: str
+    """Meaning of the output [N, J], in words."""
+    action_scale: float
+    """Change of the servo target at the action 1, rad."""
+    joint_ranges: tuple[tuple[float, float] | None, ...]
+    """Range of each servo target, rad; None for a joint without one."""
+    servo_stiffness: tuple[float, ...]
+    """Torque of each servo over its position error, N m/rad."""
+    servo_damping: tuple[float, ...]
+    """Torque of each servo over its joint's velocity, N m s/rad."""
+    torque_limits: tuple[float | None, ...]
+    """Largest torque of each servo, N m; None for one without a limit."""
+    default_joint_angles: tuple[float, ...]
+    """Joint angles at the start of an episode, rad."""
+    target_height_range: tuple[float, float]
+    """Target heights of the training, m."""
+    randomization: dict[str, tuple[float, float]]
+    """Ranges of the training's worlds, by the keys of `env.randomization`, which documents their
+    units; a term that is not here did not differ."""
+    bounce_max_distance: float
+    """Height above the paddle below which the ball counts as near it, m."""
+    chain: tuple[Link, ...]
+    """The hinges from the world to the paddle."""
+    paddle: tuple[float, float, float]
+    """Centre of the paddle in the frame of the last hinge, m."""
+
+
+def to_entries(metadata: Metadata) -> dict[str, str]:
+    """The metadata as JSON, by name."""
+    plain = metadata._asdict() | {
+        "observation": [part._asdict() for part in metadata.observation],
+        "chain": [link._asdict() for link in metadata.chain],
+    }
+    return {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+
+
+def from_entries(entries: dict[str, str]) -> Metadata:
+    """The metadata of `to_entries`; ValueError for anything else."""
+    missing = [name for name in Metadata._fields if name not in entries]
+    if missing:
+        raise ValueError(f"its metadata lacks {missing[0]}")
+    plain = {name: json.loads(entries[name]) for name in Metadata._fields}
+    if plain["format"] != FORMAT:
+        raise ValueError(f"its format is {plain['format']}, not {FORMAT}")
+    try:
+        plain["observation"] = tuple(Part(**part) for part in plain["observation"])
+        plain["chain"] = tuple(Link(**link) for link in plain["chain"])
+        metadata = Metadata(**plain)
+        _check(metadata)
+    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"its metadata is malformed: {error}") from error
+    return metadata
+
+
+def _check(metadata: Metadata) -> None:
+    count = len(metadata.joint_names)
+    numbers: list[Any] = [metadata.control_dt, metadata.action_scale, *metadata.paddle]
+    numbers += [n for link in metadata.chain for n in (*link.position, *link.quaternion)]
+    if not all(math.isfinite(number) for number in numbers) or not metadata.control_dt > 0.0:
+        raise ValueError("its metadata holds a number that is not finite or not positive")
+    if len(metadata.joint_ranges) != count or any(n.joint >= count for n in metadata.chain):
+        raise ValueError(f"its metadata is not of {count} joints")

@@ -1,0 +1,237 @@
+"""A trained policy on a robot: measurements in, actions out, with NumPy and onnxruntime alone."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
+from bounce_mjx.deploy.metadata import Metadata, from_entries
+from bounce_mjx.errors import UserError
+
+_MAX_PAUSE = 1.0
+_LOG_ERRORS_ONLY = 3
+
+UNITS = {
+    "joint_angles": "rad",
+    "joint_velocities": "rad/s",
+    "ball_position": "m",
+    "ball_velocity": "m/s",
+    "ball_age": "s",
+    "ball_quaternion": "w, x, y, z",
+    "ball_angular_velocity": "rad/s",
+    "target_height": "m",
+    "time": "s",
+}
+"""The measurements that a step may be given, and their units."""
+
+
+class DeployedPolicy:
+    """A policy with the histories that it sees; `load_policy` makes one.
+
+    Call `reset` before each ball and `step` once each control step. Positions are in the robot's
+    frame: x forward, z upward, the floor at z = 0.
+    """
+
+    def __init__(self, model: bytes, source: str):
+        """Loads an ONNX file.
+
+        Args:
+          model: content of the file.
+          source: its name, for messages.
+
+        Raises:
+          UserError: it is not a policy that `bounce-mjx export` wrote.
+        """
+        options = onnxruntime.SessionOptions()
+        # The network is too small to share between threads.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = _LOG_ERRORS_ONLY
+        try:
+            self._session = onnxruntime.InferenceSession(
+                model, options, providers=["CPUExecutionProvider"]
+            )
+            entries = self._session.get_modelmeta().custom_metadata_map
+            self.metadata: Metadata = from_entries(entries)
+            self._check_inputs()
+        # onnxruntime raises many types for a damaged file; all of them mean the same here.
+        except Exception as error:
+            reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
+            raise UserError(
+                f"{source} is no policy of this version of the package ({reason}); give a file "
+                "that bounce-mjx export wrote"
+            ) from error
+        count = len(self.metadata.joint_names)
+        self._shapes = {
+            "joint_angles": (count,),
+            "joint_velocities": (count,),
+            "ball_position": (3,),
+            "ball_velocity": (3,),
+            "ball_age": (1,),
+            "ball_quaternion": (4,),
+            "ball_angular_velocity": (3,),
+            "target_height": (1,),
+            "time": (1,),
+        }
+        self.needs = self._needs()
+        """Measurements that every step must be given; `UNITS` has their units."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the past. The next step starts it: all past values are as the present ones."""
+        self._histories: Histories | None = None
+        self._measured: Measurements = {}
+        self._time: float | None = None
+        self._action = np.zeros(len(self.metadata.joint_names))
+
+    def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
+        """The action of a control step.
+
+        Args:
+          measurements: `joint_angles` [J] (rad) and `joint_velocities` [J] (rad/s) in the order of
+            `metadata.joint_names`; of the ball's newest picture `ball_position` [3] (m),
+            `ball_velocity` [3] (m/s), `ball_age` (time since the picture was taken, s),
+            `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
+            (rad/s; default 0); `target_height` (m); `time` of any clock (s). Those in `needs` must
+            be there. Without `time`, a step is one control step after the last one.
+
+            With `time`, the elapsed time is rounded to control steps. A call less than half a
+            control step after the last one, or before it, is a repetition: it changes nothing and
+            returns the last action. A call several control steps late fills the missed ones with
+            measurements between the last and the new, and with the last action.
+
+        Returns:
+          The action [J], from -1 to 1; `servo_targets` converts it.
+
+        Raises:
+          UserError: a needed measurement is missing, one is unknown, of another shape or not
+            finite, or the time is more than 1 s from the last. The policy stays as it was.
+        """
+        measured = self._checked(measurements)
+        time = float(measured.pop("time")[0]) if "time" in measured else None
+        steps = self._steps_since(time)
+        if steps == 0:
+            return self._action.copy()
+        if self._histories is None:
+            self._histories = Histories(self.metadata, measured)
+        else:
+            for i in range(1, steps + 1):
+                share = i / steps
+                between = {
+                    name: (1.0 - share) * self._measured[name] + share * value
+                    for name, value in measured.items()
+                    if name in self._measured
+                }
+                self._histories.add(measured | between if i < steps else measured, self._action)
+        self._measured, self._time = measured, time
+        inputs = {
+            name: values[None].astype(np.float32) for name, values in self._histories.values.items()
+        }
+        (actions,) = self._session.run(["action"], inputs)
+        self._action = actions[0].astype(float)
+        return self._action.copy()
+
+    def servo_targets(self, action: np.ndarray) -> np.ndarray:
+        """Servo targets [J] (rad) of the last step's action [J]: its measured joint angles plus the
+        scaled action, clipped to the joint ranges.
+
+        Raises:
+          UserError: there was no step since the reset, or its measurements had no joint angles.
+        """
+        if "joint_angles" not in self._measured:
+            raise UserError(
+                "the servo targets start from the measured joint angles, and there are none; call "
+                "step with joint_angles first"
+            )
+        ranges = self.metadata.joint_ranges
+        low = [-np.inf if limits is None else limits[0] for limits in ranges]
+        high = [np.inf if limits is None else limits[1] for limits in ranges]
+        targets = self._measured["joint_angles"] + self.metadata.action_scale * np.asarray(action)
+        return np.clip(targets, low, high)
+
+    @property
+    def observation(self) -> np.ndarray:
+        """The network's inputs at the last step, in one vector: each quantity, the newest first;
+        empty before the first step."""
+        values = [] if self._histories is None else self._histories.values.values()
+        return np.concatenate([np.zeros(0), *(value.ravel() for value in values)])
+
+    def _check_inputs(self) -> None:
+        """ValueError where the network is not of its metadata."""
+        stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
+        actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
+        outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
+        if stated != actual or outputs != {"action": [len(self.metadata.joint_names)]}:
+            raise ValueError("its inputs or outputs are not as its metadata states")
+
+    def _needs(self) -> tuple[str, ...]:
+        seen = {part.name for part in self.metadata.observation}
+        differences = self.metadata.velocity == "differences"
+        needs = {
+            "joint_angles": {"joint_angles", "paddle_position"} | OF_BOUNCES,
+            "joint_velocities": {"joint_velocities", "bounce_joint_velocities"},
+            "ball_position": {"ball_position"} | OF_BOUNCES,
+            "ball_velocity": {"ball_velocity"},
+            "ball_age": {"ball_age"},
+            "target_height": {"target_height", "apex_error"},
+        }
+        if differences:
+            needs["ball_position"] |= needs.pop("ball_velocity")
+        return tuple(name for name, users in needs.items() if users & seen)
+
+    def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
+        """The measurements as arrays of their own, with the defaults of those that are missing."""
+        for name in measurements:
+            if name not in self._shapes:
+                raise UserError(f"{name} is no measurement; a step takes {', '.join(self._shapes)}")
+        missing = [name for name in self.needs if name not in measurements]
+        if missing:
+            raise UserError(
+                f"the measurement {missing[0]} is missing; this policy needs "
+                f"{', '.join(self.needs)} in every step"
+            )
+        checked = {"ball_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
+        checked["ball_angular_velocity"] = np.zeros(3)
+        for name, value in measurements.items():
+            checked[name] = self._array(name, value)
+        if self.metadata.velocity == "differences":
+            checked.pop("ball_velocity", None)
+        return checked
+
+    def _array(self, name: str, value: Any) -> np.ndarray:
+        shape = self._shapes[name]
+        try:
+            array = np.array(value, float)
+        except (TypeError, ValueError) as error:
+            raise UserError(
+                f"the measurement {name} is {str(value)[:100]!r}; give {_words(name, shape)}"
+            ) from error
+        if array.shape != shape and not (shape == (1,) and array.shape == ()):
+            raise UserError(
+                f"the measurement {name} has the shape {list(array.shape)}; give "
+                f"{_words(name, shape)}"
+            )
+        if not np.all(np.isfinite(array)):
+            raise UserError(
+                f"the measurement {name} holds {array[~np.isfinite(array)].flat[0]}; give finite "
+                f"numbers ({UNITS[name]})"
+            )
+        return array.reshape(shape)
+
+    def _steps_since(self, time: float | None) -> int:
+        """Control steps since the last step, at least 0."""
+        if time is None or self._time is None:
+            return 1
+        elapsed = time - self._time
+        if abs(elapsed) > _MAX_PAUSE:
+            raise UserError(
+                f"the time {time} s is {elapsed:.3g} s after the last step's; call reset after a "
+                f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
+            )
+        return max(0, round(elapsed / self.metadata.control_dt))
+
+
+def _words(name: str, shape: tuple[int, ...]) -> str:
+    count = "one number" if shape == (1,) else f"{shape[0]} numbers"
+    return f"{count} ({UNITS[name]})"

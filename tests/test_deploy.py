@@ -1,0 +1,506 @@
+"""Exported policies: the ONNX graph against JAX, the NumPy histories against the environment."""
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from bounce_mjx import BounceBall, EnvConfig, load_policy
+from bounce_mjx.commands import export as export_command
+from bounce_mjx.deploy import loading
+from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.export import describe, export_jax, export_onnx
+from bounce_mjx.deploy.metadata import from_entries
+from bounce_mjx.deploy.policy import DeployedPolicy
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.statistics import Normalizer
+from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.model import JOINT_NAMES, load_model
+from bounce_mjx.runs import reading
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
+from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.task.observation import QUANTITIES
+from bounce_mjx.task.sensing import Sensing
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
+
+# The policy sees this much of everything.
+ALL = {
+    "ball_position": 10,
+    "paddle_position": 2,
+    "target_height": 2,
+    "action": 4,
+    "apex_error": 3,
+    "bounce_position": 3,
+    "bounce_interval": 3,
+    "bounce_joint_angles": 3,
+    "bounce_joint_velocities": 2,
+}
+# A level paddle that hardly moves, under a ball that bounces on it for seconds without a policy:
+# servos this stiff let the arm sink by micrometres.
+STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
+LEVEL = {
+    "action_scale": 1e-5,
+    "ball_init_pos": (0.58856, 0.01, 1.0),
+    "ball_position_noise": 0.0,
+    "joint_angle_noise": 0.0,
+    "joint_velocity_noise": 0.0,
+}
+ENVS = {
+    "specification": {},
+    "all histories": {"observation": ALL, "randomization": STIFF, **LEVEL},
+    "sensors": {
+        "observation": ALL | {"ball_age": 2, "ball_velocity": 3, "velocity": "differences"},
+        "randomization": STIFF
+        | {
+            "camera_rate": (80.0, 130.0),
+            "ball_latency": (0.005, 0.02),
+            "frame_drop": (0.1, 0.1),
+            "ball_position_noise": (0.001, 0.001),
+            "joint_angle_noise": (5e-5, 5e-5),
+            "encoder_bias": (-0.003, 0.003),
+            "joint_velocity_noise": (0.05, 0.05),
+            "target_height": (0.4, 0.6),
+            "target_interval": (0.3, 0.5),
+        },
+        **LEVEL,
+    },
+}
+
+
+def input_name(quantity: str) -> str:
+    """The input of an exported policy that holds a quantity."""
+    return "past_actions" if quantity == "action" else quantity
+
+
+def make_run(folder: Path, env: dict) -> Path:
+    """A run whose policy is drawn at random; its first input never varied in the training."""
+    config = TrainConfig(env=env, ppo={"hidden_layers": (24, 8)})
+    size = config.env.observation.layout.size
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 1.5, size).astype(np.float32)
+    std[0] = 1e-3
+    normalizer = Normalizer(
+        jnp.asarray(rng.normal(size=size), jnp.float32), jnp.asarray(std, jnp.float32)
+    )
+    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
+    params = networks.policy_network.init(jax.random.PRNGKey(1))
+    params["params"]["Dense_0"]["kernel"] *= 20.0
+    folder.mkdir()
+    save_config(folder, config)
+    writer = CheckpointWriter(folder, config)
+    writer.save(("best",), 64, Policy(normalizer, params))
+    writer.close()
+    assert writer.problem() is None
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run for each of ENVS, and the policy of the package."""
+    folder = tmp_path_factory.mktemp("runs")
+    made = {name: make_run(folder / name.replace(" ", "_"), env) for name, env in ENVS.items()}
+    return made | {"pretrained": resource_path("pretrained")}
+
+
+@pytest.fixture(scope="module")
+def policies(runs: dict[str, Path]) -> dict[str, DeployedPolicy]:
+    """The policies of the runs."""
+    return {name: load_policy(run) for name, run in runs.items()}
+
+
+@pytest.fixture
+def observations(runs: dict[str, Path]):
+    """A function (name) -> 1,000 observations, the actions of JAX, and the parts' inputs."""
+
+    def draw(name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        checkpoint = find_checkpoint(runs[name], runs[name])
+        config = load_run_config(checkpoint.run)
+        policy = reading.load_policy(checkpoint, config)
+        layout = config.env.observation.layout
+        rng = np.random.default_rng(3)
+        # Some are farther from the mean than the normaliser's clipping.
+        spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
+        noise = spread * rng.normal(size=(1000, layout.size))
+        mean, std = (np.asarray(array) for array in policy.normalizer)
+        observation = (mean + std * noise).astype(np.float32)
+        networks = make_networks(config.ppo, layout.size, len(JOINT_NAMES))
+        inputs = {
+            input_name(part.name): observation[:, layout[part.name]].reshape(
+                1000, getattr(config.env.observation, part.name), -1
+            )
+            for part in layout.parts
+        }
+        return np.asarray(act(networks, policy, observation)), inputs
+
+    return draw
+
+
+@pytest.mark.parametrize("name", [*ENVS, "pretrained"])
+def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
+    expected, inputs = observations(name)
+    model = export_onnx(find_checkpoint(runs[name], runs[name]))
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    (actions,) = session.run(["action"], inputs)
+    np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-5)
+    # The comparison sees clipped actions and others.
+    assert 0.0 < np.mean(np.abs(expected) == 1.0) < 0.9
+
+
+@pytest.mark.parametrize("name", ["all histories", "pretrained"])
+def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
+    expected, inputs = observations(name)
+    artefact = jax.export.deserialize(export_jax(find_checkpoint(runs[name], runs[name])))
+    assert set(artefact.platforms) == {"cpu", "cuda"}
+    for count in (1, 1000):
+        some = {part: values[:count] for part, values in inputs.items()}
+        np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
+
+
+def test_metadata_tells_what_the_network_takes_and_gives(runs: dict[str, Path]) -> None:
+    model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"], runs["sensors"])))
+    metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
+    config = load_run_config(runs["sensors"])
+    assert {p.name: p.history for p in metadata.observation} == {
+        input_name(q.name): n for q in QUANTITIES if (n := getattr(config.env.observation, q.name))
+    }
+    assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
+    assert (metadata.joint_names, metadata.steps) == (list(JOINT_NAMES), 64)
+    assert metadata.control_dt == config.env.control_dt
+    assert metadata.randomization["camera_rate"] == [80.0, 130.0]
+    assert metadata.target_height_range == [0.4, 0.6]
+    assert metadata.servo_stiffness == [20000.0] * 6 and metadata.servo_damping == [200.0] * 6
+    assert metadata.torque_limits == [None] * 6
+    for node in model.graph.input:
+        shape = [d.dim_value or d.dim_param for d in node.type.tensor_type.shape.dim]
+        (part,) = (p for p in metadata.observation if p.name == node.name)
+        assert shape == ["N", part.history, part.size]
+
+
+def test_servo_targets_are_those_of_the_environment() -> None:
+    env, policy = BounceBall(EnvConfig()), load_policy("pretrained")
+    rng = np.random.default_rng(0)
+    limits = np.array(policy.metadata.joint_ranges)
+    for _ in range(20):
+        # Some angles are at the ends of their ranges.
+        angles = np.clip(rng.uniform(1.2 * limits[:, 0], 1.2 * limits[:, 1]), *limits.T)
+        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        physics = state.physics._replace(qpos=state.physics.qpos.at[:6].set(angles))
+        action = rng.uniform(-1.0, 1.0, 6)
+        policy.reset()
+        policy.step(measured_once() | {"joint_angles": angles})
+        expected = env.servo_targets(physics, jnp.asarray(action, jnp.float32))
+        np.testing.assert_allclose(policy.servo_targets(action), expected, atol=1e-6)
+
+
+MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("edited", [False, True], ids=["shipped", "anchors and references"])
+def test_paddle_position_is_that_of_mujoco(edited: bool, tmp_path: Path) -> None:
+    text = MJCF
+    if edited:
+        text = text.replace('name="Joint3"', 'name="Joint3" pos="0.01 0.02 -0.03" ref="0.4"')
+        text = text.replace('name="Joint5"', 'name="Joint5" pos="-0.02 0.01 0.03"')
+        assert text.count(' ref="0.4"') == 1 and text.count('name="Joint5" pos') == 1
+    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    metadata = describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
+    model = load_model(tmp_path / "arm.xml", 0.001)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(20):
+        angles = rng.uniform(-2.0, 2.0, 6)
+        data.qpos[:6] = angles
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(
+            paddle_position(metadata, angles), data.geom("blocker").xpos, atol=1e-12
+        )
+
+
+def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
+    text = MJCF.replace(
+        '<body name="Link1" pos="0 0 0.1">',
+        '<body name="Link1" pos="0 0 0.1"><joint name="track" type="slide" axis="1 0 0"/>',
+    )
+    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match="hangs on the joint 'track'.*remove the joint"):
+        describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
+
+
+def measured_by(sensing: Sensing, target_height: float) -> dict[str, np.ndarray]:
+    """The newest measurements in the memory of an environment's sensors."""
+    names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
+    measured = {name: np.asarray(sensing.seen[name][0]) for name in names}
+    return measured | {
+        "ball_position": np.asarray(sensing.picture.position),
+        "ball_velocity": np.asarray(sensing.picture.velocity),
+        "target_height": target_height,
+    }
+
+
+@pytest.mark.parametrize("name", ["all histories", "sensors"])
+def test_histories_are_those_of_the_environment(name: str, policies) -> None:
+    """The policy and the environment go side by side, in a closed loop."""
+    env, policy = BounceBall(EnvConfig(**ENVS[name])), policies[name]
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
+    policy.reset()
+    bounces, targets, reached = 0, set(), set()
+    for i in range(300):
+        memory, task = state.pipeline_state.memory, state.pipeline_state.task
+        measured = measured_by(memory.sensing, task.target_height)
+        if name == "sensors":
+            measured["ball_age"] = memory.sensing.picture.age
+        before = None if i == 0 else policy.observation
+        action = policy.step(measured | {"time": 7.0 + i * env.dt})
+        np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
+        flight = env.layout["bounce_interval"]
+        bounces += i > 0 and before[flight][0] != policy.observation[flight][0]
+        targets.add(float(task.target_height))
+        reached |= set(np.flatnonzero(policy.observation))
+        state = step(state, jnp.asarray(action, jnp.float32))
+        assert not state.done, i
+    assert bounces >= 4 and len(targets) >= (5 if name == "sensors" else 1)
+    # Every entry took part, but for the ball's orientation and spin.
+    still = range(env.layout["ball_quaternion"].start + 1, env.layout["ball_quaternion"].stop)
+    still = {*still, *range(*env.layout["ball_angular_velocity"].indices(env.layout.size))}
+    assert set(range(env.layout.size)) - reached <= still
+
+
+def measured_once() -> dict:
+    """Measurements that every policy here accepts."""
+    return {
+        "joint_angles": np.array([0.0, 0.7, 1.9, 0.0, -1.0, 0.0]),
+        "joint_velocities": np.linspace(-0.1, 0.1, 6),
+        "ball_position": np.array([0.6, 0.01, 0.3]),
+        "ball_velocity": np.array([0.1, -0.1, -2.0]),
+        "target_height": 0.5,
+    }
+
+
+def falling(time: float) -> dict:
+    """Measurements that change with time (s) along straight lines."""
+    measured = measured_once()
+    return measured | {
+        "joint_angles": measured["joint_angles"] + 0.3 * time,
+        "ball_position": measured["ball_position"] - 1.5 * time,
+        "time": time,
+    }
+
+
+def test_a_repeated_call_changes_nothing(policies) -> None:
+    policy = policies["all histories"]
+    policy.reset()
+    actions = [policy.step(falling(time)) for time in (1.0, 1.01)]
+    seen = policy.observation
+    for time in (1.01, 1.0149, 1.0, 0.5):
+        np.testing.assert_array_equal(policy.step(falling(1.0) | {"time": time}), actions[1])
+        np.testing.assert_array_equal(policy.observation, seen)
+    policy.step(falling(1.02))
+    assert not np.array_equal(policy.observation, seen)
+
+
+def test_histories_stay_in_control_steps(policies) -> None:
+    """A late call leaves the same positions as calls in time, and jitter does not matter."""
+    policy, seen = policies["all histories"], []
+    ball = slice(*(policies_layout(policy)["ball_position"]))
+    for times in (np.arange(12) * 0.01, np.delete(np.arange(12) * 0.01, [4, 5, 8])):
+        policy.reset()
+        for time in times:
+            policy.step(falling(time))
+        seen.append(policy.observation[ball])
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-12)
+
+    jitter = np.random.default_rng(0).uniform(-0.002, 0.002, 12)
+    observations = []
+    for errors in (np.zeros(12), jitter):
+        policy.reset()
+        for i, error in enumerate(errors):
+            policy.step(falling(0.01 * i) | {"time": 0.01 * i + error})
+        observations.append(policy.observation)
+    np.testing.assert_array_equal(*observations)
+
+
+def policies_layout(policy: DeployedPolicy) -> dict[str, tuple[int, int]]:
+    """Start and end of each part in a policy's observation."""
+    ends = np.cumsum([part.history * part.size for part in policy.metadata.observation])
+    starts = [0, *ends[:-1]]
+    names = [part.name for part in policy.metadata.observation]
+    return dict(zip(names, zip(starts, ends, strict=True), strict=True))
+
+
+WRONG = {
+    "missing": ({"ball_position": None}, "ball_position is missing", "needs joint_angles"),
+    "unknown": ({"ball_positon": [0, 0, 0]}, "ball_positon is no measurement", "ball_position"),
+    "short": ({"joint_angles": [0.0] * 5}, "joint_angles has the shape [5]", "6 numbers (rad)"),
+    "batch": ({"ball_position": [[0, 0, 1]]}, "has the shape [1, 3]", "3 numbers (m)"),
+    "words": ({"target_height": "high"}, "target_height is 'high'", "one number (m)"),
+    "ragged": ({"ball_velocity": [[0], 1, 2]}, "ball_velocity is", "3 numbers (m/s)"),
+    "nan": ({"joint_velocities": [0, 0, np.nan, 0, 0, 0]}, "holds nan", "finite", "rad/s"),
+    "infinite": ({"time": np.inf}, "time holds inf", "finite numbers (s)"),
+    "a long pause": ({"time": 1003.0}, "1e+03 s after", "call reset", "give seconds"),
+    "another clock": ({"time": -5.0}, "call reset"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG.values(), ids=WRONG)
+def test_wrong_measurements_are_refused_and_change_nothing(case: tuple, policies) -> None:
+    changes, *words = case
+    policy = policies["all histories"]
+    policy.reset()
+    policy.step(falling(0.0))
+    seen = policy.observation
+    given = {k: v for k, v in (falling(0.01) | changes).items() if v is not None}
+    with pytest.raises(UserError) as refusal:
+        policy.step(given)
+    assert all(word in str(refusal.value) for word in words), refusal.value
+    np.testing.assert_array_equal(policy.observation, seen)
+
+
+def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
+    names = [quantity.name for quantity in QUANTITIES]
+    observation = dict.fromkeys(names, 0) | {"ball_position": 2, "ball_quaternion": 1, "action": 1}
+    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
+    assert policy.needs == ("ball_position",)
+    policy.step({"ball_position": (1.0, 2.0, 3.0)})
+    policy.step({"ball_position": (4.0, 5.0, 6.0)})
+    expected = [4.0, 5.0, 6.0, 1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(policy.observation[:10], expected)
+    with pytest.raises(UserError, match="call step with joint_angles first"):
+        policy.servo_targets(np.zeros(6))
+
+
+def test_the_shipped_file_is_a_fresh_export() -> None:
+    shipped = onnx.load(resource_path("pretrained/pretrained.onnx"))
+    assert shipped == onnx.load_from_string(export_onnx(pretrained_checkpoint())), (
+        "pretrained/pretrained.onnx is stale; write it with "
+        "bounce-mjx export pretrained --onnx pretrained/pretrained.onnx"
+    )
+
+
+def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(UserError, match="nowhere.onnx cannot be read .*robust or pretrained"):
+        load_policy("nowhere.onnx")
+    with pytest.raises(UserError, match="not in a run's folder"):
+        load_policy(tmp_path)
+    shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
+    foreign = onnx.load_from_string(shipped)
+    del foreign.metadata_props[:]
+    newer = onnx.load_from_string(shipped)
+    (entry,) = (prop for prop in newer.metadata_props if prop.key == "format")
+    entry.value = "2"
+    broken = {
+        "text": b"hello",
+        "half": shipped[: len(shipped) // 2],
+        "lacks format": foreign.SerializeToString(),
+        "format is 2, not 1": newer.SerializeToString(),
+    }
+    for reason, content in broken.items():
+        (tmp_path / "a.onnx").write_bytes(content)
+        with pytest.raises(UserError, match="a.onnx is no policy .*bounce-mjx export") as refusal:
+            load_policy(tmp_path / "a.onnx")
+        assert " " not in reason or reason in str(refusal.value)
+    monkeypatch.setattr(loading, "resource_path", lambda name: tmp_path / name)
+    with pytest.raises(UserError, match="the policy robust is not in this version .*pretrained"):
+        load_policy("robust")
+
+
+# Everything of the project but NumPy and onnxruntime.
+BLOCKED = (
+    "jax jaxlib mujoco flax optax orbax pydantic pydantic_core tensorstore yaml rich tyro onnx "
+    "matplotlib scipy brax gymnasium torch"
+)
+
+
+def test_it_runs_with_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
+    script = f"""
+import importlib.abc, sys
+
+class Blocker(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {BLOCKED.split()!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocker())
+import numpy as np
+from bounce_mjx import load_policy
+from bounce_mjx.errors import UserError
+policy = load_policy("pretrained")
+action = policy.step({{
+    "joint_angles": [0.0, 0.7, 1.9, 0.0, -1.0, 0.0], "joint_velocities": np.zeros(6),
+    "ball_position": [0.6, 0.0, 0.4], "ball_velocity": [0.0, 0.0, -1.0], "target_height": 0.5}})
+print(action.shape, policy.servo_targets(action).shape, bool(np.all(np.abs(action) <= 1.0)))
+try:
+    load_policy(sys.argv[1])
+except UserError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    shapes, refusal = done.stdout.splitlines()
+    assert shapes == "(6,) (6,) True"
+    assert "must be exported, for which" in refusal and "bounce-mjx export" in refusal
+
+
+def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
+    perfect = EXAMPLE["Camera"](rate=1000.0, noise=0.0, delay=0.0)
+    bounces, survived = EXAMPLE["simulate"](load_policy("pretrained"), perfect, 8.0, 0.5)
+    assert bounces >= 10 and survived == pytest.approx(8.0)
+
+
+def test_the_example_prints_what_it_measured(monkeypatch, capsys) -> None:
+    source = CHECKOUT / "examples" / "deploy.py"
+    assert len(source.read_text(encoding="utf-8").splitlines()) <= 80
+    monkeypatch.setattr(sys, "argv", ["deploy.py", "pretrained", "--seconds", "0.6"])
+    runpy.run_path(str(source), run_name="__main__")
+    # The ball falls 0.36 m in 0.27 s, and comes back 0.5 s later.
+    assert capsys.readouterr().out == "1 bounces in 0.6 s of 0.6 s\n"
+
+
+def test_the_example_has_a_late_camera() -> None:
+    camera = EXAMPLE["Camera"](rate=100.0, noise=0.0, delay=0.020)
+    for step in range(101):
+        camera.look(step * 0.001, np.array([0.0, 0.0, 3.0 * step * 0.001]))
+    measured = camera.measure(0.1)
+    assert measured["ball_position"][2] == pytest.approx(0.24)
+    assert measured["ball_velocity"][2] == pytest.approx(3.0)
+    assert measured["ball_age"] == pytest.approx(0.02)
+
+
+def test_command_writes_both_files(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    export_command.main("pretrained --onnx policy.onnx --jax policy.jax".split())
+    shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
+    assert (tmp_path / "policy.onnx").read_bytes() == shipped
+    artefact = jax.export.deserialize((tmp_path / "policy.jax").read_bytes())
+    assert artefact.out_avals[0].shape[1:] == (6,)
+    assert "written: policy.onnx" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ("pretrained", "give --onnx FILE or --jax FILE"),
+        ("pretrained --onnx nowhere/a.onnx", "folder of --onnx nowhere/a.onnx does not exist"),
+        ("pretrained --jax .", "--jax . is a folder"),
+        ("nowhere --onnx a.onnx", "no checkpoint folder nowhere"),
+    ],
+)
+def test_command_refuses(args: str, words: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_info:
+        export_command.main(args.split())
+    error = capsys.readouterr().err
+    assert exit_info.value.code == 2 and words in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
