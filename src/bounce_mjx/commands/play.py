@@ -19,7 +19,7 @@ from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.viewers.controllers import make_policy_controller
+from bounce_mjx.viewers.controllers import Controller, make_policy_controller
 from bounce_mjx.viewers.show import ViewerOptions, show
 
 
@@ -53,12 +53,15 @@ def main(args: Sequence[str] | None = None) -> None:
         config = load_run_config(checkpoint.run)
         console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
         changes = {} if command.physics == "config" else {"physics": command.physics}
-        env = BounceBall(validate(EnvConfig, dict(config.env) | changes, "play"))
-        networks = make_networks(config.ppo, env.observation_size, env.action_size)
         policy = load_policy(checkpoint, config)
+
+        def make_controller(env: BounceBall) -> Controller:
+            networks = make_networks(config.ppo, env.observation_size, env.action_size)
+            return make_policy_controller(networks, policy)
+
         show(
-            env,
-            make_policy_controller(networks, policy),
+            validate(EnvConfig, dict(config.env) | changes, "play"),
+            make_controller,
             command.viewing,
             title=f"policy of {checkpoint.run.name}, {checkpoint.steps:,} steps",
             target_height=command.target_height,

@@ -11,7 +11,6 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.viewers.controllers import (
     make_random_controller,
@@ -46,10 +45,9 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
         )
         set_up_jax()
-        env = BounceBall(command.env)
         show(
-            env,
-            _CONTROLLERS[command.actions](env),
+            command.env,
+            _CONTROLLERS[command.actions],
             command.viewing,
             title=f"{command.actions} actions",
             target_height=None,

@@ -115,6 +115,8 @@ class _Page:
         self._settings = now
         if now.target_height != before.target_height:
             self._simulation.target_height = now.target_height
+        if now.world != before.world:
+            self._simulation.world = now.world
         if now.num_shown != before.num_shown:
             self._scene.show(now.num_shown)
         reset, push = self._controls.take_reset(), self._controls.take_push()

@@ -13,6 +13,7 @@ import viser
 
 from bounce_mjx.viewers.pace import SPEED_RANGE
 from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.world import sliders_for
 
 _PUSH_RANGE = (0.05, 1.0)
 _DEFAULT_PUSH = 0.2
@@ -35,10 +36,12 @@ class Settings(NamedTuple):
     """Number of environments in the scene."""
     target_height: float | None
     """Target height of all environments, m; None for the height drawn at each reset."""
+    world: dict[str, tuple[float, ...]] | None
+    """See `Simulation.world`."""
 
 
 class Controls:
-    """Pause, speed, number of robots, reset, target height and pushes."""
+    """Pause, speed, number of robots, reset, target height, pushes and the world."""
 
     def __init__(
         self,
@@ -52,7 +55,9 @@ class Controls:
         gui = server.gui
         low, high = simulation.env.config.target_height_range
         target = simulation.target_height or 0.5 * (low + high)
-        self._initial = Settings(False, speed, num_shown, simulation.target_height)
+        self._initial = Settings(
+            False, speed, num_shown, simulation.target_height, simulation.world
+        )
         self._max_shown = simulation.num_envs
         self._height_range = min(0.3, low, target), max(0.8, high, target)
         self._reset_requested = False
@@ -71,6 +76,30 @@ class Controls:
         with gui.add_folder("push the ball"):
             self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, _DEFAULT_PUSH)
             push = gui.add_button_group("towards", tuple(_DIRECTIONS))
+        self._sliders = {}
+        if sliders := sliders_for(simulation.env.config.randomization):
+            is_drawn = simulation.world is None
+            with gui.add_folder("world"):
+                self._world_drawn = gui.add_checkbox(
+                    "drawn at each reset", is_drawn, visible=is_drawn
+                )
+                for slider in sliders:
+                    self._sliders[slider] = gui.add_slider(
+                        slider.label, *slider.limits, slider.step, slider.nominal
+                    )
+                nominal = gui.add_button("nominal world")
+
+            @nominal.on_click
+            def _(_) -> None:
+                for slider, handle in self._sliders.items():
+                    handle.value = slider.nominal
+                self._world_drawn.value = False
+
+            for handle in self._sliders.values():
+
+                @handle.on_update
+                def _(_) -> None:
+                    self._world_drawn.value = False
 
         # Callbacks run in threads of the server; the simulation's loop takes their requests.
         @reset.on_click
@@ -98,7 +127,20 @@ class Controls:
             speed=_number_within(self._speed.value, SPEED_RANGE, initial.speed),
             num_shown=round(shown),
             target_height=None if self._drawn.value else height,
+            world=self._read_world(),
         )
+
+    def _read_world(self) -> dict[str, tuple[float, ...]] | None:
+        if not self._sliders:
+            return self._initial.world
+        if self._world_drawn.value:
+            return None
+        return {
+            slider.term: slider.world_value(
+                _number_within(handle.value, slider.limits, slider.nominal)
+            )
+            for slider, handle in self._sliders.items()
+        }
 
     def take_reset(self) -> bool:
         """Whether a reset was requested since the last call."""

@@ -1,6 +1,7 @@
 """The viewing options that `view` and `play` share, and the viewers that they start."""
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from rich.console import Console
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
@@ -17,6 +19,7 @@ from bounce_mjx.viewers.native import check_display, has_display, run_native
 from bounce_mjx.viewers.pace import SPEED_RANGE
 from bounce_mjx.viewers.scene import MAX_ENVS
 from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.world import drawn_ranges, with_sliders
 
 _RECORDED_SECONDS = 10.0
 
@@ -54,8 +57,8 @@ class ViewerOptions(StrictModel):
 
 
 def show(
-    env: BounceBall,
-    controller: Controller,
+    config: EnvConfig,
+    make_controller: Callable[[BounceBall], Controller],
     options: ViewerOptions,
     *,
     title: str,
@@ -93,13 +96,18 @@ def show(
 
         port = free_port(options.host, options.port)
 
-    num_envs = options.num_envs
-    # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
-    if not recorded and viewer == "browser" and env.engine.name == "fused":
-        num_envs = MAX_ENVS
+    env, num_envs, ranges = BounceBall(config), options.num_envs, None
+    if not recorded and viewer == "browser":
+        env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
+        # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
+        if env.engine.name == "fused":
+            num_envs = MAX_ENVS
     with console.status("compiling"):
-        simulation = run_interruptible(Simulation, env, controller, num_envs, options.seed)
+        simulation = run_interruptible(
+            Simulation, env, make_controller(env), num_envs, options.seed, ranges
+        )
         simulation.target_height = target_height
+        simulation.world = None if config.randomization.terms else {}
 
     if recorded:
         with console.status("recording"):

@@ -1,5 +1,7 @@
 """Episodes as NumPy frames: stepped live for a viewer, or recorded."""
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -7,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.env import BounceBall, BounceState
+from bounce_mjx.task.randomization import TERMS, Ranges, World, physics_parameters
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.task.state import State
 from bounce_mjx.viewers.controllers import Controller
@@ -37,26 +40,48 @@ class Frame(NamedTuple):
 class Simulation:
     """N environments under a controller; an environment is reset when its episode is over."""
 
-    def __init__(self, env: BounceBall, controller: Controller, num_envs: int, seed: int):
-        """Compiles the programs, which takes seconds, and resets all environments."""
+    def __init__(
+        self,
+        env: BounceBall,
+        controller: Controller,
+        num_envs: int,
+        seed: int,
+        ranges: Ranges | None = None,
+    ):
+        """Compiles the programs, which takes seconds, and resets all environments.
+
+        Args:
+          ranges: from which the resets draw the worlds, see `BounceBall.reset`.
+        """
         self.env = env
         self.num_envs = num_envs
         self.target_height: float | None = None
         """Target height of all environments, m; None for the height drawn at each reset."""
+        self.world: dict[str, Sequence[float]] | None = None
+        """Entries of some terms of the world that are on, in all environments, with the others
+        nominal; None for the world drawn at each reset."""
         self._controller = controller
+        self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
-        self._reset_program = jax.jit(self._start)
-        self._step_program = jax.jit(self._advance)
         self._push = np.zeros(3, np.float32)
+        nothing = jax.eval_shape(self._fresh_states, self._key)
+        self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
+        self._steps = np.zeros(num_envs, np.int32)
+        over = np.ones(num_envs, bool)
+        programs = (
+            jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
+            jax.jit(self._advance).lower(*self._inputs()),
+        )
+        # Together, as one compilation does not keep two cores busy.
+        with ThreadPoolExecutor() as pool:
+            self._reset_program, self._step_program = pool.map(
+                lambda program: program.compile(), programs
+            )
         self.reset()
-        steps = self._steps, self._target(), self._push
-        self._step_program = self._step_program.lower(self._key, self._states, *steps).compile()
 
     def reset(self) -> Frame:
         """Starts a new episode in every environment; its first frame."""
-        self._key, key = jax.random.split(self._key)
-        self._states, self._steps, frame = self._reset_program(key)
-        self.frame = jax.device_get(frame)
+        self.frame = self._reset(np.ones(self.num_envs, bool))
         return self.frame
 
     def push(self, velocity: tuple[float, float, float]) -> None:
@@ -65,11 +90,11 @@ class Simulation:
 
     def step(self) -> Frame:
         """Advances one control step."""
-        self._key, self._states, self._steps, frame = self._step_program(
-            self._key, self._states, self._steps, self._target(), self._push
-        )
+        self._key, self._states, self._steps, frame = self._step_program(*self._inputs())
         self._push = np.zeros(3, np.float32)
         self.frame = jax.device_get(frame)
+        if self.frame.over.any():
+            self._reset(self.frame.over)
         return self.frame
 
     def record(self, seconds: float) -> Frame:
@@ -81,23 +106,46 @@ class Simulation:
     def _target(self) -> np.float32:
         return np.float32(np.nan if self.target_height is None else self.target_height)
 
+    def _world(self) -> World:
+        """The terms that have a nominal value; nan where the drawn ones stay."""
+        values = {}
+        for name in self.env.config.randomization.terms:
+            shape, nominal, _ = TERMS[name]
+            if nominal is not None:
+                entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
+                values[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
+        return values
+
+    def _inputs(self) -> tuple:
+        """Arguments of the program of a step."""
+        changes = self._target(), self._push, self._world()
+        return self._key, self._states, self._steps, *changes
+
+    def _reset(self, over: np.ndarray) -> Frame:
+        """Starts a new episode in some environments [N]; the frame of all."""
+        self._key, key = jax.random.split(self._key)
+        self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
+        return jax.device_get(frame)
+
     def _fresh_states(self, key: jax.Array) -> State:
-        return jax.vmap(self.env.reset, out_axes=-1)(jax.random.split(key, self.num_envs))
+        return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
+            jax.random.split(key, self.num_envs)
+        )
 
-    def _start(self, key: jax.Array) -> tuple[State, jax.Array, Frame]:
-        states, steps = self._fresh_states(key), jnp.zeros(self.num_envs, jnp.int32)
-        return states, steps, _view(self.env, states, steps, steps > 0)
+    def _restart(self, key, states, steps, over):
+        fresh = self._fresh_states(key)
+        states = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, states)
+        steps = jnp.where(over, 0, steps)
+        return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, key, states, steps, target, push):
-        key, reset_key, action_key = jax.random.split(key, 3)
-        states = _influence(self.env, states, target, push)
+    def _advance(self, key, states, steps, target, push, world):
+        key, action_key = jax.random.split(key)
+        states = _influence(self.env, states, target, push, world)
         actions = self._controller(states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
-        fresh = self._fresh_states(reset_key)
-        following = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after)
-        return key, following, jnp.where(over, 0, steps), _view(self.env, after, steps, over)
+        return key, after, steps, _view(self.env, after, steps, over)
 
 
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
@@ -131,9 +179,11 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
     )
 
 
-def _influence(env: BounceBall, states: State, target: jax.Array, push: jax.Array) -> State:
-    """States [..., N] with another target height [] (nan keeps it) and a ball pushed by a velocity
-    [3], m/s."""
+def _influence(
+    env: BounceBall, states: State, target: jax.Array, push: jax.Array, world: World
+) -> State:
+    """States [..., N] with another target height [] (nan keeps it), a ball pushed by a velocity
+    [3] (m/s), and another world (nan keeps a term)."""
     physics, task = states.pipeline_state.physics, states.pipeline_state.task
     velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
     changed = states.pipeline_state._replace(
@@ -141,6 +191,16 @@ def _influence(env: BounceBall, states: State, target: jax.Array, push: jax.Arra
         task=task._replace(target_height=jnp.where(jnp.isnan(target), task.target_height, target)),
     )
 
+    def in_world(state: BounceState) -> BounceState:
+        terms = {
+            name: jnp.where(jnp.isnan(value), state.world[name], value)
+            for name, value in world.items()
+        }
+        terms = state.world | terms
+        return state._replace(world=terms, parameters=physics_parameters(terms, env.mj_model))
+
+    if world:
+        changed = jax.vmap(in_world, in_axes=-1, out_axes=-1)(changed)
     observation = jax.vmap(env.observe, in_axes=-1, out_axes=-1)(changed)
     return states.replace(pipeline_state=changed, obs=observation)
 

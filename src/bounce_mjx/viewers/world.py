@@ -1,0 +1,82 @@
+"""The world's sliders: terms of the randomisation that a viewer sets in place of a draw."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from bounce_mjx.evaluation.suite import neutral_range
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.randomization import TERMS, RandomizationConfig, Ranges
+
+
+class WorldSlider(NamedTuple):
+    """A slider for one term of `RandomizationConfig`."""
+
+    label: str
+    term: str
+    limits: tuple[float, float]
+    """In the slider's unit."""
+    step: float
+    scale: float = 1.0
+    """Factor from the slider's unit to the term's."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The limits in the term's unit."""
+        return self.limits[0] * self.scale, self.limits[1] * self.scale
+
+    @property
+    def nominal(self) -> float:
+        """The nominal value in the slider's unit."""
+        return TERMS[self.term].nominal / self.scale
+
+    def world_value(self, position: float) -> tuple[float, ...]:
+        """The entries of the term for a position of the slider, which moves the first one."""
+        others = math.prod(TERMS[self.term].shape) - 1
+        return (position * self.scale, *(TERMS[self.term].nominal,) * others)
+
+
+SLIDERS = (
+    WorldSlider("action latency, ms", "action_latency", (0.0, 50.0), 1.0, 1e-3),
+    WorldSlider("ball latency, ms", "ball_latency", (0.0, 50.0), 1.0, 1e-3),
+    WorldSlider("ball noise, mm", "ball_position_noise", (0.0, 20.0), 0.5, 1e-3),
+    WorldSlider("paddle tilt, degrees", "paddle_tilt", (0.0, 5.0), 0.1, math.radians(1.0)),
+    WorldSlider("restitution", "restitution", (0.6, 0.98), 0.01),
+)
+
+
+def with_sliders(config: EnvConfig) -> EnvConfig:
+    """The task with the terms of the sliders on, in ranges that contain the sliders' and its own.
+
+    The nominal restitution is that of the project's own model, so another model gets no slider for
+    it.
+    """
+    spans = {}
+    for slider in SLIDERS:
+        if slider.term == "restitution" and config.mjcf is not None:
+            continue
+        low, high = getattr(config.randomization, slider.term) or slider.span
+        spans[slider.term] = min(low, slider.span[0]), max(high, slider.span[1])
+    randomization = config.randomization.model_copy(update=spans)
+    return config.model_copy(update={"randomization": randomization})
+
+
+def drawn_ranges(config: EnvConfig) -> Ranges:
+    """The ranges from which a reset of `with_sliders(config)` draws the worlds of `config`."""
+    ranges = config.randomization.ranges()
+    for name in with_sliders(config).randomization.terms:
+        if name not in ranges:
+            low, high = neutral_range(name, config)
+            ranges[name] = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+    return ranges
+
+
+def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
+    """The sliders whose limits are in the ranges of the terms that are on."""
+    return tuple(
+        slider
+        for slider in SLIDERS
+        if (span := getattr(config, slider.term)) is not None
+        and span[0] <= slider.span[0] <= slider.span[1] <= span[1]
+    )
