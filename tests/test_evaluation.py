@@ -14,6 +14,7 @@ from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
@@ -527,6 +528,23 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
     # One step more or less is worth up to about 15.
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
+
+
+def test_one_target_height_replaces_the_drawn_ones(random_policy, monkeypatch):
+    """Also where the world of the training draws and changes it."""
+    drawn = {"target_height": (0.3, 0.8), "target_interval": (2.0, 4.0), "air_drag": (0.0, 0.1)}
+    config = EnvConfig(randomization=drawn, episode_seconds=0.5)
+    built = []
+
+    def make_evaluator(env, networks, episodes):
+        built.append(env)
+        return lambda policy, key: empty_statistics(episodes)
+
+    monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
+    evaluate_policy(random_policy, config, PPOConfig(), episodes=2, target_height=0.5)
+    (env,) = built
+    assert env.config.target_heights == (0.5, 0.5)
+    assert env.config.randomization.terms == ("air_drag",)
 
 
 def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path):
