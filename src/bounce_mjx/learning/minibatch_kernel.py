@@ -360,19 +360,19 @@ def _run(
         metrics_ref[seed, network, tile, 0] = jnp.sum(losses) * mean_of
         metrics_ref[seed, network, tile, 1] = jnp.sum(ratio - 1.0 - log_ratio) * mean_of
 
-        of_hidden = hidden_gradient_ref.at[seed, network, tile]
-        of_output = output_gradient_ref.at[seed, network, tile]
-        of_output[output_bias] = jnp.sum(by_result, axis=0)
-        of_output[noise_row] = jnp.sum(by_log_prob * (deviation * deviation - 1.0), axis=0)
-        of_output[pl.ds(0, width)] = matmul(h2, out_gradient, width, NUM_OUTPUTS, flip_a=True)
+        hidden_result = hidden_gradient_ref.at[seed, network, tile]
+        output_result = output_gradient_ref.at[seed, network, tile]
+        output_result[output_bias] = jnp.sum(by_result, axis=0)
+        output_result[noise_row] = jnp.sum(by_log_prob * (deviation * deviation - 1.0), axis=0)
+        output_result[pl.ds(0, width)] = matmul(h2, out_gradient, width, NUM_OUTPUTS, flip_a=True)
         gradient = matmul(out_gradient, w3, TILE, width, flip_b=True)
         gradient *= load(slope2).astype(float32)
-        of_hidden[hidden_bias] = jnp.sum(gradient, axis=0)
+        hidden_result[hidden_bias] = jnp.sum(gradient, axis=0)
         store(slope2, gradient)
-        of_hidden[second] = matmul(h1, slope2, width, width, flip_a=True)
+        hidden_result[second] = matmul(h1, slope2, width, width, flip_a=True)
         gradient = matmul(slope2, w2, TILE, width, flip_b=True) * load(slope1).astype(float32)
         store(slope1, gradient)
-        of_hidden[first] = matmul(x, slope1, NUM_INPUTS, width, flip_a=True)
+        hidden_result[first] = matmul(x, slope1, NUM_INPUTS, width, flip_a=True)
 
     # Operands of one product need the same swizzle, which their narrowest dimension bounds.
     wide = (plgpu.TilingTransform((8, 64)), plgpu.SwizzleTransform(128))

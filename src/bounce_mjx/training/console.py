@@ -72,8 +72,8 @@ class Reporter:
         # A sum, because a mean would hide a single event in many iterations.
         non_finite = np.nansum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
-        for name, of_seeds in means.items():
-            for log, value in zip(self._logs, of_seeds, strict=False):
+        for name, seed_values in means.items():
+            for log, value in zip(self._logs, seed_values, strict=False):
                 if math.isfinite(value):
                     log.add_scalar(name, float(value), steps)
         for name, last in self._last.items():

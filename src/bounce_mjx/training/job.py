@@ -231,10 +231,10 @@ class _Job:
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
         self.steps = latest.steps
-        of_seeds = [plain] if self.config.num_seeds == 1 else plain["seeds"]
+        seed_records = [plain] if self.config.num_seeds == 1 else plain["seeds"]
         self.members = [
-            _Member(folder, config, _resumed_progress(folder, one, latest))
-            for (folder, config), one in zip(self._folders_of_seeds(), of_seeds, strict=True)
+            _Member(folder, config, _resumed_progress(folder, record, latest))
+            for (folder, config), record in zip(self._folders_of_seeds(), seed_records, strict=True)
         ]
         if hosts.is_leader():
             _write_config(self.run, self.config)
@@ -259,11 +259,11 @@ class _Job:
             self.state = None
         self.writers: list[CheckpointWriter] = []
         if hosts.is_leader():
-            of_members = [(member.run, member.config) for member in self.members]
+            seed_folders = [(member.run, member.config) for member in self.members]
             several = self.config.num_seeds > 1
             self.writers = [
                 CheckpointWriter(*arguments)
-                for arguments in ([(self.run, self.config)] if several else []) + of_members
+                for arguments in ([(self.run, self.config)] if several else []) + seed_folders
             ]
         for writer in self.writers:
             self.stack.callback(writer.close)
@@ -449,12 +449,12 @@ class _Job:
           faults: the metric "fault" of a block [seeds, I].
         """
         before = (self.steps - self.block_steps) // self.config.ppo.batch_steps
-        for member, of_block in zip(self.members, faults, strict=True):
-            if member.progress.fault is not None or not of_block.any():
+        for member, block_faults in zip(self.members, faults, strict=True):
+            if member.progress.fault is not None or not block_faults.any():
                 continue
-            first = int(np.argmax(of_block != 0))
+            first = int(np.argmax(block_faults != 0))
             member.progress.fault = (
-                f"{self.trainer.checked[int(of_block[first]) - 1]} was the first that was not "
+                f"{self.trainer.checked[int(block_faults[first]) - 1]} was the first that was not "
                 f"finite, at iteration {before + first + 1}"
             )
             if self.config.num_seeds > 1:
