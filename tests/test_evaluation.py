@@ -25,6 +25,7 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task.env import Memory
 from bounce_mjx.task.observation import OBSERVATION
 from bounce_mjx.task.state import State
 
@@ -117,6 +118,30 @@ def test_settling_takes_two_seconds(env):
     np.testing.assert_allclose(s.apex_error, [0.1])
     # The upward speed is measured over the whole episode.
     np.testing.assert_array_equal(s.rising_steps, [4])
+
+
+def test_bounces_settle_again_after_a_change_of_the_target(env):
+    """Ages after the step, of a target that changed 0.01, 2 and 2.01 s before; and of one that
+    never does."""
+    row = {"bounced": 1.0, "apex_error": 0.05}
+    batch = states([row] * 4)
+    memory = Memory(
+        counter=jnp.zeros(4, jnp.int32),
+        step=jnp.full(4, 901),
+        phases=jnp.zeros((3, 4)),
+        target_age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
+        target_range=(jnp.full(4, 0.3), jnp.full(4, 0.8)),
+        actuation=None,
+        sensing=None,
+    )
+    changing = batch.pipeline_state._replace(
+        world={"target_interval": jnp.full(4, 4.0)}, memory=memory
+    )
+    s = accumulate(env, empty_statistics(4), batch.replace(pipeline_state=changing), jnp.int32(900))
+    np.testing.assert_array_equal(s.settled_bounces, [0, 0, 1, 1])
+    np.testing.assert_array_equal(s.accurate_bounces, [0, 0, 1, 1])
+    # The horizontal position does not depend on the target.
+    np.testing.assert_array_equal(s.settled_steps, [1, 1, 1, 1])
 
 
 def test_settling_follows_the_control_step():
@@ -347,6 +372,14 @@ def test_upward_speed_is_judged_only_for_low_targets(target_range, judged):
         assert report.results[SPEED].passed is (passed if judged else None)
         np.testing.assert_allclose(report.results[SPEED].value, speed / 900)
         assert report.passed == (passed or not judged)
+
+
+def test_upward_speed_is_judged_by_the_drawn_targets(env):
+    drawing = BounceBall(EnvConfig(randomization={"target_height": (0.3, 0.8)}))
+    fast = statistics(rising_speed=9000)
+    assert judge(drawing, fast).results[SPEED].passed is None
+    assert judge(drawing, fast, target_heights=(0.5, 0.5)).results[SPEED].passed is False
+    assert judge(env, fast, target_heights=(0.8, 0.8)).results[SPEED].passed is None
 
 
 def report_of(passed, mean_return) -> Report:

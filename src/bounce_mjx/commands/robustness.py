@@ -95,7 +95,7 @@ def _measure(
 ) -> tuple[list[Outcome], str]:
     """Measures all conditions and shows a progress bar."""
     all_conditions = load_suite(suite, config.env)
-    conditions = computed(all_conditions)
+    conditions = computed(all_conditions, command.physics)
     if skipped := {c.perturbation.name for c in all_conditions} - {
         c.perturbation.name for c in conditions
     }:

@@ -438,7 +438,7 @@ class BounceBall:
 
     def _first_memory(self, state: BounceState, truth: Kinematics, rng: jax.Array) -> Memory:
         config, dtype = self.config, truth.ball_position.dtype
-        counter = jax.lax.bitcast_convert_type(jax.random.bits(rng), jnp.int32)
+        counter = jax.lax.bitcast_convert_type(jax.random.bits(rng, dtype=jnp.uint32), jnp.int32)
         return Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),

@@ -23,7 +23,7 @@ SENSOR_TERMS = frozenset(
 
 
 class Picture(NamedTuple):
-    """The last picture of the ball that has arrived."""
+    """The last picture of the ball that has arrived, and was not lost."""
 
     position: jax.Array
     """Measured position [3], m."""
@@ -32,7 +32,7 @@ class Picture(NamedTuple):
     age: jax.Array
     """Time since it was taken [], s."""
     number: jax.Array
-    """Number of pictures since the reset []; negative before the first."""
+    """Number of the last picture since the reset that was due []; negative before the first."""
 
 
 class Sensing(NamedTuple):
@@ -144,17 +144,19 @@ def take_picture(
     noises = noise.normal(counter, _BALL_STREAM, (6,), dtype)
     position, velocity = ball[:3], ball[3:]
     position = _disturbed(world, "ball_position", position, noises[:3])
-    arrived = number > last.number
+    due = number > last.number
+    arrived = due
     if "frame_drop" in world:
         lost = noise.uniform(counter, _DROP_STREAM, (), dtype) < world["frame_drop"]
-        arrived &= ~lost
+        arrived = due & ~lost
     held_age = last.age + control_dt
     if observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
         velocity = (position - last.position) / elapsed
     velocity = _disturbed(world, "ball_velocity", velocity, noises[3:])
     fresh = Picture(position, velocity, age * control_dt, number)
-    held = last._replace(age=held_age)
+    # A lost picture is not looked for again.
+    held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
     return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
 
 
