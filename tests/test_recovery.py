@@ -420,7 +420,7 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
     assert len(refusals) == 2
     with lock_run(run):
         pass
-    assert not list(run.glob(".lock"))
+    assert not list(run.glob(".*"))
 
 
 # Paths
