@@ -46,6 +46,8 @@ class PhysicsParameters(NamedTuple):
     """Rotor inertia [6] at the joints, kg m^2."""
     damping: Array | None = None
     """Viscous damping [6] of the joints, N m s/rad."""
+    frictionloss: Array | None = None
+    """Dry friction [6] of the joints, N m; on MuJoCo's C engine alone."""
     link_mass: Array | None = None
     """Masses [6] of the links, kg; first moment and inertia change in proportion, the centre of
     mass stays."""
@@ -72,6 +74,7 @@ SHAPES = PhysicsParameters(
     force_limit=(_NUM_JOINTS,),
     armature=(_NUM_JOINTS,),
     damping=(_NUM_JOINTS,),
+    frictionloss=(_NUM_JOINTS,),
     link_mass=(_NUM_JOINTS,),
     paddle_position=(3,),
     paddle_rotation=(4,),
@@ -159,6 +162,8 @@ def edited_fields(
         put("dof_armature", dofs, p.armature)
     if p.damping is not None:
         put("dof_damping", dofs, p.damping)
+    if p.frictionloss is not None:
+        put("dof_frictionloss", dofs, p.frictionloss)
     if p.link_mass is not None:
         ratio = p.link_mass / m.body_mass[links]
         put("body_mass", links, p.link_mass)
