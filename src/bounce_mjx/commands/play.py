@@ -27,8 +27,9 @@ class PlayCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), or a checkpoint in it. The default is the newest run,
-    or the policy that comes with the package if there is no run."""
+    """A run's folder (its best checkpoint), a checkpoint in it, or a policy that comes with the
+    package: pretrained or robust. The default is the newest run, or pretrained if there is no
+    run."""
     target_height: Positive | None = None
     """Target height, m. By default each reset draws it from the range of the run's config."""
     physics: Literal["config", "fused", "mjx"] = "config"

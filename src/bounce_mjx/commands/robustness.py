@@ -29,7 +29,7 @@ from bounce_mjx.reports.robustness import ROBUSTNESS_FILE, robustness_figure, ro
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import to_json, write_atomically
-from bounce_mjx.runs.folders import choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.training.setup import set_up_jax
 
@@ -50,7 +50,7 @@ class RobustnessCommand(StrictModel):
     """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
-    for the policy that comes with the package."""
+    for a policy that comes with the package."""
     log_dir: Path = Path("runs/bounce_ball")
     """Folder in which to look for the newest run."""
 
@@ -72,7 +72,7 @@ def main(args: Sequence[str] | None = None) -> None:
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
         suite = command.suite or resource_path("configs/robustness.yaml")
-        shipped = checkpoint == pretrained_checkpoint()
+        shipped = checkpoint.run in map(resource_path, SHIPPED.values())
         out = command.out or (Path("robustness") if shipped else checkpoint.run)
         _make_folder(out)
         outcomes, engine = run_interruptible(_measure, command, config, policy, suite, console)

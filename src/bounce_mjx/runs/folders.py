@@ -36,6 +36,8 @@ from bounce_mjx.runs.progress import load_results
 
 CheckpointName = Literal["latest", "best"]
 PRETRAINED = "pretrained"
+SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
+"""Names of the policies that come with the package, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
 
 
@@ -154,21 +156,27 @@ def has_checkpoint(run: Path, name: CheckpointName, steps: int) -> bool:
     return steps in stored_checkpoints(run / CHECKPOINTS / name)
 
 
-def pretrained_checkpoint() -> Checkpoint:
-    """The checkpoint that comes with the package."""
-    return best_checkpoint(resource_path(PRETRAINED))
+def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
+    """The checkpoint of a policy in `SHIPPED`."""
+    folder = resource_path(SHIPPED[name])
+    if not folder.is_dir():
+        others = " or ".join(other for other in SHIPPED if other != name)
+        raise UserError(
+            f"the policy {name} is not in this version of the package; give {others} or a run's "
+            "folder"
+        )
+    return best_checkpoint(folder)
 
 
 def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Checkpoint:
     """The checkpoint to show or to evaluate; prints the choice where the user made none.
 
     Args:
-      path: see `find_checkpoint`; or `PRETRAINED`, the checkpoint that comes with the package,
-        unless there is a folder of that name. Where it is None and the default folder of runs is
+      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder of that name. Where it is None and the default folder of runs is
         empty, the choice is the checkpoint that comes with the package.
     """
-    if path == Path(PRETRAINED) and not path.is_dir():
-        return pretrained_checkpoint()
+    if str(path) in SHIPPED and not path.is_dir():
+        return pretrained_checkpoint(str(path))
     if path is not None:
         return find_checkpoint(path, log_dir)
     try:

@@ -81,7 +81,7 @@ class Simulation:
         self.reset()
 
     def reset(self) -> Frame:
-"""Starts a new episode in every environment; returns the first frame."""
+        """Starts a new episode in every environment; returns the first frame."""
         self.frame = self._reset(np.ones(self.num_envs, bool))
         return self.frame
 
