@@ -1,6 +1,7 @@
 """The shipped policy: its results, its users, and the command that ships it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
+from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
@@ -94,6 +96,19 @@ def test_a_run_is_preferred_to_it(tmp_path: Path, monkeypatch, console, capsys) 
 def test_it_is_used_only_for_the_default_folder_of_runs(tmp_path: Path, console) -> None:
     with pytest.raises(UserError, match="no run with a checkpoint"):
         choose_checkpoint(None, tmp_path, console)
+
+
+def test_the_policies_have_names(tmp_path: Path, monkeypatch, console) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert choose_checkpoint(Path("pretrained"), LOG_DIR, console) == pretrained_checkpoint()
+    monkeypatch.setattr(folders, "resource_path", lambda name: tmp_path / "package" / name)
+    with pytest.raises(
+        UserError, match="robust is not in this version .* give pretrained or a run"
+    ):
+        choose_checkpoint(Path("robust"), LOG_DIR, console)
+    robust = tmp_path / "package" / "pretrained" / "robust"
+    shutil.copytree(FOLDER, robust)
+    assert choose_checkpoint(Path("robust"), LOG_DIR, console).run == robust
 
 
 @pytest.fixture

@@ -27,11 +27,17 @@ from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, view
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers import offscreen, pace
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
+    make_policy_controller,
     make_random_controller,
     make_scripted_controller,
     make_zero_controller,
@@ -42,6 +48,7 @@ from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
 
 GRAVITY = 9.81
 SECONDS = 3.0
@@ -305,38 +312,34 @@ class Client:
         time.sleep(0.1)
 
 
-@pytest.fixture
-def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
-    """A client of a served simulation of two environments, and a record of the page's actions: the
-    numbers of environments shown, the speeds, the target heights and the pushes."""
-    did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
+def watch(
+    monkeypatch: pytest.MonkeyPatch, owner: type, method: str, record: Callable[..., None]
+) -> None:
+    """Calls `record` with the arguments of every call of a method."""
+    original = getattr(owner, method)
 
-    def watch(owner: type, method: str, record: Callable[..., None]) -> None:
-        original = getattr(owner, method)
+    def watched(self, *args):
+        record(self, *args)
+        return original(self, *args)
 
-        def watched(self, *args):
-            record(self, *args)
-            return original(self, *args)
+    monkeypatch.setattr(owner, method, watched)
 
-        monkeypatch.setattr(owner, method, watched)
 
-    watch(Scene, "show", lambda _, number: did["shown"].append(number))
-    watch(Pace, "due", lambda _, speed: did["speed"].append(speed))
-    watch(Simulation, "step", lambda simulation: did["target"].append(simulation.target_height))
-    watch(Simulation, "push", lambda _, velocity: did["push"].append(velocity))
-    scripted.target_height = None
+@contextlib.contextmanager
+def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+    """A client of a simulation's page."""
     failures, printed, ended = [], io.StringIO(), threading.Event()
 
     def step(simulation) -> None:
         if ended.is_set():
             raise KeyboardInterrupt
 
-    watch(Simulation, "step", step)
+    watch(monkeypatch, Simulation, "step", step)
 
     def serve() -> None:
         try:
             run_browser(
-                scripted, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
+                simulation, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
                 host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
             )  # fmt: skip
         except BaseException as error:
@@ -347,11 +350,28 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     while "viewer" not in printed.getvalue():
         assert server.is_alive(), failures
         time.sleep(0.05)
-    yield Client(re.search(r"http://\S+", printed.getvalue())[0]), did
+    yield Client(re.search(r"http://\S+", printed.getvalue())[0])
     assert server.is_alive(), failures
     ended.set()
     server.join(PATIENCE)
     assert [type(failure) for failure in failures] == [KeyboardInterrupt], failures
+
+
+@pytest.fixture
+def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
+    """A client of a served simulation of two environments, and a record of the page's actions: the
+    numbers of environments shown, the speeds, the target heights and the pushes."""
+    did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
+    for owner, method, record in (
+        (Scene, "show", lambda _, number: did["shown"].append(number)),
+        (Pace, "due", lambda _, speed: did["speed"].append(speed)),
+        (Simulation, "step", lambda simulation: did["target"].append(simulation.target_height)),
+        (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
+    ):
+        watch(monkeypatch, owner, method, record)
+    scripted.target_height = None
+    with served(scripted, monkeypatch) as client:
+        yield client, did
     scripted.target_height = None
 
 
@@ -405,6 +425,109 @@ def test_an_invalid_camera_is_ignored(page) -> None:
         client.look(position=[position, 0.0, 0.0])
         client.set(client.control("robots"), number)
         wait_until(lambda number=number: did["shown"][-1] == number)
+
+
+# The world's sliders
+
+NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS}
+
+
+@pytest.fixture(scope="module")
+def played() -> Simulation:
+    """The nominal policy in worlds whose ball mass is drawn, under the sliders."""
+    checkpoint = pretrained_checkpoint()
+    run = load_run_config(checkpoint.run)
+    config = run.env.model_copy(
+        update={"randomization": RandomizationConfig(ball_mass=(0.8, 0.95))}
+    )
+    env = BounceBall(with_sliders(config))
+    networks = make_networks(run.ppo, env.observation_size, env.action_size)
+    controller = make_policy_controller(networks, load_policy(checkpoint, run))
+    return Simulation(env, controller, 2, seed=0, ranges=drawn_ranges(config))
+
+
+def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...]) -> Frame:
+    """An episode whose world changes after its first second, which is nominal."""
+    simulation.world = {}
+    simulation.reset()
+    simulation.record(1.0)
+    simulation.world = world
+    return simulation.record(seconds)
+
+
+WORSE = {
+    "late actions": {"action_latency": (0.03,)},
+    "late ball": {"ball_latency": (0.03,)},
+    "tilted paddle": {"paddle_tilt": (np.radians(3.0), 0.0)},
+}
+
+
+@pytest.mark.parametrize("world", WORSE.values(), ids=WORSE)
+def test_the_nominal_policy_loses_the_ball_in_another_world(played: Simulation, world) -> None:
+    assert not recorded(played, 6.0).over.any()
+    assert recorded(played, 6.0, **world).over.any(axis=0).all()
+
+
+def test_bounces_get_lower_with_the_restitution(played: Simulation) -> None:
+    """The policy was trained for one restitution only."""
+    highest = [
+        recorded(played, 4.0, restitution=(e,)).ball[-200:, :, 2].max() for e in (0.6, 0.85, 0.98)
+    ]
+    assert highest[0] < highest[1] - 0.05 < highest[2] - 0.1
+
+
+def test_only_the_worlds_own_terms_are_drawn(played: Simulation) -> None:
+    """The sliders' terms are nominal where they are not drawn, and all terms where nothing is."""
+    played.world = None
+    played.reset()
+    played.step()
+    world = played._states.pipeline_state.world
+    mass = np.asarray(world["ball_mass"])
+    assert np.all((mass >= 0.8) & (mass <= 0.95)) and mass[0] != mass[1]
+    np.testing.assert_allclose(world["restitution"], 0.85)
+    np.testing.assert_array_equal(world["action_latency"], 0.0)
+    played.world = {}
+    played.step()
+    np.testing.assert_array_equal(played._states.pipeline_state.world["ball_mass"], 1.0)
+
+
+def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatch) -> None:
+    frames, worlds = [], []
+    watch(monkeypatch, Simulation, "step", lambda simulation: frames.append(simulation.frame))
+    watch(monkeypatch, Simulation, "step", lambda simulation: worlds.append(simulation.world))
+    played.world = None
+    played.reset()
+    with served(played, monkeypatch) as client:
+        wait_until(lambda: len(frames) > 100)
+        assert worlds[-1] is None and not any(frame.over.any() for frame in frames)
+        client.set(client.control("action latency, ms"), 30)
+        wait_until(lambda: worlds[-1] == NOMINAL | {"action_latency": (0.03,)})
+        wait_until(lambda: any(frame.over.any() for frame in frames))
+        for value in (1e9, -1e9, NAN, INFINITY, "much", [1], None):
+            client.set(client.control("restitution"), value)
+        assert {world["restitution"] for world in worlds if world} == {(0.85,), (0.6,), (0.98,)}
+        client.set(client.control("nominal world"), True)
+        wait_until(lambda: worlds[-1] == NOMINAL)
+
+
+def test_sliders_extend_the_ranges_of_a_task() -> None:
+    config = EnvConfig(
+        randomization=RandomizationConfig(action_latency=(0.01, 0.2), restitution=(0.7, 0.8))
+    )
+    widened = with_sliders(config).randomization
+    assert (widened.action_latency, widened.restitution) == ((0.0, 0.2), (0.6, 0.98))
+    assert sliders_for(widened) == SLIDERS and not sliders_for(config.randomization)
+    ranges = drawn_ranges(config)
+    assert set(ranges) == set(widened.terms)
+    np.testing.assert_allclose(ranges["restitution"], (0.7, 0.8))
+    np.testing.assert_array_equal(ranges["paddle_tilt"], np.zeros((2, 2)))
+
+
+def test_another_robot_has_no_slider_for_the_restitution() -> None:
+    """Its own restitution is unknown."""
+    config = EnvConfig(mjcf=resource_path("mjcf/bounce_ball.xml"))
+    labels = [slider.term for slider in sliders_for(with_sliders(config).randomization)]
+    assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
 
 
 def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:

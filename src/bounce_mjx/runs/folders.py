@@ -172,8 +172,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     """The checkpoint to show or to evaluate; prints the choice where the user made none.
 
     Args:
-      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder of that name. Where it is None and the default folder of runs is
-        empty, the choice is the checkpoint that comes with the package.
+      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder of that name.
+        Where it is None and the default folder of runs is empty, the choice is `PRETRAINED`.
     """
     if str(path) in SHIPPED and not path.is_dir():
         return pretrained_checkpoint(str(path))
