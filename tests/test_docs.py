@@ -25,8 +25,10 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.config import command_line as cli
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.randomization import TERMS
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
@@ -308,3 +310,24 @@ def test_packages_import_in_the_order_of_the_map():
             if wrong := imported & set(order[i + 1 :]):
                 against.append(f"{path.relative_to(package)} imports {wrong}")
     assert order and not against
+
+
+def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:
+    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
+    section = page.split("## Export a policy\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.+?) \| .+ \|$", section, re.MULTILINE)
+    entries = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(entries) == sorted(Metadata._fields)
+
+
+def test_robot_page_example_runs() -> None:
+    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    names: dict = {}
+    exec(compile(example, "real-robot.md", "exec"), names)
+    # The arm is in its posture, and no target is farther than the action scale.
+    angles = bounce_mjx.load_policy("pretrained").metadata.default_joint_angles
+    np.testing.assert_allclose(names["servo_targets"], angles, atol=0.02 + 0.005)

@@ -207,7 +207,7 @@ def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
     script = """
 import jax
 from rich.console import Console
-from bounce_mjx import BounceBall
+from bounce_mjx import BounceBall, load_policy as load_deployed
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -220,10 +220,11 @@ networks = make_networks(config.ppo, env.observation_size, env.action_size)
 action = act(networks, load_policy(checkpoint, config), state.obs)
 print(checkpoint.run)
 print(*action.shape, bool((abs(action) > 0.0).any()))
+print(len(load_deployed("pretrained").needs))
 """
-    run, action = run_installed(site, script, tmp_path)
+    run, action, needs = run_installed(site, script, tmp_path)
     assert Path(run) == site / "bounce_mjx" / "pretrained"
-    assert action == "6 True"
+    assert (action, needs) == ("6 True", "5")
 
 
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")

@@ -9,6 +9,8 @@ import math
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.physics.fused.scalars import sine_cosine
+
 
 def next_counter(counter: jax.Array) -> jax.Array:
     """The counter [] (int32) of the next control step: a linear congruential generator (the
@@ -30,8 +32,9 @@ def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.d
     size = math.prod(shape)
     pairs = (size + 1) // 2
     numbers = uniform(counter, stream, (2, pairs), dtype)
-    radius, angle = jnp.sqrt(-2.0 * jnp.log(numbers[0])), 2.0 * math.pi * numbers[1]
-    both = jnp.concatenate([radius * jnp.cos(angle), radius * jnp.sin(angle)])
+    radius = jnp.sqrt(-2.0 * jnp.log(numbers[0]))
+    sine, cosine = sine_cosine(2.0 * math.pi * numbers[1])
+    both = jnp.concatenate([radius * cosine, radius * sine])
     return both[:size].reshape(shape)
 
 
