@@ -41,7 +41,7 @@ def page_id(page: Path) -> str:
 
 
 def code(page: Path) -> list[str]:
-    """The lines of a page's code blocks, and its pieces of code in a sentence."""
+    """The lines of a page's code blocks, and its inline code."""
     text = page.read_text(encoding="utf-8")
     fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     rest = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -108,7 +108,7 @@ def test_the_documentation_shows_the_commands() -> None:
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the command's own parser; nothing else of it runs."""
+    """The command's own parser accepts them; nothing else of the command runs."""
     name, *args = command
     path = CHECKOUT / name
     if name.startswith("bounce-mjx "):
@@ -168,7 +168,7 @@ def test_config_reference_is_fresh() -> None:
 
 
 def reference_rows() -> dict[str, list[str]]:
-    """The cells of every key of the config reference, behind the key."""
+    """For each key of the config reference, the cells that follow the key."""
     rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", config_reference.reference(), re.MULTILINE)
     return {key: re.split(r" (?<!\\)\| ", cells) for key, cells in rows}
 
@@ -190,7 +190,7 @@ def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
         assert flag.strip("`") in flags
         assert kind and meaning
         expected = defaults[key]
-        # Six digits of a number, in a list too.
+        # Numbers have six digits, also in a list.
         if isinstance(np.ravel(expected)[0], float):
             expected = pytest.approx(expected, rel=1e-5)
         assert yaml.safe_load(default) == expected
@@ -210,7 +210,8 @@ def refused(key: str, value: object) -> bool:
 
 
 def test_config_reference_has_the_true_ranges() -> None:
-    """Right outside a bound the key itself is refused, inside it is not."""
+    """A value just outside a bound is refused, and the error names the key; a value just inside is
+    accepted."""
     checked = 0
     for key, (_, kind, *_, limits, _) in reference_rows().items():
         if kind not in ("number", "whole number"):

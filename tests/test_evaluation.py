@@ -43,7 +43,7 @@ def env():
 
 
 def states(rows) -> State:
-    """A batch, batch last, from one dict of values an episode."""
+    """A batch (batch axis last) from one dict of values per episode."""
     defaults = {
         "x": TARGET_X, "y": 0.0, "vz": 0.0, "reward": 0.0, "done": 0.0,
         "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0,
@@ -72,7 +72,7 @@ def resting_state() -> State:
 
 
 def count(env, steps, first_step=0) -> Statistics:
-    """Statistics after a list of steps, each a list of one dict an episode."""
+    """Statistics after a list of steps; each step is a list of one dict per episode."""
     statistics = empty_statistics(len(steps[0]))
     for i, rows in enumerate(steps, start=first_step):
         statistics = accumulate(env, statistics, states(rows), jnp.int32(i))
@@ -103,7 +103,7 @@ def test_episode_counts_up_to_its_end(env):
     np.testing.assert_array_equal(s.rising_steps, [2, 4])
 
 
-def test_largest_count_is_kept(env):
+def test_largest_count_is_recorded(env):
     s = count(env, [[{"n_bounces": n}] for n in (1.0, 2.0, 3.0, 1.0)])
     np.testing.assert_array_equal(s.max_bounces, [3])
 
@@ -117,7 +117,7 @@ def test_settling_takes_two_seconds(env):
     np.testing.assert_array_equal(s.settled_bounces, [2])
     np.testing.assert_array_equal(s.accurate_bounces, [2])
     np.testing.assert_allclose(s.apex_error, [0.1])
-    # The upward speed is of the whole episode.
+    # The upward speed is measured over the whole episode.
     np.testing.assert_array_equal(s.rising_steps, [4])
 
 
@@ -186,7 +186,7 @@ def test_apex_counts_only_at_bounces(env):
         np.testing.assert_array_equal(value, [0])
 
 
-def test_speed_is_of_the_rising_ball(env):
+def test_speed_counts_only_the_rising_ball(env):
     s = count(env, [[{"vz": v}] for v in (0.5, -3.0, 0.0, 1.0)])
     np.testing.assert_array_equal(s.rising_steps, [2])
     np.testing.assert_array_equal(s.rising_speed, [1.5])
@@ -198,7 +198,7 @@ EPISODES = 200
 
 
 def statistics(**changes) -> Statistics:
-    """Of 200 episodes of 20 s that meet every result; `changes` replace fields."""
+    """Statistics of 200 episodes of 20 s that meet every result; `changes` replace fields."""
     perfect = {
         "running": True, "steps": 2000, "episode_return": 20_000, "max_bounces": 40,
         "settled_steps": 1800, "centred_steps": 1800, "settled_bounces": 30,
@@ -231,7 +231,7 @@ def test_perfect_statistics_pass(env):
 @pytest.mark.parametrize(
     ("result", "changes", "value", "passed"),
     [
-        # 99% of 200 episodes are 198.
+        # 99% of 200 episodes is 198.
         (BOUNCES, {"max_bounces": first(198, 3, 2)}, 99.0, True),
         (BOUNCES, {"max_bounces": first(197, 3, 2)}, 98.5, False),
         (BOUNCES, {"max_bounces": 2}, 0.0, False),
@@ -257,7 +257,7 @@ def test_result_at_its_bound(result, changes, value, passed, env):
     assert report.passed == passed
 
 
-def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
+def test_shares_weight_steps_and_bounces_equally(env):
     """One long accurate episode outweighs many short ones."""
     report = judge(
         env,
@@ -282,7 +282,7 @@ def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
     ],
 )
 def test_nothing_to_measure_fails(result, changes, env):
-    """It has no figure, as a number would be a good one for some quantities."""
+    """The result has no figure, because any number would be good for some quantities."""
     report = judge(env, statistics(**changes))
     assert report.results[result].passed is False
     assert report.results[result].value is None
@@ -295,7 +295,7 @@ def test_nothing_to_measure_fails(result, changes, env):
 
 
 def test_nothing_to_measure_is_shown_as_none(env):
-    """In the table, in Markdown, in the line of further figures and in the table of seeds."""
+    """This holds for the table, the Markdown, the line of other figures and the table of seeds."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     rows = show(results_table(report, "exp[lr]")).splitlines()
     assert "exp[lr]" in rows[0]
@@ -310,7 +310,7 @@ def test_nothing_to_measure_is_shown_as_none(env):
     cells = {row.split()[0]: row for row in rows}
     assert cells["0"].count("none") == 2
     assert cells["1"].count("none") == 0
-    # The seeds that have a figure do not speak for the one that has none.
+    # The mean of the seeds that have a figure would hide the seed that has none.
     assert cells["mean"].count("none") == cells["std"].count("none") == 2
     assert "1/3" in cells["mean"]
 
@@ -425,8 +425,8 @@ def random_policy(networks):
 
 
 def holding_policy(networks):
-    """Networks and a policy that hold the paddle level at home, where balls bounce for some 3 s,
-    or tilted if the target is above 0.5 m, so that they fall off."""
+    """Networks and a policy that hold the paddle level at home, where a ball bounces for about 3 s.
+    If the target is above 0.5 m they tilt the paddle, so that the ball falls off."""
     home = jnp.array(EnvConfig().default_joint_angles)
     tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
 
@@ -483,7 +483,7 @@ def test_evaluator_equals_a_python_loop(networks):
 
 
 class CountingBall(BounceBall):
-    """Counts how often a batch of it is stepped."""
+    """An environment that counts how often a batch of it is stepped."""
 
     def __init__(self, config):
         super().__init__(config)
@@ -547,7 +547,7 @@ def test_one_target_height_replaces_the_drawn_ones(random_policy, monkeypatch):
     assert env.config.randomization.terms == ("air_drag",)
 
 
-def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path):
+def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     mjcf = tmp_path / "one_iteration.xml"
     mjcf.write_text(text.replace(' iterations="4"', ' iterations="1"'), encoding="utf-8")
@@ -561,7 +561,7 @@ def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path
 
 
 def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_path):
-    """Both as they are, with null for a missing figure in the file."""
+    """The warnings are printed unchanged, and a missing figure is null in the file."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
     monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: evaluation)

@@ -39,7 +39,7 @@ def site(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
-    """Runs a script that sees the installed wheel only; the lines that it prints."""
+    """Runs a script that sees only the installed wheel, and returns the lines that it prints."""
     done = subprocess.run(
         [sys.executable, "-c", HIDE_CHECKOUT + script],
         cwd=cwd,
@@ -52,8 +52,8 @@ def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
 
 
 def test_import_is_light(tmp_path: Path) -> None:
-    """The package leaves JAX for its first use, and the environment needs none of what trainers,
-    other engines, viewers and adapters need."""
+    """The package imports JAX only at its first use, and the environment imports none of the
+    libraries of trainers, other engines, viewers and adapters."""
     script = """
 import sys
 import bounce_mjx
@@ -85,8 +85,8 @@ print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.module
 
 
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
-    """A copy of the package with one more term, added at the end of the others in rewards.py: the
-    config, the metrics, the reward, the viewer's bars and the report's figure have it."""
+    """In a copy of the package, one more term is added after the others in rewards.py. The config,
+    the metrics, the reward, the viewer's bars and the report's figure then have it."""
     copy = tmp_path / "src" / "bounce_mjx"
     shutil.copytree(CHECKOUT / "src" / "bounce_mjx", copy)
     for folder in ("mjcf", "configs"):
@@ -241,7 +241,7 @@ README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     ids=["jax", "torch", "gymnasium", "brax"],
 )
 def test_readme_example_runs(number, printed, request, capsys):
-    """The examples for each kind of user, as they stand."""
+    """The README's examples for each kind of user run unchanged."""
     needs = {1: "torch_libraries", 2: "opengl"}
     if number in needs:
         request.getfixturevalue(needs[number])

@@ -4,9 +4,8 @@ the manifest that tells whether a checkpoint is as it was written."""
 import hashlib
 import json
 import os
-import stat
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import pydantic
 from pydantic_core import to_jsonable_python
@@ -21,8 +20,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class Manifest(pydantic.BaseModel):
     """manifest.json: size and SHA-256 of every other file of a checkpoint, by name."""
 
-    format: Literal[1] = 1
-    files: dict[str, dict[Literal["size", "sha256"], int | str]]
+    format: int = 1
+    files: dict[str, dict[str, int | str]]
 
 
 def to_json(plain: Any) -> str:
@@ -72,39 +71,29 @@ def sync(path: Path) -> None:
 
 def seal(folder: Path) -> None:
     """Writes the manifest of a checkpoint whose other files are complete."""
-    files = {name: _entry(p) for name, p in _regular_files(folder).items() if name != MANIFEST_FILE}
-    write_atomically(folder / MANIFEST_FILE, to_json(Manifest(files=files)))
+    write_atomically(folder / MANIFEST_FILE, to_json(Manifest(files=_describe_files(folder))))
 
 
 def check_integrity(folder: Path) -> None:
     """Raises OSError or ValueError where a file is not as the manifest describes it."""
-    present = _regular_files(folder)
-    if present.pop(MANIFEST_FILE, None) is None:
-        raise ValueError(f"it has no {MANIFEST_FILE}")
+    found = _describe_files(folder)
     expected = read_json(folder / MANIFEST_FILE, Manifest).files
-    for name in sorted(present.keys() | expected.keys()):
-        if name not in present:
+    for name in sorted(found.keys() | expected.keys()):
+        if name not in found:
             raise ValueError(f"{name} is missing")
-        # The size first: a file may be too large to be hashed in reasonable time.
-        size = expected.get(name, {}).get("size")
-        if present[name].stat().st_size != size or _entry(present[name]) != expected[name]:
+        if found[name] != expected.get(name):
             raise ValueError(f"{name} is not as it was written")
 
 
-def _entry(path: Path) -> dict[str, int | str]:
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"size": path.stat().st_size, "sha256": digest}
-
-
-def _regular_files(folder: Path) -> dict[str, Path]:
-    """The files under a folder by relative name, without hidden ones; ValueError for a link or a
-    device, which may have no end."""
-    files = {}
-    for path in sorted(folder.rglob("*")):
-        mode = path.lstat().st_mode
-        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:
+    """The entries of a manifest; ValueError for a link or a device, which may have no end."""
+    entries = {}
+    for path in folder.rglob("*"):
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
             raise ValueError(f"{path.name} is not a regular file")
-        if stat.S_ISREG(mode) and not path.name.startswith("."):
-            files[path.relative_to(folder).as_posix()] = path
-    return files
+        if path.is_file() and not path.name.startswith(".") and path.name != MANIFEST_FILE:
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            entry = {"size": path.stat().st_size, "sha256": digest}
+            entries[path.relative_to(folder).as_posix()] = entry
+    return entries
