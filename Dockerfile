@@ -1,9 +1,9 @@
-# The main job on NVIDIA GPUs:
+# Image for training on NVIDIA GPUs:
 #   docker build -t bounce_mjx .
 #   docker run --gpus all -v "$PWD/runs:/app/runs" bounce_mjx --stop-when-solved
 FROM python:3.12-slim
 
-# Software OpenGL and EGL, for videos.
+# EGL and a software OpenGL driver, to render videos.
 RUN apt-get update \
  && apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri \
  && rm -rf /var/lib/apt/lists/*

@@ -1,4 +1,4 @@
-"""Overhead of the PyTorch adapter: the time of a step through it and of the jitted step alone.
+"""Overhead of the PyTorch adapter: the time of a step through it, and of the jitted step alone.
 
     python benchmarks/adapter.py --num-envs 4096 32768
 
@@ -31,7 +31,7 @@ class Command(StrictModel):
     num_envs: tuple[Annotated[int, Field(ge=1)], ...] = (4096,)
     """Batch sizes."""
     steps: Annotated[int, Field(ge=1)] = 1000
-    """Steps of a round."""
+    """Steps per round."""
     rounds: Annotated[int, Field(ge=1)] = 7
     """Rounds of each variant."""
     out: Path = Path("benchmarks/results")
@@ -39,7 +39,7 @@ class Command(StrictModel):
 
 
 def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
-    """Functions that do a number of steps and wait for the last."""
+    """Functions that take a number of steps and wait for the last one."""
     import torch
 
     from bounce_mjx.adapters.torch import TorchVectorEnv
@@ -121,7 +121,7 @@ def main() -> None:
                         f"{100.0 * (value / alone - 1.0):+.1f}",
                     ]
                 )
-        header = ["environments", "through", "us a step", "M env steps/s", "overhead, %"]
+        header = ["environments", "interface", "us per step", "M env steps/s", "overhead, %"]
         device = device_name()
         text = f"Device: {device}\n\n{markdown_table(header, rows)}"
         write(command.out, "adapter", {"device": device, "records": records}, text)

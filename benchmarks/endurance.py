@@ -2,8 +2,9 @@
 
     python benchmarks/endurance.py RUN --num-envs 1024 --minutes 10
 
-The policy acts without a time limit and without resets. An environment fails at its first end: the
-ball falls, flies off, ... Each row is one minute of simulated time.
+The policy acts without a time limit and without resets. An environment fails when its episode first
+terminates, for example because the ball falls or flies away. Each row is one minute of simulated
+time.
 """
 
 import resource
@@ -30,7 +31,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
 from bounce_mjx.runs.reading import load_policy
 
-# Share of the environments that must keep the ball up throughout.
+# Minimum share of environments that keep the ball up throughout.
 MIN_SHARE = 0.99
 
 
@@ -46,13 +47,13 @@ class Command(StrictModel):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = DEFAULT_SEED
     """Seed of the resets."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
     out: Path = Path("benchmarks/results")
     """Folder for endurance.json and endurance.md."""
 
 
 def measure(command: Command) -> list[dict]:
-    """One record a minute."""
+    """One record per minute."""
     checkpoint = find_checkpoint(command.checkpoint or newest_run(command.log_dir))
     config = load_run_config(checkpoint.run)
     env = BounceBall(config.env)
@@ -97,7 +98,7 @@ def measure(command: Command) -> list[dict]:
 
 
 def table(records: list[dict]) -> str:
-    """A row a minute."""
+    """One row per minute."""
     rows = [
         [
             str(r["minute"]),
@@ -113,7 +114,7 @@ def table(records: list[dict]) -> str:
     ]
     header = [
         "minute",
-        "up since the start %",
+        "ball up since the start %",
         "horizontal %",
         "height %",
         "mean apex error, cm",
@@ -125,7 +126,7 @@ def table(records: list[dict]) -> str:
 
 
 def main() -> None:
-    """Runs the command line; exit status 1 if too few environments kept the ball up."""
+    """Runs the command line; the exit status is 1 if too few environments kept the ball up."""
     with exit_on_user_error():
         command = parse(
             Command,

@@ -4,18 +4,18 @@
     python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # some of them
     python benchmarks/jax_vs_torch.py --methods --merge FILES            # existing records only
 
-ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax; the hyperparameters
-are the config's as far as each library has them (`trainers.py`, `adapters/torch/rsl_rl_ppo.py`,
-`adapters/torch/skrl_ppo.py`). Each training is a separate process with an empty compilation cache.
-All start episodes with the task's resets, and every `eval_every` steps the policy without noise is
-judged by the same evaluation on the same resets, on the fused physics.
+The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax.
+They use the config's hyperparameters as far as each library has them (`trainers.py`,
+`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py`). Each training is a separate process
+with an empty compilation cache. All trainers start episodes with the task's resets. Every
+`eval_every` steps, the same evaluation measures the policy without noise, on the same resets and on
+the fused physics.
 
 - Training clock: time in the trainer, without evaluations and without compiling. The first two
-  blocks of a trainer may compile, so each counts at most as the median of the later blocks.
-- From process start: the whole time, with the evaluations, whose program compiles while the trainer
-  trains.
-- Each evaluation is written to jax_vs_torch.jsonl as it ends, so that a run that was cut short has
-  its evaluations up to then. A new run of a (method, seed) replaces the earlier one.
+  blocks of a trainer may compile, so each of them counts as at most the median of the later blocks.
+- From process start: the whole time, including the evaluations, whose program compiles while the
+trainer trains. - Each evaluation is written to jax_vs_torch.jsonl when it ends, so that an
+interrupted run keeps its evaluations. A new run of a method and seed replaces the earlier one.
 """
 
 import json
@@ -79,11 +79,11 @@ class Command(TrainConfig):
     config: Path | None = None
     """Preset: a YAML file. The default is the device's preset, configs/default.yaml on a GPU."""
     methods: tuple[Method, ...] = METHODS
-    """Trainers to run; none to show the existing records."""
+    """Trainers to run; give none to show only the existing records."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2)
     """Seeds of the trainings."""
     max_seconds: Annotated[float, Field(gt=0.0)] = 570.0
-    """Time limit of a training's process, s; the training ends at its next evaluation."""
+    """Time limit of a training's process, s; after it, the training ends at its next evaluation."""
     stop_at_solved: bool = False
     """End each training at its first evaluation that meets all five results."""
     merge: tuple[Path, ...] = ()
@@ -91,7 +91,7 @@ class Command(TrainConfig):
     out: Path = Path("benchmarks/results")
     """Folder for jax_vs_torch.jsonl, .md and .png."""
     worker: bool = False
-    """Train one method and seed in this process; the command starts such processes itself."""
+    """Train one method and seed in this process; the command itself starts such processes."""
 
 
 def main() -> None:
@@ -129,12 +129,12 @@ def read_command(args: list[str]) -> Command:
 
 
 def train_in_a_process(command: Command, args: list[str], method: Method, seed: int) -> None:
-    """Trains one method with one seed, cold."""
+    """Trains one method with one seed in a new process, with an empty compilation cache."""
     own = ["--methods", method, "--seed", str(seed), "--worker", "--out", str(command.out)]
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {
             "JAX_COMPILATION_CACHE_DIR": cache,
-            # JAX would otherwise reserve most of the memory, of which PyTorch needs some.
+            # JAX would otherwise reserve most of the memory, and PyTorch needs some of it.
             "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
             _STARTED: str(time.time()),
         }
@@ -174,7 +174,7 @@ class _Judge:
         self._device = device_name()
 
     def prepare(self) -> None:
-        """Starts to compile the evaluation."""
+        """Starts the compilation of the evaluation."""
         self._policy = jax.eval_shape(self._empty_policy)
         self._evaluator = _Background(self._compile)
 
@@ -222,8 +222,8 @@ class _Judge:
 
 
 def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]:
-    """The evaluations of the newest run of each method and seed, in order, each with its training
-    clock `train_seconds`."""
+    """The evaluations of the newest run of each method and seed, in order; each record gets its
+    training clock, `train_seconds`."""
     runs: dict[str, list[Record]] = {}
     for record in records:
         runs.setdefault(record["run"], []).append(record)
@@ -242,7 +242,7 @@ def newest_runs(records: list[Record]) -> dict[tuple[Method, int], list[Record]]
 
 
 def summarize(runs: dict[tuple[Method, int], list[Record]]) -> dict[Method, dict[str, list]]:
-    """For each method the figures of each seed; None for a figure that a run did not reach."""
+    """The figures of each seed by method; None for a figure that a run did not reach."""
     summary: dict[Method, dict[str, list]] = {}
     for method in METHODS:
         of_method = [run for (name, _), run in sorted(runs.items()) if name == method]
@@ -299,7 +299,7 @@ def table(runs: dict[tuple[Method, int], list[Record]]) -> str:
     ]
     return (
         f"Device: {some['device']}, {some['num_envs']:,} environments. Mean over the seeds that "
-        f"reached the figure (least to most).\n\n{markdown_table(header, rows)}"
+        f"reached the figure (minimum to maximum).\n\n{markdown_table(header, rows)}"
     )
 
 
@@ -336,7 +336,7 @@ def plot(runs: dict[tuple[Method, int], list[Record]], path: Path) -> None:
 
 
 class _Background:
-    """A value that a daemon thread computes; a pool would delay the end of the process."""
+    """A value that a daemon thread computes; a thread pool would delay the end of the process."""
 
     def __init__(self, compute):
         self._thread = threading.Thread(target=self._run, args=(compute,), daemon=True)

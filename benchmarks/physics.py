@@ -1,10 +1,10 @@
-"""Physics steps per second of the engines at several batch sizes, measured in turns.
+"""Physics steps per second of each engine at several batch sizes.
 
     python benchmarks/physics.py --batch-sizes 512 4096 --engines fused mjx c
 
-One measurement is a program of `--control-steps` control steps (10 physics steps each) under
-random actions. The engines take turns. The fastest of the repeats counts, as other work on the
-machine can only slow a repeat down.
+One measurement is a program of `--control-steps` control steps (10 physics steps each) under random
+actions. The engines take turns. The fastest repeat counts, because other work on the machine can
+only slow a repeat down.
 """
 
 import os
@@ -38,7 +38,7 @@ class Command(StrictModel):
     engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
     """Engines; c is MuJoCo's C engine on all processor cores."""
     control_steps: Annotated[int, Field(ge=1)] = 50
-    """Control steps in one measurement of the fused engine; the slower engines do 2."""
+    """Control steps in one measurement of the fused engine; the slower engines take only 2."""
     repeats: Annotated[int, Field(ge=1)] = 5
     """Measurements of each engine."""
     out: Path = Path("benchmarks/results")
@@ -73,7 +73,7 @@ def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[
 
 
 def c_program(batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
-    """A program of the C engine on all cores."""
+    """A function that runs the C engine on all cores, and its compile time, 0."""
     env = BounceBall()
     model, threads = env.mj_model, os.cpu_count() or 1
     rng = np.random.default_rng(0)

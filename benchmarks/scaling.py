@@ -1,11 +1,11 @@
-"""Scaling of the training with the number of seeds and the number of devices.
+"""Scaling of the training with the number of seeds and with the number of devices.
 
     python benchmarks/scaling.py --num-seeds 1 4 16 --num-devices 1 2 4
 
-Seeds: the time of one block of training with S seeds in one program, relative to one seed.
-Devices: environment steps per second on D devices with `--num-envs` environments on each, relative
-to one device. The hyperparameters come from the preset. Only the compiled block is timed. The
-fastest of the repeats counts, as other work on the machine can only slow a repeat down.
+Seeds: the time of one block of training with S seeds in one program, relative to one seed. Devices:
+environment steps per second on D devices with `--num-envs` environments on each, relative to one
+device. The hyperparameters come from the preset. Only the compiled block is timed. The fastest
+repeat counts, because other work on the machine can only slow a repeat down.
 """
 
 import sys
@@ -108,8 +108,8 @@ def table(records: list[dict]) -> str:
     header = [
         "seeds",
         "devices",
-        "environments a seed",
-        "ms a block",
+        "environments per seed",
+        "ms per block",
         "M steps/s",
         "time x",
         "steps/s x",

@@ -1,7 +1,7 @@
 """skrl's PPO in JAX on this environment, for `jax_vs_torch.py`.
 
-The hyperparameters are those of `adapters/torch/skrl_ppo.py`, except that skrl's JAX side clips the
-gradients of each network separately and has a learning rate for each network.
+The hyperparameters are the same as in `adapters/torch/skrl_ppo.py`, except that skrl's JAX side
+clips the gradients of each network separately and adapts a learning rate for each network.
 """
 
 from typing import Any
@@ -26,8 +26,8 @@ from bounce_mjx.task.env import BounceBall
 
 
 class SkrlJaxLearner:
-    """skrl's agent, stepped as its trainers do, but with the terminal observation at an episode's
-    end, from which it then bootstraps a time-out."""
+    """skrl's agent, stepped as skrl's trainers do. At the end of an episode it gets the terminal
+    observation, so that it bootstraps a time-out from that observation."""
 
     def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
         skrl.config.jax.key = seed
@@ -137,7 +137,7 @@ class SkrlJaxLearner:
                 self.agent.post_interaction(**clock)
 
     def policy(self) -> Policy:
-        """The present policy, without its noise."""
+        """The current policy, without action noise."""
         params = self.agent.policy.state_dict.params["params"]
         depth = len(self.config.hidden_layers)
         hidden = {f"hidden_{i}": params[f"Dense_{i}"] for i in range(depth)}
@@ -161,7 +161,7 @@ class SkrlJaxLearner:
 
 
 class Normalizer:
-    """This project's normalisation as skrl's preprocessor."""
+    """This project's normalisation as a skrl preprocessor."""
 
     def __init__(self, size: int):
         self.statistics = init_statistics(size)
@@ -177,7 +177,7 @@ class Normalizer:
 
 
 def make_models(config: PPOConfig) -> tuple[type[Model], type[Model]]:
-    """The policy and the value network of the config as skrl's models."""
+    """The config's policy and value networks as skrl models."""
     wide = nn.initializers.orthogonal(2**0.5)
 
     def hidden(x: jax.Array) -> jax.Array:

@@ -2,10 +2,10 @@
 
     python benchmarks/sweep.py --trials 20 --seeds 8 --storage runs/sweep.db
 
-A trial's value is the share of results met, over all evaluations and seeds: it rewards learning
-early as well as staying good. The storage file holds the study. The same command continues an
-interrupted search and repeats an interrupted trial, so run only one process at a time. Needs optuna
-(the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of
+A trial's value is the share of results met over all evaluations and seeds. It rewards both early
+learning and lasting success. The storage file holds the study. The same command continues an
+interrupted search and repeats its interrupted trials, so run only one process at a time. Needs
+optuna (the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of
 `bounce-mjx eval`.
 """
 
@@ -51,9 +51,9 @@ class Command(StrictModel):
     """The command line."""
 
     config: Path | None = None
-    """YAML file with the fixed settings. The default is the preset of the device."""
+    """YAML file with the fixed settings. The default is the device's preset."""
     trials: Annotated[int, Field(ge=1)] = 20
-    """Total number of trials, with the trials of earlier calls."""
+    """Total number of trials, including those of earlier calls."""
     seeds: Annotated[int, Field(ge=1)] = 8
     """Seeds of each trial."""
     steps: Annotated[int, Field(ge=1)] = 20_000_000

@@ -2,8 +2,8 @@
 
     python benchmarks/train.py --seeds 0 1 2 3 4 --engines fused mjx mujoco
 
-Each training is a separate process with an empty compilation cache: `train_jax.py
---stop-when-solved`, as a user would start it, with the flags after `--`.
+Each training is a separate process with an empty compilation cache. It runs
+`train_jax.py --stop-when-solved` as a user would, with the flags that follow `--`.
 """
 
 import json
@@ -34,7 +34,8 @@ class Command(StrictModel):
     engines: tuple[Literal["fused", "mjx", "mujoco"], ...] = ("fused", "mujoco")
     """Engines on which each trained policy is evaluated, 1,024 episodes each."""
     stop_when_solved: bool = True
-    """End a training at its first evaluation that meets all results, or else at total_steps."""
+    """End a training at its first evaluation that meets all results, or at total_steps if none
+    does."""
     out: Path = Path("benchmarks/results")
     """Folder for train.json and train.md."""
 
@@ -72,7 +73,7 @@ def evaluate_on(run: str, engine: str, folder: Path) -> dict:
         stderr=subprocess.PIPE,
         text=True,
     )
-    # Status 1 is a failed result, which is a valid measurement.
+    # Status 1 means that a result failed, which is a valid measurement.
     if finished.returncode not in (0, 1):
         raise UserError(f"the evaluation on {engine} failed: {finished.stderr[-500:]}")
     return json.loads(out.read_text(encoding="utf-8"))

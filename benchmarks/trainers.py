@@ -1,20 +1,20 @@
-"""The trainers that `jax_vs_torch.py` compares, each as one function.
+"""The trainers that `jax_vs_torch.py` compares, one function each.
 
 Each trains on the config's environment until `on_block` returns True. `on_block` receives the
 number of environment steps so far, the block's time in seconds, and the policy.
 
-For ours, rsl_rl, skrl and skrl_jax the hyperparameters are in the tables of
-`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py` and `skrl_jax.py`. For brax, on the
-fused and on the mjx physics:
+For rsl_rl, skrl and skrl_jax, the differences of the hyperparameters from ours are in the tables of
+`adapters/torch/rsl_rl_ppo.py` and `adapters/torch/skrl_ppo.py`, and in `skrl_jax.py`. For brax, on
+the fused and on the mjx physics:
 
 | PPOConfig                         | brax                                             |
 |-----------------------------------|--------------------------------------------------|
-| all settings that are not below   | the same                                         |
-| value_cost                        | the same; doubled, as brax halves it             |
-| learning_rate, its limits, target_kl | the same; adapted by 1.5 (here 1.1)           |
+| settings not listed below         | the same                                         |
+| value_cost                        | the same; passed doubled, as brax halves it      |
+| learning_rate, its limits, target_kl | the same; adapted by a factor of 1.5 (ours 1.1) |
 | decay_steps                       | none                                             |
 | advantages                        | recomputed by the current network for each minibatch |
-| resets                            | each environment always to its own first state   |
+| resets                            | each environment always resets to its first state |
 """
 
 import concurrent.futures
@@ -75,14 +75,14 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
         state, _ = jax.block_until_ready(run_block(state))
         seconds = time.perf_counter() - started
         steps += iterations * config.ppo.batch_steps
-        # A copy, as the next block reuses the memory of the state.
+        # Copied because the next block reuses the state's memory.
         ended = on_block(
             steps, seconds, jax.tree.map(jnp.copy, policy_of(state, env.observation_size))
         )
 
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
-    """A PyTorch library on the adapter."""
+    """A PyTorch library on the PyTorch adapter."""
     from bounce_mjx.adapters.torch.trainer import make_learner
 
     learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
@@ -112,11 +112,11 @@ def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
 
 
 class _TrainingEnded(Exception):
-    """Ends brax's training, which cannot be stopped otherwise."""
+    """Ends brax's training, which offers no other way to stop."""
 
 
 class CriticObservation(Wrapper):
-    """Observations as this project's networks take them: for the policy, and for the critic."""
+    """Observations for the policy and for the critic, as this project's networks expect them."""
 
     def __init__(self, env: BounceBall, critic_metrics: tuple[str, ...]):
         super().__init__(env)
@@ -216,7 +216,7 @@ def brax_networks(config: PPOConfig, observation_size: int, action_size: int) ->
 
 
 def _normalizer(statistics, key: str) -> Normalizer:
-    """The normaliser of one of brax's observations."""
+    """The normaliser of one entry of brax's observation."""
     return Normalizer(statistics.mean[key], statistics.std[key])
 
 

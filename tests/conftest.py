@@ -1,6 +1,6 @@
-"""Tests of optional packages are skipped where a package is missing; CI must have all of them.
+"""Tests of an optional package are skipped if the package is missing; CI must have all packages.
 
-All tests and their processes share one cache of compiled programs, which ends with them.
+All tests and their processes share one cache of compiled programs, which is deleted at the end.
 """
 
 import importlib.util
@@ -44,7 +44,7 @@ def pytest_report_header() -> list[str]:
 
 @pytest.fixture
 def float64() -> Iterator[None]:
-    """Everything in the test runs in float64."""
+    """Runs the whole test in float64."""
     with jax.enable_x64(True):
         yield
 

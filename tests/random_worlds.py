@@ -10,7 +10,8 @@ from bounce_mjx.robot.model import find_addresses
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, all of them given but for the friction of a contact without."""
+    """The model's own numbers, all of them given but for those that it has not: friction and
+    force limits."""
     at = find_addresses(mj_model)
     links = mj_model.jnt_bodyid[at.arm_joints,]
     stiffness, damping = direct_solref(mj_model)

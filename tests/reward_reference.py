@@ -1,6 +1,6 @@
 """The fifteen reward terms of the original specification in float64 NumPy, formula by formula.
 
-Independent of the package on purpose: every constant is written as in the specification.
+It is independent of the package on purpose: every constant is written as in the specification.
 """
 
 import numpy as np
@@ -62,8 +62,9 @@ def reference_terms(
     # 2. Out of position
     r_out = -2.0 / (1 + exp(-(err_xy - 0.05) / 0.03))
 
-    # 3. Velocity matching; a case's velocity counts as 0 where the case does not hold, which the
-    # specification leaves open: its smooth weights alone would let every case leak into the others.
+    # 3. Velocity matching. The velocity of a case is 0 where the case does not hold. The
+    # specification leaves this open, but with its smooth weights alone every case would leak into
+    # the others.
     dh = h_target - z_ball
     v_desired = 0.5
     v_up = np.where((v_z > 0) & (z_ball < h_target), sqrt(maximum(0, v_z**2 - 2 * g * dh)), 0.0)

@@ -41,14 +41,14 @@ def evaluation(method, seed, steps, block_seconds, passed=False, run=1.0):
     }
 
 
-def test_training_clock_leaves_compiling_out(benchmark):
+def test_training_clock_excludes_compilation(benchmark):
     seconds = (9.0, 3.0, 1.0, 2.0)
     records = [evaluation("brax", 0, 100 * (i + 1), s) for i, s in enumerate(seconds)]
     run = benchmark.newest_runs(records)["brax", 0]
     assert [record["train_seconds"] for record in run] == [1.5, 3.0, 4.0, 6.0]
 
 
-def test_newest_run_counts_and_a_part_of_a_run_too(benchmark):
+def test_the_newest_run_counts_even_if_it_is_incomplete(benchmark):
     old = [evaluation("ours", 0, 100, 1.0, passed=True)]
     new = [evaluation("ours", 0, steps, 1.0, steps > 200, run=2.0) for steps in (100, 200, 300)]
     whole = [evaluation("rsl_rl", 0, steps, 2.0, steps > 300) for steps in (100, 200, 300, 400)]
@@ -65,7 +65,8 @@ def test_newest_run_counts_and_a_part_of_a_run_too(benchmark):
 @pytest.mark.usefixtures("torch_libraries")
 @pytest.mark.parametrize("methods", [("ours", "rsl_rl"), ("brax", "skrl"), ("skrl_jax",)])
 def test_trainers_are_compared(methods, tmp_path):
-    """Each in a process of its own; one table, one plot, one line an evaluation."""
+    """Each trainer runs in its own process; together they give one table, one plot, and one line
+    per evaluation."""
     command = [sys.executable, "jax_vs_torch.py", *TINY, "--out", tmp_path, "--methods", *methods]
     done = subprocess.run(
         command,

@@ -46,7 +46,7 @@ def test_brax_makes_the_environment():
 
 
 def test_randomization_by_brax_is_refused(env):
-    """brax would replace `env.sys`, which the environment does not have."""
+    """brax's domain randomisation would replace `env.sys`, which the environment does not have."""
     with pytest.raises(UserError, match="randomization_fn .* no effect; .*randomize"):
         training.wrap(env, randomization_fn=lambda system: (system, None))
 
@@ -58,7 +58,7 @@ def test_randomization_by_brax_is_refused(env):
 def brax_episode(env):
     """Four environments in brax's own training wrappers, over two time-outs of 3 steps."""
     wrapped = training.wrap(env, episode_length=3)
-    # brax reads the batch off the shape of keys of the old kind.
+    # brax reads the batch size from the shape of old-style keys.
     states = [jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(8), 4))]
     wrapped_step = jax.jit(wrapped.step)
     actions = jax.random.uniform(jax.random.key(9), (6, 4, 6), minval=-1.0)
@@ -87,7 +87,7 @@ def test_brax_vmap_wrapper_equals_single_steps(brax_episode, env):
 
 
 def test_step_keeps_what_wrappers_added(env):
-    """Metrics and info, as every environment of brax does."""
+    """A step keeps unknown metrics and info, as every brax environment does."""
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     state = state.replace(metrics=state.metrics | {"mine": jnp.ones(())}, info={"lap": jnp.ones(3)})
     after = jax.jit(env.step)(state, jnp.zeros(6))
@@ -117,7 +117,7 @@ def train(trainer, env, networks, **settings):
 
 
 def assert_evaluated(metrics):
-    """The evaluation has the return and its terms, which sum to it."""
+    """The evaluation reports the return and its terms, and the terms sum to the return."""
     terms = [float(metrics[f"eval/episode_reward/{name}"]) for name in TERM_NAMES]
     np.testing.assert_allclose(metrics["eval/episode_reward"], sum(terms), rtol=1e-4)
     assert 0.0 < metrics["eval/avg_episode_length"] <= 20.0
@@ -203,8 +203,8 @@ def test_brax_apg_learns(env):
 # jax.device_put_replicated
 
 
-def test_device_put_replicated_is_there_only_within(monkeypatch):
-    # Where jax still had the function it would be left alone: the next test.
+def test_device_put_replicated_exists_only_in_the_context(monkeypatch):
+    # If jax still has the function, it is left alone: see the next test.
     monkeypatch.delattr(jax, "device_put_replicated", raising=False)
     with pytest.raises(KeyError), pmap_support.device_put_replicated():
         assert jax.device_put_replicated is pmap_support.replicate
@@ -233,13 +233,13 @@ def test_replicate_copies_arrays_numbers_and_keys():
     )
 
 
-def test_replicate_asks_for_a_device():
+def test_replicate_requires_a_device():
     with pytest.raises(ValueError, match="at least one"):
         pmap_support.replicate(jnp.zeros(2), [])
 
 
 def test_replicate_puts_one_copy_on_each_device():
-    # The number of CPU devices is fixed when jax starts: hence the process.
+    # Runs in a separate process because the number of CPU devices is fixed when jax starts.
     program = """
 import jax, numpy as np
 jax.config.update("jax_platforms", "cpu")

@@ -1,4 +1,4 @@
-"""The commands: the files that they leave, and their answers to mistakes."""
+"""The commands: the files that they write, and their messages after mistakes."""
 
 import json
 import re
@@ -47,9 +47,8 @@ def run(trained: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd) -> Fails:
-    """A function (main, arguments) -> the sentence with which the command refuses them.
-
-    The command runs in an empty directory, in which it must leave everything as it is.
+    """A function (main, arguments) -> the sentence with which the command refuses the arguments.
+    The command runs in an empty directory, which it must leave unchanged.
     """
     monkeypatch.chdir(tmp_path)
 
@@ -169,7 +168,7 @@ def test_bad_config_file(fails: Fails, tmp_path: Path, case: tuple) -> None:
     assert_says(fails(train_command.main, ["--config", "my.yaml"]), ["my.yaml", *words])
 
 
-def test_flag_is_judged_on_top_of_the_config_file(fails: Fails, tmp_path: Path) -> None:
+def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Path) -> None:
     (tmp_path / "my.yaml").write_text("ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 4}")
     sentence = fails(train_command.main, "--config my.yaml --num-envs 9 --rollout-length 5".split())
     assert_says(sentence, ("num_minibatches 4", "45 samples", "choose a divisor of 45"))
@@ -301,7 +300,7 @@ RESUME_CHANGES = {
 
 
 @pytest.mark.parametrize("key", RESUME_CHANGES)
-def test_resume_cannot_change_what_shapes_the_state(fails: Fails, run: Path, key: str) -> None:
+def test_resume_cannot_change_the_shapes_of_the_state(fails: Fails, run: Path, key: str) -> None:
     sentence = fails(train_command.main, ["--resume", "run", *RESUME_CHANGES[key].split()])
     assert_says(sentence, (f"cannot change {key};", "leave those flags out"))
 
@@ -379,7 +378,7 @@ def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
 
 
 def test_run_logs_to_tensorboard(trained: Path) -> None:
-    """A result without a figure, such as the height without a bounce, has no point."""
+    """A result without a figure, such as the height without a bounce, has no point in the log."""
     log = EventAccumulator(str(trained)).Reload()
     evaluations = json.loads((trained / "results.json").read_text())["evaluations"]
     measured = {name for name in RESULT_NAMES if any(e[name] is not None for e in evaluations)}
@@ -406,7 +405,7 @@ def test_run_logs_to_tensorboard(trained: Path) -> None:
 
 
 def evaluate(args: list[str], json_file: Path) -> dict:
-    """Runs the command on a policy that fails; the content of its JSON file."""
+    """Runs the command on a policy that fails, and returns the content of its JSON file."""
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([*map(str, args), "--episodes", "4", "--json", str(json_file)])
     assert exit_info.value.code == 1

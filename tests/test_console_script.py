@@ -51,7 +51,7 @@ def test_help_of_a_command_names_it(name: str, capsys) -> None:
     assert f"usage: bounce-mjx {name} " in capsys.readouterr().out
 
 
-def test_every_command_has_its_module_and_the_package_its_own_form() -> None:
+def test_every_command_also_runs_as_a_module() -> None:
     for name in console_script.COMMANDS:
         assert callable(
             importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}").main

@@ -16,8 +16,9 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy import loading
-from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import describe, export_jax, export_onnx
+from bounce_mjx.deploy.histories import Histories
 from bounce_mjx.deploy.metadata import from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
@@ -29,8 +30,8 @@ from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.observation import QUANTITIES
-from bounce_mjx.task.sensing import Sensing
+from bounce_mjx.task.observation import QUANTITIES, Kinematics
+from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
@@ -168,7 +169,7 @@ def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations)
         np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
 
 
-def test_metadata_tells_what_the_network_takes_and_gives(runs: dict[str, Path]) -> None:
+def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) -> None:
     model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"])))
     metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
     config = load_run_config(runs["sensors"])
@@ -217,13 +218,13 @@ def test_paddle_position_is_that_of_mujoco(edited: bool, tmp_path: Path) -> None
     (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
     metadata = describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
     model = load_model(tmp_path / "arm.xml", 0.001)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data, rng, chain = mujoco.MjData(model), np.random.default_rng(0), Chain(metadata)
     for _ in range(20):
         angles = rng.uniform(-2.0, 2.0, 6)
         data.qpos[:6] = angles
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(
-            paddle_position(metadata, angles), data.geom("blocker").xpos, atol=1e-12
+            chain.paddle_position(angles), data.geom("blocker").xpos, atol=1e-12
         )
 
 
@@ -274,6 +275,73 @@ def test_histories_are_those_of_the_environment(name: str, policies) -> None:
     still = range(env.layout["ball_quaternion"].start + 1, env.layout["ball_quaternion"].stop)
     still = {*still, *range(*env.layout["ball_angular_velocity"].indices(env.layout.size))}
     assert set(range(env.layout.size)) - reached <= still
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: int) -> None:
+    """Random numbers of past values, and a ball on a made-up path over a moving paddle."""
+    rng = np.random.default_rng(seed)
+    lengths = {quantity.name: int(rng.integers(0, 5)) for quantity in QUANTITIES}
+    lengths["bounce_interval"] += 1
+    env = TrainConfig(env={"observation": lengths}).env
+    metadata = describe(TrainConfig(env=env), 0)
+    chain, times = Chain(metadata), np.arange(200) * env.control_dt
+    angles = np.array(env.default_joint_angles) + 0.05 * np.sin(times[:, None] * np.arange(3, 9))
+    paddle = np.array([chain.paddle_position(a) for a in angles])
+    ball = paddle + rng.normal(scale=0.01, size=paddle.shape)
+    ball[:, 2] += 0.4 * np.abs(np.sin(5.0 * times)) + 0.02
+    actions = rng.uniform(-1.0, 1.0, (200, 6))
+    truth = Kinematics(
+        joint_angles=angles,
+        ball_position=ball,
+        ball_quaternion=rng.normal(size=(200, 4)),
+        joint_velocities=rng.normal(size=(200, 6)),
+        ball_velocity=rng.normal(size=(200, 3)),
+        ball_angular_velocity=rng.normal(size=(200, 3)),
+        paddle_position=paddle,
+    )
+    targets, ages = rng.uniform(0.4, 0.6, (200, 1)), 0.03 - 0.0001 * np.arange(200)[:, None]
+    measured = truth._asdict() | {"target_height": targets, "action": actions, "ball_age": ages}
+    given = {name: values for name, values in measured.items() if name != "action"}
+
+    def at(i: int, values: dict) -> dict:
+        return {name: array[i] for name, array in values.items()}
+
+    @jax.jit
+    def remembered(memory, measured, near_height):
+        picture = memory.picture._replace(position=measured["ball_position"])
+        target = measured["target_height"][0]
+        return remember(memory, measured, picture, near_height, target, env.control_dt)
+
+    with jax.enable_x64(True):
+        start = Kinematics(*(jnp.asarray(values[0]) for values in truth))
+        memory = start_sensing(
+            env.randomization, env.observation, env.control_dt, start, jnp.asarray(targets[0, 0])
+        )
+        histories = Histories(metadata, at(0, given) | {"ball_age": np.zeros(1)})
+        for i in range(1, 200):
+            near_height = paddle[i, 2] + env.bounce_max_distance
+            memory = remembered(memory, at(i, measured), near_height)
+            histories.add(at(i, given), actions[i])
+            for name, values in memory.seen.items():
+                seen = histories.values[input_name(name)]
+                np.testing.assert_allclose(seen, values, atol=1e-9, err_msg=f"{name} at {i}")
+    # The ball came down three times at least.
+    intervals = histories.values["bounce_interval"]
+    assert np.count_nonzero(intervals) >= min(3, len(intervals))
+
+
+def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> None:
+    """Without the age of a picture, a picture is new where the ball has moved."""
+    observation = dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
+    observation |= {"ball_velocity": 1, "velocity": "differences"}
+    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
+    assert policy.needs == ("ball_position",)
+    speeds = []
+    for x in (0.0, 0.001, 0.001, 0.005, 0.005, 0.005, 0.002):
+        policy.step({"ball_position": [x, 0.0, 0.3]})
+        speeds.append(policy.observation[0])
+    np.testing.assert_allclose(speeds, [0.0, 0.1, 0.1, 0.2, 0.2, 0.2, -0.1], atol=1e-12)
 
 
 def measured_once() -> dict:
@@ -387,7 +455,7 @@ def test_the_shipped_file_is_a_fresh_export() -> None:
     )
 
 
-def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> None:
+def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(UserError, match="nowhere.onnx cannot be read .*robust or pretrained"):
         load_policy("nowhere.onnx")
     with pytest.raises(UserError, match="not in a run's folder"):
@@ -398,7 +466,11 @@ def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> N
     newer = onnx.load_from_string(shipped)
     (entry,) = (prop for prop in newer.metadata_props if prop.key == "format")
     entry.value = "2"
+    unknown = onnx.load_from_string(shipped)
+    for prop in unknown.metadata_props:
+        prop.value = prop.value.replace("ball_velocity", "ball_colour")
     broken = {
+        "its input ball_colour is unknown": unknown.SerializeToString(),
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),
@@ -412,6 +484,17 @@ def test_load_policy_refuses_what_is_no_policy(tmp_path: Path, monkeypatch) -> N
     monkeypatch.setattr(loading, "resource_path", lambda name: tmp_path / name)
     with pytest.raises(UserError, match="the policy robust is not in this version .*pretrained"):
         load_policy("robust")
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    use = {
+        "onnx": lambda: export_onnx(pretrained_checkpoint()),
+        "onnxruntime": lambda: load_policy("pretrained"),
+    }
+    with pytest.raises(UserError, match=f"the package {package} is missing.*pip install"):
+        use[package]()
 
 
 # Everything of the project but NumPy and onnxruntime.
@@ -459,7 +542,7 @@ def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
     assert bounces >= 10 and survived == pytest.approx(8.0)
 
 
-def test_the_example_prints_what_it_measured(monkeypatch, capsys) -> None:
+def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:
     source = CHECKOUT / "examples" / "deploy.py"
     assert len(source.read_text(encoding="utf-8").splitlines()) <= 80
     monkeypatch.setattr(sys, "argv", ["deploy.py", "pretrained", "--seconds", "0.6"])

@@ -25,8 +25,10 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.config import command_line as cli
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.randomization import TERMS
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
@@ -39,7 +41,7 @@ def page_id(page: Path) -> str:
 
 
 def code(page: Path) -> list[str]:
-    """The lines of a page's code blocks, and its pieces of code in a sentence."""
+    """The lines of a page's code blocks, and its inline code."""
     text = page.read_text(encoding="utf-8")
     fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     rest = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -106,7 +108,7 @@ def test_the_documentation_shows_the_commands() -> None:
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the command's own parser; nothing else of it runs."""
+    """The command's own parser accepts them; nothing else of the command runs."""
     name, *args = command
     path = CHECKOUT / name
     if name.startswith("bounce-mjx "):
@@ -166,7 +168,7 @@ def test_config_reference_is_fresh() -> None:
 
 
 def reference_rows() -> dict[str, list[str]]:
-    """The cells of every key of the config reference, behind the key."""
+    """For each key of the config reference, the cells that follow the key."""
     rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", config_reference.reference(), re.MULTILINE)
     return {key: re.split(r" (?<!\\)\| ", cells) for key, cells in rows}
 
@@ -188,7 +190,7 @@ def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
         assert flag.strip("`") in flags
         assert kind and meaning
         expected = defaults[key]
-        # Six digits of a number, in a list too.
+        # Numbers have six digits, also in a list.
         if isinstance(np.ravel(expected)[0], float):
             expected = pytest.approx(expected, rel=1e-5)
         assert yaml.safe_load(default) == expected
@@ -208,7 +210,8 @@ def refused(key: str, value: object) -> bool:
 
 
 def test_config_reference_has_the_true_ranges() -> None:
-    """Right outside a bound the key itself is refused, inside it is not."""
+    """A value just outside a bound is refused, and the error names the key; a value just inside is
+    accepted."""
     checked = 0
     for key, (_, kind, *_, limits, _) in reference_rows().items():
         if kind not in ("number", "whole number"):
@@ -308,3 +311,24 @@ def test_packages_import_in_the_order_of_the_map():
             if wrong := imported & set(order[i + 1 :]):
                 against.append(f"{path.relative_to(package)} imports {wrong}")
     assert order and not against
+
+
+def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:
+    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
+    section = page.split("## Export a policy\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.+?) \| .+ \|$", section, re.MULTILINE)
+    entries = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(entries) == sorted(Metadata._fields)
+
+
+def test_robot_page_example_runs() -> None:
+    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    names: dict = {}
+    exec(compile(example, "real-robot.md", "exec"), names)
+    # The arm is in its posture, and no target is farther than the action scale.
+    angles = bounce_mjx.load_policy("pretrained").metadata.default_joint_angles
+    np.testing.assert_allclose(names["servo_targets"], angles, atol=0.02 + 0.005)

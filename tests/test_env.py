@@ -1,4 +1,4 @@
-"""`BounceBall`: observation, resets, actions, bounces, ends, faults, and its derivative."""
+"""`BounceBall`: observation, resets, actions, bounces, terminations, faults, and its derivative."""
 
 import functools
 import re
@@ -143,7 +143,8 @@ def test_observation_entries(entries, read, walked, model):
 
 
 def test_layout_names_the_parts_of_the_observation(walked, model):
-    """Its slices are the entries above; the true state has the same values under the same names."""
+    """The slices are the entries of the test above; the true state has the same values under the
+    same names."""
     assert OBSERVATION.size == 29
     kinematics = BounceBall().kinematics(walked.pipeline_state)._asdict()
     assert [*kinematics, "target_height"] == [part.name for part in OBSERVATION.parts]
@@ -186,7 +187,8 @@ def resets(env):
 
 
 def reset_noise(resets) -> dict[str, np.ndarray]:
-    """Every random entry of the resets, scaled so that it should be uniform in [-1, 1]."""
+    """Every random entry of the resets, scaled so that its distribution should be uniform in [-1,
+    1]."""
     obs = resets.obs.astype(np.float64)
     return {
         "joint angles": (obs[:, 0:6] - DEFAULT_ANGLES) / 0.1,
@@ -283,7 +285,8 @@ def test_action_is_clipped_to_one(reset, step):
 
 
 def c_step(model, physics, action) -> mujoco.MjData:
-    """One control step by MuJoCo's C engine: the action as SPEC.md words it, then 10 substeps."""
+    """One control step by MuJoCo's C engine: the action as the specification defines it, then 10
+    substeps."""
     data = mj_data(model, physics)
     for name, entry in zip(JOINTS, np.clip(action, -1, 1), strict=True):
         target = np.clip(data.joint(name).qpos[0] + 0.02 * entry, *model.joint(name).range)
@@ -348,7 +351,7 @@ def test_reset_and_step_report_the_same_metrics(episodes, reset):
 
 
 def test_reward_terms_follow_the_state(episodes, model):
-    """Against the specification's formulas on the state of MuJoCo's C engine."""
+    """The terms equal the specification's formulas, evaluated on the state of MuJoCo's C engine."""
     rows = []
     for before, action, after in episodes:
         data = mj_data(model, after.pipeline_state.physics)
@@ -391,7 +394,7 @@ PADDLE_Z = 0.05
 
 
 def drive(steps, start_height=0.45, target=0.5, config=None):
-    """Feeds ball heights and vertical velocities, one pair a step, to `update_task`.
+    """Feeds ball heights and vertical velocities, one pair per step, to `update_task`.
 
     Returns:
       bounced and n_bounces after each step, and the last task state.
@@ -566,7 +569,7 @@ def test_fast_joint_ends_the_episode(joint, sign, reset, finish):
         assert finish(state, jnp.zeros(6), moving).done == done
 
 
-def test_a_fast_or_spinning_ball_ends_nothing(reset, finish):
+def test_a_fast_or_spinning_ball_does_not_end_the_episode(reset, finish):
     state = reset(jax.random.key(0))
     physics = with_ball(state.pipeline_state.physics, velocity=(7, 7, 7), spin=(50, 50, 50))
     assert finish(state, jnp.zeros(6), physics).done == 0
@@ -582,7 +585,7 @@ def finish_each(env):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_non_finite_physics_ends_the_episode_and_goes_no_further(value, walked, finish_each):
+def test_non_finite_physics_ends_the_episode_and_does_not_spread(value, walked, finish_each):
     before = walked.pipeline_state
     qpos, qvel = np.tile(before.physics.qpos, (25, 1)), np.tile(before.physics.qvel, (25, 1))
     qpos[np.arange(13), np.arange(13)] = value
@@ -596,7 +599,7 @@ def test_non_finite_physics_ends_the_episode_and_goes_no_further(value, walked, 
 
 
 @pytest.mark.parametrize("speed", [1e20, 1e38])
-def test_diverged_physics_goes_no_further_either(speed, walked, finish):
+def test_diverged_physics_does_not_spread_either(speed, walked, finish):
     """Finite coordinates whose squares overflow, beyond MuJoCo's own limit of 1e10 (mjMAXVAL)."""
     physics = walked.pipeline_state.physics
     after = finish(walked, jnp.ones(6), physics._replace(qvel=physics.qvel.at[0].set(speed)))
@@ -610,7 +613,7 @@ def test_finite_steps_are_not_counted_as_faults(episodes):
 
 
 @pytest.mark.parametrize("broken", [range(6), [2]], ids=["all entries", "one entry"])
-def test_nan_action_ends_the_episode_and_goes_no_further(broken, walked, step):
+def test_nan_action_ends_the_episode_and_does_not_spread(broken, walked, step):
     action = jnp.zeros(6).at[jnp.array(list(broken))].set(jnp.nan)
     after = step(walked, action)
     assert after.done == 1
@@ -635,8 +638,8 @@ def test_fault_leaves_the_rest_of_the_batch_alone(env):
 
 
 def test_gradient_through_steps_with_a_contact_equals_finite_differences():
-    """The sum of the rewards of five steps, in which the ball hits the paddle, along a direction
-    of the actions; by central differences of the fourth order."""
+    """The derivative of the summed rewards of five steps, in which the ball hits the paddle, along
+    a direction of the actions, against central differences of the fourth order."""
     with jax.enable_x64(True):
         env = BounceBall()
         state = env.reset(jax.random.key(0))
@@ -655,7 +658,7 @@ def test_gradient_through_steps_with_a_contact_equals_finite_differences():
             )
             return rewards.sum(), after.metrics["n_bounces"]
 
-        # XLA takes most of its time to fuse what runs only a few times here.
+        # Without fusion XLA compiles much faster, and the program runs only a few times.
         compiled = functools.partial(jax.jit, compiler_options={"xla_disable_hlo_passes": "fusion"})
         (_, bounces), gradient = compiled(jax.value_and_grad(total, has_aux=True))(actions)
         assert bounces == 1.0

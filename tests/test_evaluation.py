@@ -15,6 +15,7 @@ from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
@@ -26,6 +27,7 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task.env import Memory
 from bounce_mjx.task.observation import OBSERVATION
 from bounce_mjx.task.state import State
 
@@ -42,7 +44,7 @@ def env():
 
 
 def states(rows) -> State:
-    """A batch, batch last, from one dict of values an episode."""
+    """A batch (batch axis last) from one dict of values per episode."""
     defaults = {
         "x": TARGET_X, "y": 0.0, "vz": 0.0, "reward": 0.0, "done": 0.0,
         "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0,
@@ -71,7 +73,7 @@ def resting_state() -> State:
 
 
 def count(env, steps, first_step=0) -> Statistics:
-    """Statistics after a list of steps, each a list of one dict an episode."""
+    """Statistics after a list of steps; each step is a list of one dict per episode."""
     statistics = empty_statistics(len(steps[0]))
     for i, rows in enumerate(steps, start=first_step):
         statistics = accumulate(env, statistics, states(rows), jnp.int32(i))
@@ -102,7 +104,7 @@ def test_episode_counts_up_to_its_end(env):
     np.testing.assert_array_equal(s.rising_steps, [2, 4])
 
 
-def test_largest_count_is_kept(env):
+def test_largest_count_is_recorded(env):
     s = count(env, [[{"n_bounces": n}] for n in (1.0, 2.0, 3.0, 1.0)])
     np.testing.assert_array_equal(s.max_bounces, [3])
 
@@ -116,8 +118,32 @@ def test_settling_takes_two_seconds(env):
     np.testing.assert_array_equal(s.settled_bounces, [2])
     np.testing.assert_array_equal(s.accurate_bounces, [2])
     np.testing.assert_allclose(s.apex_error, [0.1])
-    # The upward speed is of the whole episode.
+    # The upward speed is measured over the whole episode.
     np.testing.assert_array_equal(s.rising_steps, [4])
+
+
+def test_bounces_settle_again_after_a_change_of_the_target(env):
+    """Ages after the step, of a target that changed 0.01, 2 and 2.01 s before; and of one that
+    never does."""
+    row = {"bounced": 1.0, "apex_error": 0.05}
+    batch = states([row] * 4)
+    memory = Memory(
+        counter=jnp.zeros(4, jnp.int32),
+        step=jnp.full(4, 901),
+        phases=jnp.zeros((3, 4)),
+        target_age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
+        target_range=(jnp.full(4, 0.3), jnp.full(4, 0.8)),
+        actuation=None,
+        sensing=None,
+    )
+    changing = batch.pipeline_state._replace(
+        world={"target_interval": jnp.full(4, 4.0)}, memory=memory
+    )
+    s = accumulate(env, empty_statistics(4), batch.replace(pipeline_state=changing), jnp.int32(900))
+    np.testing.assert_array_equal(s.settled_bounces, [0, 0, 1, 1])
+    np.testing.assert_array_equal(s.accurate_bounces, [0, 0, 1, 1])
+    # The horizontal position does not depend on the target.
+    np.testing.assert_array_equal(s.settled_steps, [1, 1, 1, 1])
 
 
 def test_settling_follows_the_control_step():
@@ -161,7 +187,7 @@ def test_apex_counts_only_at_bounces(env):
         np.testing.assert_array_equal(value, [0])
 
 
-def test_speed_is_of_the_rising_ball(env):
+def test_speed_counts_only_the_rising_ball(env):
     s = count(env, [[{"vz": v}] for v in (0.5, -3.0, 0.0, 1.0)])
     np.testing.assert_array_equal(s.rising_steps, [2])
     np.testing.assert_array_equal(s.rising_speed, [1.5])
@@ -173,7 +199,7 @@ EPISODES = 200
 
 
 def statistics(**changes) -> Statistics:
-    """Of 200 episodes of 20 s that meet every result; `changes` replace fields."""
+    """Statistics of 200 episodes of 20 s that meet every result; `changes` replace fields."""
     perfect = {
         "running": True, "steps": 2000, "episode_return": 20_000, "max_bounces": 40,
         "settled_steps": 1800, "centred_steps": 1800, "settled_bounces": 30,
@@ -206,7 +232,7 @@ def test_perfect_statistics_pass(env):
 @pytest.mark.parametrize(
     ("result", "changes", "value", "passed"),
     [
-        # 99% of 200 episodes are 198.
+        # 99% of 200 episodes is 198.
         (BOUNCES, {"max_bounces": first(198, 3, 2)}, 99.0, True),
         (BOUNCES, {"max_bounces": first(197, 3, 2)}, 98.5, False),
         (BOUNCES, {"max_bounces": 2}, 0.0, False),
@@ -232,7 +258,7 @@ def test_result_at_its_bound(result, changes, value, passed, env):
     assert report.passed == passed
 
 
-def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
+def test_shares_weight_steps_and_bounces_equally(env):
     """One long accurate episode outweighs many short ones."""
     report = judge(
         env,
@@ -257,7 +283,7 @@ def test_shares_are_of_all_steps_and_bounces_not_of_episodes(env):
     ],
 )
 def test_nothing_to_measure_fails(result, changes, env):
-    """It has no figure, as a number would be a good one for some quantities."""
+    """The result has no figure, because any number would be good for some quantities."""
     report = judge(env, statistics(**changes))
     assert report.results[result].passed is False
     assert report.results[result].value is None
@@ -270,7 +296,7 @@ def test_nothing_to_measure_fails(result, changes, env):
 
 
 def test_nothing_to_measure_is_shown_as_none(env):
-    """In the table, in Markdown, in the line of further figures and in the table of seeds."""
+    """This holds for the table, the Markdown, the line of other figures and the table of seeds."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     rows = show(results_table(report, "exp[lr]")).splitlines()
     assert "exp[lr]" in rows[0]
@@ -285,7 +311,7 @@ def test_nothing_to_measure_is_shown_as_none(env):
     cells = {row.split()[0]: row for row in rows}
     assert cells["0"].count("none") == 2
     assert cells["1"].count("none") == 0
-    # The seeds that have a figure do not speak for the one that has none.
+    # The mean of the seeds that have a figure would hide the seed that has none.
     assert cells["mean"].count("none") == cells["std"].count("none") == 2
     assert "1/3" in cells["mean"]
 
@@ -351,6 +377,14 @@ def test_upward_speed_is_judged_only_for_low_targets(target_range, judged):
         assert report.passed == (passed or not judged)
 
 
+def test_upward_speed_is_judged_by_the_drawn_targets(env):
+    drawing = BounceBall(EnvConfig(randomization={"target_height": (0.3, 0.8)}))
+    fast = statistics(rising_speed=9000)
+    assert judge(drawing, fast).results[SPEED].passed is None
+    assert judge(drawing, fast, target_heights=(0.5, 0.5)).results[SPEED].passed is False
+    assert judge(env, fast, target_heights=(0.8, 0.8)).results[SPEED].passed is None
+
+
 def report_of(passed, mean_return) -> Report:
     results = tuple(Result("", "", 0.0, "", p) for p in passed)
     return Report(results, {"mean_return": mean_return})
@@ -393,8 +427,8 @@ def random_policy(networks):
 
 
 def holding_policy(networks):
-    """Networks and a policy that hold the paddle level at home, where balls bounce for some 3 s,
-    or tilted if the target is above 0.5 m, so that they fall off."""
+    """Networks and a policy that hold the paddle level at home, where a ball bounces for about 3 s.
+    If the target is above 0.5 m they tilt the paddle, so that the ball falls off."""
     home = jnp.array(EnvConfig().default_joint_angles)
     tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
 
@@ -451,7 +485,7 @@ def test_evaluator_equals_a_python_loop(networks):
 
 
 class CountingBall(BounceBall):
-    """Counts how often a batch of it is stepped."""
+    """An environment that counts how often a batch of it is stepped."""
 
     def __init__(self, config):
         super().__init__(config)
@@ -498,7 +532,24 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
 
 
-def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path):
+def test_one_target_height_replaces_the_drawn_ones(random_policy, monkeypatch):
+    """Also where the world of the training draws and changes it."""
+    drawn = {"target_height": (0.3, 0.8), "target_interval": (2.0, 4.0), "air_drag": (0.0, 0.1)}
+    config = EnvConfig(randomization=drawn, episode_seconds=0.5)
+    built = []
+
+    def make_evaluator(env, networks, episodes):
+        built.append(env)
+        return lambda policy, key: empty_statistics(episodes)
+
+    monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
+    evaluate_policy(random_policy, config, PPOConfig(), episodes=2, target_height=0.5)
+    (env,) = built
+    assert env.config.target_heights == (0.5, 0.5)
+    assert env.config.randomization.terms == ("air_drag",)
+
+
+def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     mjcf = tmp_path / "one_iteration.xml"
     mjcf.write_text(text.replace(' iterations="4"', ' iterations="1"'), encoding="utf-8")
@@ -512,7 +563,7 @@ def test_an_unconverged_solver_is_told_where_c_simulates(random_policy, tmp_path
 
 
 def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_path):
-    """Both as they are, with null for a missing figure in the file."""
+    """The warnings are printed unchanged, and a missing figure is null in the file."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
     monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: evaluation)

@@ -1,5 +1,5 @@
-"""Config files and command lines of any kind: each is a valid run or one sentence, and leaves the
-disk alone. 1,800 cases in all."""
+"""Config files and command lines of any kind: each gives a valid run or one error sentence, and
+never touches the disk. 1,800 cases in all."""
 
 import contextlib
 import io
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
 
 
 def cases(number: int) -> Callable:
-    """So many cases, the same in every run."""
+    """Settings for this number of cases, the same cases in every run."""
     return settings(
         max_examples=number,
         derandomize=True,
@@ -52,7 +52,7 @@ def cases(number: int) -> Callable:
 
 
 def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
-    """The command of a command line; None where one sentence refuses it or it asks for help."""
+    """The command of a command line; None if one sentence refuses it or if it asks for help."""
     before = contents(folder)
     out, err = io.StringIO(), io.StringIO()
     try:
@@ -72,7 +72,8 @@ def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
 
 
 def assert_valid_run(command: train_command.TrainCommand) -> None:
-    """Its config passes the validation again, and comes back from its file."""
+    """Checks that the command's config passes the validation again and survives a round trip
+    through a file."""
     config = config_of(command)
     again = TrainConfig.model_validate(yaml.safe_load(dump_config(config)))
     assert again == config
@@ -105,7 +106,7 @@ TREES = st.recursive(
 
 
 def groups(group: type[pydantic.BaseModel]) -> st.SearchStrategy[dict]:
-    """Trees with the keys of a config, some of them, and values of any kind."""
+    """Trees with some of the keys of a config and values of any kind."""
     fields = {}
     for name, field in group.model_fields.items():
         inner = field.annotation
@@ -190,7 +191,7 @@ def test_config_file_of_any_bytes(folder: Path, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("data", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_config_file_that_once_broke_something(folder: Path, data: bytes) -> None:
+def test_config_file_that_once_caused_an_error(folder: Path, data: bytes) -> None:
     read_config(folder, data)
 
 

@@ -16,7 +16,7 @@ from bounce_mjx.interrupt import run_interruptible
 TIMEOUT = 120.0
 
 
-def test_the_result_and_the_exception_come_through() -> None:
+def test_results_and_exceptions_are_passed_on() -> None:
     assert run_interruptible(divmod, 7, 2) == (3, 1)
     assert run_interruptible(int, "ff", base=16) == 255
     with pytest.raises(ZeroDivisionError):
@@ -25,7 +25,7 @@ def test_the_result_and_the_exception_come_through() -> None:
         run_interruptible(sys.exit, 2)
 
 
-def test_the_work_is_kept_off_the_thread_that_takes_signals() -> None:
+def test_the_work_runs_outside_the_thread_that_handles_signals() -> None:
     assert run_interruptible(threading.current_thread) is not threading.main_thread()
 
 
@@ -56,7 +56,8 @@ COMMANDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", COMMANDS.values(), ids=COMMANDS)
 def test_ctrl_c_ends_a_command_that_compiles(case: tuple, tmp_path: Path) -> None:
-    """The signal comes while XLA compiles the largest program, and is not put off to its end.
+    """The signal comes while XLA compiles the largest program, and takes effect before the
+    compilation ends.
 
     MJX's programs take XLA more than a second.
     """
@@ -77,7 +78,7 @@ def test_ctrl_c_ends_a_command_that_compiles(case: tuple, tmp_path: Path) -> Non
         for line in process.stderr:
             said += line
             if re.search(rf"to MLIR module conversion jit\({program}\)", line):
-                # Python still has a few lines to run before it hands over to XLA.
+                # Python still runs a few lines before XLA takes over.
                 time.sleep(0.3)
                 process.send_signal(signal.SIGINT)
         assert process.wait(TIMEOUT) == 130, said

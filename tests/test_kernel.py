@@ -18,11 +18,11 @@ from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics
 from random_worlds import random_parameters
 
-# No multiple of a block.
+# Not a multiple of the block size.
 BATCH = 70
 NUM_SUBSTEPS = 10
 MODEL = PhysicsParameters()
-# In the interpreter both are compiled from the same operations.
+# In the interpreter both programs are compiled from the same operations.
 ROUNDING = 1e-6
 
 Step = Callable[[PhysicsState, jax.Array], PhysicsState]
@@ -67,7 +67,7 @@ def batched(env: BounceBall) -> Step:
 
 
 def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
-    """Every number of the world given, the batch last; all environments share the gravity."""
+    """All physics parameters, the batch last; all environments share the gravity."""
     drawn = random_parameters(env.mj_model, batch, seed=0)
     drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
     return drawn._replace(
@@ -90,7 +90,7 @@ def by_xla(env: BounceBall) -> PhysicsState:
     return jax.jit(batched(env))(*moving(env, BATCH))
 
 
-def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
+def test_a_batch_equals_the_xla_program(env, by_xla, in_kernel):
     program = jax.jit(batched(env)).trace(*moving(env, BATCH))
     assert "pallas_call" in str(program.jaxpr)
     after = program.lower().compile()(*moving(env, BATCH))
@@ -99,7 +99,7 @@ def test_a_batch_is_what_xla_makes_of_it(env, by_xla, in_kernel):
 
 
 def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
-    """Tracing it takes some tenths of a second, and a training has several programs."""
+    """Tracing the physics takes some tenths of a second, and a training has several programs."""
     traced = []
     substep = dynamics.substep
     monkeypatch.setattr(dynamics, "substep", lambda *args: traced.append(1) or substep(*args))
@@ -114,7 +114,7 @@ def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
 
 
 def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
-    """More inputs than the coordinates and targets: all the world's numbers, of each
+    """The kernel takes more inputs than coordinates and targets: all physics parameters of each
     environment."""
     args = (*moving(env, BATCH), random_worlds(env, BATCH))
     program = jax.jit(in_worlds(env)).trace(*args)
@@ -126,7 +126,7 @@ def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
 
 
 def test_several_batches_and_shared_targets(env, in_kernel):
-    """Batches of batches, as of several seeds, and an argument that is the same for all."""
+    """Batches of batches, as with several seeds, and an argument that all environments share."""
     physics, ctrl = moving(env, BATCH)
     twice = jax.tree.map(lambda x: jnp.stack([x, 0.5 * x]), physics)
     shared = ctrl[:, 0]
@@ -139,7 +139,7 @@ def test_several_batches_and_shared_targets(env, in_kernel):
         assert_equal(jax.tree.map(lambda x, i=i: x[i], after), alone)
 
 
-# In a process of its own, as the number of devices is set before JAX starts.
+# In a separate process, because the number of devices is set before JAX starts.
 ON_DEVICES = """
 import functools, re
 import jax, jax.numpy as jnp, numpy as np
@@ -168,8 +168,8 @@ for program, args, axes in (
 """
 
 
-def test_devices_keep_their_part(monkeypatch):
-    """Nothing is exchanged between eight devices that share a batch, of one seed or of two."""
+def test_devices_keep_their_shard(monkeypatch):
+    """Eight devices that share the batch of one seed or of two exchange nothing."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
     done = subprocess.run(
         [sys.executable, "-c", ON_DEVICES],
@@ -182,7 +182,7 @@ def test_devices_keep_their_part(monkeypatch):
     assert done.stdout.split() == ["0", "0"]
 
 
-def test_one_environment_and_float64_are_left_to_xla(env, in_kernel):
+def test_one_environment_and_float64_are_compiled_by_xla(env, in_kernel):
     physics, ctrl = moving(env, 2)
     one = jax.tree.map(lambda x: x[:, 0], physics)
     single = jax.jit(partial(step, env)).trace(one, ctrl[:, 0]).lower().as_text()
@@ -193,7 +193,7 @@ def test_one_environment_and_float64_are_left_to_xla(env, in_kernel):
 
 
 def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
-    """Without a GPU here: the program for one holds a kernel, the one for a processor none."""
+    """This needs no GPU: the program for a GPU contains a kernel, the program for a CPU none."""
     monkeypatch.setattr(kernel, "has_kernels", lambda: True)
     traced = jax.jit(batched(env)).trace(*moving(env, BATCH))
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
@@ -208,7 +208,7 @@ def test_the_kernel_with_parameters_is_lowered_for_a_gpu(env, monkeypatch):
     assert on_gpu.count("custom_call @mosaic_gpu") == 1
 
 
-def test_there_is_no_kernel_here(monkeypatch):
+def test_there_is_no_kernel_on_a_cpu(monkeypatch):
     assert not availability.has_kernels()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setenv("BOUNCE_MJX_GPU_KERNEL", "off")
@@ -218,7 +218,7 @@ def test_there_is_no_kernel_here(monkeypatch):
 @pytest.mark.parametrize(
     ("capability", "expected"), [("9.0", True), ("10.0", True), ("8.6", False), ("gfx90a", False)]
 )
-def test_which_gpus_have_kernels(monkeypatch, capability, expected):
+def test_only_supported_gpus_use_kernels(monkeypatch, capability, expected):
     device = type("Device", (), {"compute_capability": capability})
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "local_devices", lambda backend=None: [device])

@@ -67,7 +67,7 @@ def random_samples(key: jax.Array, networks, params) -> dict[str, jax.Array]:
 
 
 def expected_loss(params, networks, samples: dict[str, jax.Array]):
-    """Schulman et al. 2017, equations 7 and 9, in float32; with its parts."""
+    """The loss of Schulman et al. 2017, equations 7 and 9, in float32, and its parts."""
     policy, value = params
     distribution = networks.policy_network.apply(policy, samples["inputs"][:, :NUM_OBSERVATIONS])
     log_ratio = distribution.log_prob(samples["action"]) - samples["log_prob"]
@@ -103,7 +103,7 @@ def test_packing_is_undone_and_pads_with_zeros():
         np.testing.assert_array_equal(mask, one > 0.0)
 
 
-def test_gradient_and_metrics_are_those_of_the_loss(interpret, monkeypatch):
+def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch):
     networks, params = random_params(jax.random.PRNGKey(0))
     samples = random_samples(jax.random.PRNGKey(1), networks, params)
     monkeypatch.setattr(
@@ -126,13 +126,14 @@ def test_gradient_and_metrics_are_those_of_the_loss(interpret, monkeypatch):
     for (path, a), b in zip(
         jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True
     ):
-        # bfloat16 has eight binary digits, and takes some samples over the clipping limit.
+        # bfloat16 has eight binary digits, so rounding moves some samples across the clipping
+        # limit.
         error = float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b))
         assert error < 0.05, jax.tree_util.keystr(path)
     assert metrics.keys() == expected.keys()
     for name, value in expected.items():
         assert float(metrics[name]) == pytest.approx(float(value), rel=0.02, abs=1e-3), name
-    # Padding stays 0, so it neither counts in the norm of the gradient nor moves.
+    # Padding stays 0, so it does not contribute to the norm of the gradient and never changes.
     total = sum(float(jnp.sum(x**2)) for x in packed)
     assert math.isclose(
         total, sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(ours)), rel_tol=1e-5
@@ -180,14 +181,14 @@ def test_shuffling_keeps_samples_together():
         ({"num_minibatches": 8}, False),
     ],
 )
-def test_which_trainings_the_kernel_computes(changes, supported):
+def test_the_kernel_supports_these_trainings(changes, supported):
     config = PPOConfig.model_validate(dict(CONFIG) | changes)
     assert minibatch_kernel.supports(config, NUM_CRITIC_INPUTS, NUM_ACTIONS) is supported
     assert not minibatch_kernel.supports(config, 64, NUM_ACTIONS)
 
 
 def test_the_kernel_is_lowered_for_a_gpu():
-    """Without a GPU here: one kernel a minibatch, for one seed as for several."""
+    """This needs no GPU: the program has one kernel per minibatch, for one seed and for several."""
     _, params = random_params(jax.random.PRNGKey(0))
     packed = minibatch_kernel.pack(params)
     shape = (CONFIG.num_minibatches, NUM_SAMPLES)

@@ -14,7 +14,7 @@ from test_physics import XML, edited
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
-    # edit, what the message must say
+    # edit, text that the message must contain
     "timestep 0": ('timestep="0.001"', 'timestep="0"', "timestep 0.0"),
     "timestep nan": ('timestep="0.001"', 'timestep="nan"', "timestep nan"),
     "timestep negative": ('timestep="0.001"', 'timestep="-0.1"', "timestep -0.1"),
@@ -37,7 +37,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_simulated_is_refused(tmp_path, name):
+def test_models_that_cannot_be_simulated_are_refused(tmp_path, name):
     old, new, text = REFUSED[name]
     assert old in XML
     mjcf = tmp_path / "robot.xml"
@@ -48,8 +48,8 @@ def test_what_cannot_be_simulated_is_refused(tmp_path, name):
     assert str(mjcf) in str(error.value)
 
 
-def test_the_plain_model_moves_as_the_pictured_one():
-    """The model drops the parts for pictures, and takes a fraction of the memory."""
+def test_the_model_without_visuals_moves_the_same():
+    """The model without the visual parts takes a fraction of the memory."""
     pictured, plain = (load_model(None, 0.001, visual=visual) for visual in (True, False))
     assert mujoco.mj_sizeModel(plain) < 0.1 * mujoco.mj_sizeModel(pictured)
     after = []
@@ -62,7 +62,8 @@ def test_the_plain_model_moves_as_the_pictured_one():
 
 
 def test_an_edited_model_is_an_error():
-    """Where a program that would not notice it is traced; colours are free."""
+    """The error comes when a program that would ignore the edit is traced; colours may be
+    edited."""
     env = BounceBall()
     key, action = jax.random.PRNGKey(0), jnp.zeros(6)
     state = jax.eval_shape(env.reset, key)
@@ -108,7 +109,7 @@ def test_a_joint_without_a_range_is_not_clipped(tmp_path):
 
 
 def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
-    """A servo whose length is a multiple of the angle holds its joint as one without gear does."""
+    """A servo whose length is a multiple of the angle holds its joint like a servo without gear."""
     geared = env_of(
         tmp_path, ('<position kp="20000" kv="200"', '<position gear="-2" kp="5000" kv="50"')
     )
@@ -134,7 +135,7 @@ UNCONVERGED = {
 
 @pytest.mark.parametrize("name", UNCONVERGED)
 def test_a_solver_that_stops_early_is_named(name):
-    """The fused engine warns of the setting, and of no other."""
+    """The fused engine warns of this setting and of no other."""
     settings, named, innocent = UNCONVERGED[name]
     (warning,) = make_engine(edited(SOLVER, settings), "auto").warnings
     assert all(text in warning for text in named)
@@ -142,5 +143,5 @@ def test_a_solver_that_stops_early_is_named(name):
 
 
 @pytest.mark.parametrize("settings", [SOLVER, "", 'solver="PGS"', 'solver="CG" iterations="50"'])
-def test_a_solver_that_converges_is_no_warning(settings):
+def test_a_solver_that_converges_gives_no_warning(settings):
     assert make_engine(edited(SOLVER, settings), "auto").warnings == ()

@@ -39,7 +39,7 @@ def site(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
-    """Runs a script that sees the installed wheel only; the lines that it prints."""
+    """Runs a script that sees only the installed wheel, and returns the lines that it prints."""
     done = subprocess.run(
         [sys.executable, "-c", HIDE_CHECKOUT + script],
         cwd=cwd,
@@ -52,8 +52,8 @@ def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
 
 
 def test_import_is_light(tmp_path: Path) -> None:
-    """The package leaves JAX for its first use, and the environment needs none of what trainers,
-    other engines, viewers and adapters need."""
+    """The package imports JAX only at its first use, and the environment imports none of the
+    libraries of trainers, other engines, viewers and adapters."""
     script = """
 import sys
 import bounce_mjx
@@ -85,8 +85,8 @@ print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.module
 
 
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
-    """A copy of the package with one more term, added at the end of the others in rewards.py: the
-    config, the metrics, the reward, the viewer's bars and the report's figure have it."""
+    """In a copy of the package, one more term is added after the others in rewards.py. The config,
+    the metrics, the reward, the viewer's bars and the report's figure then have it."""
     copy = tmp_path / "src" / "bounce_mjx"
     shutil.copytree(CHECKOUT / "src" / "bounce_mjx", copy)
     for folder in ("mjcf", "configs"):
@@ -207,7 +207,7 @@ def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
     script = """
 import jax
 from rich.console import Console
-from bounce_mjx import BounceBall
+from bounce_mjx import BounceBall, load_policy as load_deployed
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -220,10 +220,11 @@ networks = make_networks(config.ppo, env.observation_size, env.action_size)
 action = act(networks, load_policy(checkpoint, config), state.obs)
 print(checkpoint.run)
 print(*action.shape, bool((abs(action) > 0.0).any()))
+print(len(load_deployed("pretrained").needs))
 """
-    run, action = run_installed(site, script, tmp_path)
+    run, action, needs = run_installed(site, script, tmp_path)
     assert Path(run) == site / "bounce_mjx" / "pretrained"
-    assert action == "6 True"
+    assert (action, needs) == ("6 True", "5")
 
 
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
@@ -240,7 +241,7 @@ README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     ids=["jax", "torch", "gymnasium", "brax"],
 )
 def test_readme_example_runs(number, printed, request, capsys):
-    """The examples for each kind of user, as they stand."""
+    """The README's examples for each kind of user run unchanged."""
     needs = {1: "torch_libraries", 2: "opengl"}
     if number in needs:
         request.getfixturevalue(needs[number])

@@ -48,8 +48,9 @@ from test_physics import (
 )
 
 MODEL = PhysicsParameters()
-# The numbers of a frictionless world; test_friction.py has the contact's friction.
-FIELDS = [field for field in PhysicsParameters._fields if field != "contact_friction"]
+# The numbers that the shipped model has; test_friction.py has the contact's friction.
+_NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss")
+FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
 NUM_WORLDS = 16
 
 
@@ -169,6 +170,24 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
     assert error < 1e-9
 
 
+@pytest.mark.usefixtures("float64")
+def test_given_force_limits_are_mujocos(mj_model):
+    """Some servos at their limits, which have no implicit damping there, and some not."""
+    states, _ = random_states(mj_model, 128, seed=11)
+    limits = 10.0 ** np.random.default_rng(0).uniform(1.0, 3.5, (128, 6))
+    alone = PhysicsParameters(force_limit=limits)
+    for parameters in (alone, random_parameters(mj_model, 128, 12)._replace(force_limit=limits)):
+        expected, _ = c_steps(mj_model, parameters, states)
+        assert_same_step(uncompiled_steps(mj_model, parameters, states), expected)
+    data = mujoco.MjData(edited_model(mj_model, world(alone, 0)))
+    at_limit = []
+    for i, start in enumerate(zip(*states, strict=True)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start
+        mujoco.mj_forward(edited_model(mj_model, world(alone, i)), data)
+        at_limit.append(np.abs(data.actuator_force) == limits[i])
+    assert 0.2 < np.mean(at_limit) < 0.8
+
+
 def test_nothing_given_leaves_the_program_alone(mj_model):
     """The model's constants fold as before: no further input, and the same model to the bit."""
     model = fused.read_model(mj_model)
@@ -211,8 +230,8 @@ def test_paddle_position_follows_its_parameter(mj_model):
 
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
-    """Filtered servos in random worlds with friction, free-running over control steps, against
-    C."""
+    """Filtered servos at their limits in random worlds with friction, free-running over control
+    steps, against C."""
     count, num_substeps = 4, 5
     model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     assert model.na == 6
@@ -222,7 +241,10 @@ def test_mjx_carries_activations_and_worlds(record_property):
         *(jnp.asarray(x[:count]) for x in start[:2]), jnp.asarray(start.qpos[:count, :6])
     )
     parameters = random_parameters(model, count, seed=9)
-    parameters = parameters._replace(contact_friction=np.array([0.01, 0.1, 0.4, 1.0]))
+    parameters = parameters._replace(
+        contact_friction=np.array([0.01, 0.1, 0.4, 1.0]),
+        force_limit=np.tile([300.0, 100.0, 30.0, 10.0, 3.0, 1.0], (count, 1)),
+    )
     data = []
     for i in range(count):
         c_model = edited_model(model, world(parameters, i))
@@ -386,3 +408,25 @@ def test_filtered_servos_start_at_rest():
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.actuator_force, 0.0, atol=0.01)
     assert resting_activations(load_model(None, 0.001), list(data.qpos)) is None
+
+
+def test_dry_friction_acts_on_c_alone(mj_model):
+    """A joint under a torque below its dry friction hardly moves."""
+    model = edited_model(mj_model, PhysicsParameters(frictionloss=np.full(6, 10.0)))
+    addresses = find_addresses(mj_model)
+    speeds = []
+    for m in (edited_model(mj_model, MODEL), model):
+        data = mujoco.MjData(m)
+        m.actuator_gainprm[:], m.actuator_biasprm[:] = 0.0, 0.0
+        m.opt.gravity[:] = 0.0
+        data.qfrc_applied[addresses.arm_qvel[0]] = 5.0
+        for _ in range(100):
+            mujoco.mj_step(m, data)
+        speeds.append(abs(data.qvel[addresses.arm_qvel[0]]))
+    assert speeds[0] > 0.1
+    # A soft constraint creeps.
+    assert speeds[1] < 0.05 * speeds[0]
+    state = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
+    given = PhysicsParameters(frictionloss=jnp.full(6, 10.0))
+    with pytest.raises(UserError, match="dry friction .*--physics mujoco"):
+        make_engine(mj_model, "fused").step(given, state, Control(jnp.zeros(mj_model.nu)), 1)

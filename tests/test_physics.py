@@ -359,6 +359,11 @@ SUPPORTED = {
     "skew base": ('<body name="Link1" pos="0 0 0.1">', '<body name="Link1" euler="0.1 -0.2 0.3">'),
     "tilted gravity": ('gravity="0 0 -9.81"', 'gravity="1 -2 -9"'),
     "ctrlrange": ('<position kp="20000"', '<position ctrlrange="-0.5 0.5" kp="20000"'),
+    "forcerange": ('<position kp="20000"', '<position forcerange="-300 80" kp="20000"'),
+    "forcerange and gear": (
+        '<position kp="20000"',
+        '<position forcerange="-30 9" gear="-2" kp="20000"',
+    ),
     "gear": ('<position kp="20000"', '<position gear="-2" kp="20000"'),
     "affine actuator": (
         '<position name="act2" joint="Joint2"/>',
@@ -447,7 +452,7 @@ UNSUPPORTED = {
     "stiffness": ("<joint ", '<joint stiffness="1" ', "stiffness"),
     "stiffness polynomial": ("<joint ", '<joint stiffness="0 1 0" ', "stiffness"),
     "damping polynomial": ("<joint ", '<joint damping="1 1 0" ', "damping"),
-    "joint force range": ("<joint ", '<joint actuatorfrcrange="-9 9" ', "forcerange"),
+    "joint force range": ("<joint ", '<joint actuatorfrcrange="-9 9" ', "actuatorfrcrange"),
     "joint offset": ('name="Joint2"', 'name="Joint2" pos="0.01 0 0"', "pos"),
     "slide": ('name="Joint2"', 'name="Joint2" type="slide"', "hinges"),
     "gravcomp": ('<body name="Link3"', '<body name="Link3" gravcomp="1"', "gravcomp"),
@@ -488,7 +493,6 @@ UNSUPPORTED = {
         '<tendon><fixed><joint joint="Joint2" coef="1"/></fixed></tendon><actuator>',
         "tendons",
     ),
-    "force range": ("<position ", '<position forcerange="-9 9" ', "forcerange"),
     "actuator dynamics": ("<position ", '<position timeconst="0.01" ', "position servos"),
     "actuator delay": ("<position ", '<position delay="0.005" nsample="9" ', "delay"),
     "actuator damping": ("<position ", '<position damping="1" ', "damping"),

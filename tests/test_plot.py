@@ -106,8 +106,8 @@ def test_a_label_names_few_settings(tmp_path: Path) -> None:
     assert labels[1] == "num_envs 64, rollout_length 16, num_epochs 2 … (one seed)"
 
 
-def test_a_curve_is_what_was_logged_last(tmp_path: Path) -> None:
-    """A run that went on from step 2 logs step 3 again."""
+def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
+    """A run that was resumed from step 2 logs step 3 again."""
     run = write_run(
         tmp_path / "run", TrainConfig(), {"episode/return": {1: 10.0, 2: 20.0, 3: 30.0}}
     )
@@ -132,7 +132,7 @@ def logged(run: Path, name: str) -> dict[int, float]:
 
 
 def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
-    """At the steps that all three seeds reached."""
+    """The band covers the steps that all three seeds reached."""
     seeds = [logged(run, "episode/return") for run in runs[:3]]
     steps = [1000, 2000, 3000, 4000]
     values = np.array([[seed[step] for step in steps] for seed in seeds])
@@ -152,7 +152,7 @@ def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
     assert [n for n in lengths if n] == [4, 4, 5, 5]  # the mean, and each seed to its end
 
 
-def test_the_curves_have_their_units(runs: list[Path]) -> None:
+def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
     """One run is one line; the apex error is in centimetres."""
     figure = curves_figure(group_runs(runs[3:]))
     for axes, (name, _, factor) in zip(figure.axes, CURVES, strict=True):
@@ -173,7 +173,7 @@ def test_there_is_a_panel_for_every_reward_term(runs: list[Path]) -> None:
 
 
 def test_an_evaluation_is_drawn_from_its_recording() -> None:
-    """4 s at 100 Hz of two made-up episodes, the second of which ends after 3 s."""
+    """A recording of 4 s at 100 Hz of two invented episodes, the second of which ends after 3 s."""
     env = BounceBall(EnvConfig(episode_seconds=4.0))
     ball = np.zeros((400, 3, 2), np.float32)
     ball[:, 2] = np.linspace(0.1, 0.7, 400)[:, None]
@@ -194,7 +194,7 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
     line = next(line for line in heights.lines if line.get_label() == "ball")
     np.testing.assert_allclose(line.get_xdata(), 0.01 * np.arange(1, 401))
     np.testing.assert_allclose(line.get_ydata(), ball[:, 2, 0])
-    # Three bounces after 2 s and before an end, all with the apex 3 cm too high.
+    # Three bounces after 2 s and before the end of the episode, all with the apex 3 cm too high.
     counts = [bar for bar in errors.patches if bar.get_height()]
     (bar,) = counts
     assert bar.get_height() == 3
@@ -205,7 +205,7 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
     assert len(points.get_xdata()) == 3
 
 
-def test_images_are_what_their_suffix_says(runs: list[Path]) -> None:
+def test_images_have_the_format_of_their_suffix(runs: list[Path]) -> None:
     figure = curves_figure(group_runs(runs))
     width, height = figure.get_size_inches()
     assert Image.open(io.BytesIO(image(figure, "png"))).size == (150 * width, 150 * height)
@@ -251,7 +251,7 @@ def test_bad_plot(trained: Path, tmp_path: Path, monkeypatch, capfd, case) -> No
 
 
 def check_report(run: Path) -> str:
-    """The text of a report, after checks that it is whole and needs nothing else."""
+    """The text of a report, after checking that the page is complete and needs no other file."""
     page = (run / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert len(sources) == 3
@@ -273,18 +273,18 @@ def check_report(run: Path) -> str:
 
 
 def as_shown(value: float | None) -> str:
-    """A figure as tables show it."""
+    """A figure as the tables show it."""
     return "none" if value is None else f"{value:.2f}"
 
 
 def test_training_leaves_a_report(trained: Path) -> None:
-    """Its episodes of 0.5 s end before the height is measured."""
+    """The run's episodes of 0.5 s end before the height is measured."""
     page = check_report(trained)
     height = load_results(trained).best.results[2]
     assert (height.value, height.passed) == (None, False)
     assert "none" in re.search(r"<td[^>]*>height</td>.*", page)[0]
     assert "|apex error| none, " in page
-    # Nor has the log a point that a curve would show as the best there is.
+    # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
     assert not {"results/height", "results/mean_apex_error_m"} & set(log)
@@ -358,7 +358,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
 
 
-def test_a_result_that_is_not_judged_is_said_so(trained: Path) -> None:
+def test_a_result_that_is_not_judged_is_marked(trained: Path) -> None:
     report = load_results(trained).best
     speed = dataclasses.replace(report.results[3], passed=None)
     text = results_markdown(dataclasses.replace(report, results=(*report.results[:3], speed)))

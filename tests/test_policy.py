@@ -1,4 +1,5 @@
-"""Networks, distribution and normalisation: against brax's own implementations, and by claim."""
+"""Networks, distribution and normalisation: against brax's implementations, and property by
+property."""
 
 import jax
 import jax.numpy as jnp
@@ -56,14 +57,14 @@ def test_far_observations_are_clipped(normalizer):
     np.testing.assert_array_equal(np.delete(far, CONSTANT), 10.0)
 
 
-def test_before_any_data_observations_pass_as_they_are():
+def test_before_any_data_observations_are_unchanged():
     observation = jnp.linspace(-3.0, 3.0, N)
     for normalizer in (init_normalizer(N), init_statistics(N).normalizer):
         np.testing.assert_array_equal(normalize(observation, normalizer), observation)
 
 
-def test_statistics_follow_braxs(seen):
-    """Over batches of [T, B, N], as the trainer adds them: the same update and normalisation."""
+def test_statistics_equal_brax(seen):
+    """Batches [T, B, N], as the trainer adds them, give the same update and normalisation."""
     ours = init_statistics(N)
     theirs = running_statistics.init_state(
         jax.ShapeDtypeStruct((N,), jnp.float32), std_eps=MIN_VARIANCE
@@ -92,7 +93,7 @@ def config() -> PPOConfig:
 
 @pytest.fixture(scope="module")
 def brax_networks(config):
-    """The same networks by brax."""
+    """The same networks in brax."""
     orthogonal = jax.nn.initializers.orthogonal
     return make_ppo_networks(
         {"state": (N,), "critic": (N + 2,)},
@@ -115,14 +116,14 @@ def brax_networks(config):
 
 
 @pytest.mark.parametrize("which", ["policy_network", "value_network"])
-def test_networks_are_braxs(which, config, brax_networks, seen):
-    """The same parameters, by name and value, from the same key; and the same outputs."""
+def test_networks_equal_brax(which, config, brax_networks, seen):
+    """The same key gives the same parameters, by name and value, and the same outputs."""
     ours, theirs = getattr(make_networks(config, N, 6), which), getattr(brax_networks, which)
     key = jax.random.PRNGKey(3)
     params, expected = ours.init(key), theirs.init(key)
     assert jax.tree.structure(params) == jax.tree.structure(expected)
     jax.tree.map(np.testing.assert_array_equal, params, expected)
-    # Other parameters than the first ones, of which the biases are 0.
+    # Different parameters from the initial ones, whose biases are 0.
     params = jax.tree.map(lambda x: x + 0.1, params)
     inputs = seen[:50] if which == "policy_network" else np.tile(seen[:50, :1], N + 2)
     outputs = (ours.apply(params, inputs), theirs.apply(None, params, inputs))
@@ -130,7 +131,7 @@ def test_networks_are_braxs(which, config, brax_networks, seen):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-def test_gaussian_is_braxs(seen):
+def test_gaussian_equals_brax(seen):
     rng = np.random.default_rng(1)
     mean, std = rng.normal(size=(50, 6)), np.exp(rng.normal(size=(50, 6)))
     ours, theirs = Gaussian(mean, std), NormalDistribution(6)
@@ -141,9 +142,9 @@ def test_gaussian_is_braxs(seen):
     np.testing.assert_allclose(ours.entropy(), expected, rtol=1e-4)
 
 
-def test_drift_of_what_never_varied_does_not_move_the_policy(seen, normalizer):
-    """As the ball's orientation drifts by rounding in MJX: policies that bounced elsewhere failed
-    there before."""
+def test_drift_of_a_constant_input_does_not_change_the_policy(seen, normalizer):
+    """In MJX the ball's orientation drifts by rounding; policies that bounced on other engines once
+    failed there."""
     networks = make_networks(PPOConfig(hidden_layers=(16,)), N, 6)
     params = networks.policy_network.init(jax.random.PRNGKey(0))
     policy = Policy(normalizer, params)

@@ -23,7 +23,7 @@ def all_finite(tree) -> bool:
 
 
 def plain(tree):
-    """`tree` with its random keys as numbers."""
+    """`tree` with its random keys converted to numbers."""
 
     def to_numpy(leaf):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -41,7 +41,8 @@ def assert_identical(first, second):
 
 
 def advantages_by_definition(reward, value, next_value, terminated, truncated, discount, lam):
-    """Each advantage as its own sum of discounted errors, forward in time, up to an end."""
+    """Each advantage as a separate sum of discounted errors, forward in time, up to the end of the
+    episode."""
     result = np.zeros(reward.shape)
     for t, b in np.ndindex(*reward.shape):
         weight = 1.0
@@ -103,7 +104,7 @@ def test_advantages_by_hand(terminated_at, truncated_at, expected):
 
 
 @pytest.mark.parametrize("end", ["terminated", "truncated"])
-def test_nothing_flows_back_over_an_end(end):
+def test_no_advantage_flows_back_over_an_end(end):
     rollout = random_rollout(seed=1)
     rollout["terminated"][:], rollout["truncated"][:] = False, False
     rollout[end][10] = True
@@ -118,7 +119,7 @@ def test_nothing_flows_back_over_an_end(end):
     assert np.all(first[11:] != second[11:])
 
 
-def test_only_a_time_out_uses_the_value_that_follows():
+def test_only_a_time_out_uses_the_following_value():
     rollout = random_rollout(seed=2)
     changed = rollout | {"next_value": rollout["next_value"] + 1.0}
     first, second = (
@@ -134,7 +135,7 @@ def test_only_a_time_out_uses_the_value_that_follows():
 
 @pytest.fixture(scope="module")
 def rate_config():
-    """Ten iterations of 100 steps each until the limit has come down."""
+    """The limit falls over ten iterations of 100 steps each."""
     return PPOConfig(
         num_envs=10, rollout_length=10, num_minibatches=2, decay_steps=1000,
         max_learning_rate=1e-2, final_max_learning_rate=1e-4, min_learning_rate=1e-5,
@@ -145,7 +146,7 @@ def rate_config():
 @pytest.mark.parametrize(
     ("iteration", "expected"), [(0, 1e-2), (5, 1e-3), (10, 1e-4), (11, 1e-4), (10**6, 1e-4)]
 )
-def test_max_learning_rate_falls_in_equal_ratios(iteration, expected, rate_config):
+def test_max_learning_rate_decays_exponentially(iteration, expected, rate_config):
     actual = ppo.max_learning_rate(rate_config, jnp.int32(iteration))
     np.testing.assert_allclose(actual, expected, rtol=1e-5)
 
@@ -226,7 +227,7 @@ def two_state_config(**changes) -> PPOConfig:
 @pytest.mark.parametrize(
     ("env", "critic_metrics", "expected"),
     [
-        # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out were an end.
+        # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out counted as a termination.
         pytest.param(TwoStates(1.0), (), [1.0, 1.0], id="constant reward"),
         # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led
         # on to the first state of the next episode, they would be worth 0.526 and 0.474.
@@ -250,9 +251,10 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
     assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
 
 
-def test_update_learns_on_what_the_next_rollout_will_see():
-    """With a policy that stays as it is, the KL divergence of an update is that between the policy
-    on observations as the rollout saw them and as the statistics that include it make them."""
+def test_update_uses_the_normalisation_of_the_next_rollout():
+    """If the policy does not change, the KL divergence of an update is the divergence between the
+    policy on the rollout's own normalised observations and on the same observations normalised with
+    the statistics that include the rollout."""
     config = two_state_config(num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12)
     trainer = ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
     before = trainer.init(jax.random.key(0))
@@ -266,7 +268,8 @@ def test_update_learns_on_what_the_next_rollout_will_see():
         for state in (before, after)
     )
     of_states = jnp.sum(jnp.square(new - old) / (2.0 * jnp.square(deviation)), axis=-1)
-    # All are in the first state at first; half of them time out then, and are there again.
+    # All environments start in the first state; half of them then time out and are in the first
+    # state again.
     divergence = 0.75 * of_states[0] + 0.25 * of_states[1]
     assert divergence > 1e-5
     np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
@@ -317,7 +320,7 @@ def init(trainer):
 
 @pytest.fixture(scope="module")
 def run(trainer):
-    """A number of iterations, compiled once for each number."""
+    """A function that runs a number of iterations, compiled once per number."""
     return jax.jit(trainer.run, static_argnums=1)
 
 
@@ -377,8 +380,8 @@ def test_two_iterations_equal_one_and_one(init, run, after_two):
     assert_identical(joined, metrics)
 
 
-def test_run_returns_the_types_that_it_takes(trainer, init):
-    """Else a jitted `run` compiles again for its own result."""
+def test_run_returns_the_same_types_as_its_input(trainer, init):
+    """Otherwise a jitted `run` would be compiled again for its own result."""
     state = init(jax.random.key(0))
     result, _ = jax.eval_shape(lambda s: trainer.run(s, 1), state)
     types = [
@@ -388,8 +391,8 @@ def test_run_returns_the_types_that_it_takes(trainer, init):
     assert types[0] == types[1]
 
 
-def test_bfloat16_computes_the_hidden_layers_alone(tiny, env, init, run):
-    """The state stays float32, and the update goes the way that it goes in float32."""
+def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
+    """The state stays in float32, and the update has the same direction as in float32."""
     config = tiny.model_copy(update={"compute_dtype": "bfloat16"})
     trainer = ppo.make_trainer(config, env, env.config.episode_steps)
     before = init(jax.random.key(0))
@@ -405,7 +408,7 @@ def test_bfloat16_computes_the_hidden_layers_alone(tiny, env, init, run):
     )
     cosine = step @ reference_step / np.linalg.norm(step) / np.linalg.norm(reference_step)
     assert 0.9 < cosine < 1.0 - 1e-6
-    # Adam's first steps have the size of the learning rate, whichever the type.
+    # Adam's first steps have the size of the learning rate, whatever the type.
     np.testing.assert_allclose(metrics["loss/value"], reference_metrics["loss/value"], rtol=0.05)
 
 
@@ -430,7 +433,7 @@ def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
     many, many_metrics = jax.jit(jax.vmap(lambda s: trainer.run(s, 2)))(many_states)
     for i, (one, metrics) in enumerate((after_two, run(init(keys[1]), 2))):
         chosen, chosen_metrics = jax.tree.map(lambda x, i=i: x[i], (many, many_metrics))
-        # Adam magnifies the rounding of gradients near zero up to a step of the learning rate.
+        # Adam magnifies the rounding of gradients near zero to at most a step of the learning rate.
         for a, b in zip(jax.tree.leaves(chosen.params), jax.tree.leaves(one.params), strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=2e-4)
         np.testing.assert_allclose(
@@ -440,7 +443,8 @@ def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
 
 
 class FaultyBall(BounceBall):
-    """Its physics fails in about half of the environments as soon as the ball falls."""
+    """An environment whose physics fails in about half of the instances as soon as the ball
+    falls."""
 
     def __init__(self):
         super().__init__()
@@ -454,7 +458,7 @@ class FaultyBall(BounceBall):
         self.engine = self.engine._replace(step=step)
 
 
-def test_faults_do_not_spoil_the_training(tiny):
+def test_faults_do_not_harm_the_training(tiny):
     env = FaultyBall()
     trainer = ppo.make_trainer(tiny, env, env.config.episode_steps)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 2))(jax.random.key(0))

@@ -57,14 +57,14 @@ def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
         assert now.value == pytest.approx(then.value, abs=tolerance), now.name
 
 
-def test_it_is_small_and_holds_only_what_acting_needs() -> None:
+def test_it_is_small_and_holds_only_the_policy() -> None:
     files = [path for path in FOLDER.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 1_000_000
     items = {path.name for path in pretrained_checkpoint().folder.iterdir() if path.is_dir()}
     assert items == {"policy"}
 
 
-def test_the_command_that_made_it_gives_its_config(shipped: dict, monkeypatch) -> None:
+def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> None:
     monkeypatch.chdir(FOLDER.parent)
     python, script, *flags = shipped["command"].split()
     assert (python, script) == ("python", "train_jax.py")
@@ -74,13 +74,13 @@ def test_the_command_that_made_it_gives_its_config(shipped: dict, monkeypatch) -
     assert shipped["device"]
 
 
-def test_it_is_taken_where_there_is_no_run(tmp_path: Path, monkeypatch, console, capsys) -> None:
+def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, console, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     assert choose_checkpoint(None, LOG_DIR, console) == pretrained_checkpoint()
     assert "comes with the package" in capsys.readouterr().out
 
 
-def test_a_run_is_preferred(tmp_path: Path, monkeypatch, console, capsys) -> None:
+def test_a_run_is_preferred_to_it(tmp_path: Path, monkeypatch, console, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("2026-01-01", "2026-01-02"):
         folder = LOG_DIR / name / "checkpoints" / "best" / "64"
@@ -92,14 +92,14 @@ def test_a_run_is_preferred(tmp_path: Path, monkeypatch, console, capsys) -> Non
     assert choose_checkpoint(FOLDER, LOG_DIR, console) == pretrained_checkpoint()
 
 
-def test_it_stands_in_only_for_the_default_folder_of_runs(tmp_path: Path, console) -> None:
+def test_it_is_used_only_for_the_default_folder_of_runs(tmp_path: Path, console) -> None:
     with pytest.raises(UserError, match="no run with a checkpoint"):
         choose_checkpoint(None, tmp_path, console)
 
 
 @pytest.fixture
 def measure(monkeypatch, measured: Report):
-    """A function (report) that makes `ship` measure that report."""
+    """A function (report) that makes `ship` measure this report."""
 
     def replace(report: Report) -> None:
         evaluation = Evaluation(report, "fused", ())
@@ -112,7 +112,7 @@ def measure(monkeypatch, measured: Report):
 @pytest.mark.slow
 def test_shipping_keeps_the_policy(tmp_path: Path, measure, shipped: dict) -> None:
     out = tmp_path / "pretrained"
-    for _ in range(2):  # into nothing, and in place of an older one
+    for _ in range(2):  # into a new folder, and over an older one
         ship_command.main([str(FOLDER), "--out", str(out)])
     assert list(tmp_path.iterdir()) == [out]
     config = load_run_config(out)
@@ -142,7 +142,7 @@ def test_a_policy_that_misses_a_result_is_not_shipped(
     assert not list(tmp_path.iterdir())
 
 
-def test_shipping_replaces_no_foreign_folder(tmp_path: Path, capsys) -> None:
+def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, capsys) -> None:
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(SystemExit) as exit_info:
         ship_command.main([str(FOLDER), "--out", str(tmp_path)])

@@ -21,7 +21,7 @@ EPISODES, RECORDED = 6, 4
 
 @pytest.fixture(scope="module")
 def env() -> BounceBall:
-    """Episodes of 1.5 s: the ball bounces a few times, and falls off a paddle that is let sink."""
+    """Episodes of 1.5 s in which the ball bounces a few times, or falls off a paddle that sinks."""
     return BounceBall(EnvConfig(episode_seconds=1.5))
 
 
@@ -45,7 +45,7 @@ def evaluated(env: BounceBall, networks, policy: Policy):
 
 @pytest.fixture(scope="module")
 def stepped(env: BounceBall, networks, policy: Policy):
-    """States [T, ..., K] of the recorded episodes, by stepping the environment."""
+    """States [T, ..., K] of the recorded episodes, computed by stepping the environment."""
     keys = jax.random.split(jax.random.PRNGKey(2), EPISODES)[:RECORDED]
     states = jax.jit(jax.vmap(env.reset))(keys)
     step = jax.jit(lambda states: jax.vmap(env.step)(states, act(networks, policy, states.obs)))
@@ -61,7 +61,7 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
     ended = np.cumsum(stepped.done, axis=0) > 0
     running = np.concatenate([np.ones((1, RECORDED), bool), ~ended[:-1]])
     assert ended.any() and not ended[:50].any()
-    # The loop ends with the last of all episodes.
+    # The loop ends when the last episode ends.
     steps = int(statistics.steps.max())
     np.testing.assert_array_equal(recording.running[:steps], running[:steps])
     assert not recording.running[steps:].any()
@@ -83,7 +83,7 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
     np.testing.assert_allclose(statistics.steps[:RECORDED], running.sum(axis=0))
 
 
-def test_apex_errors_are_those_of_the_environment(evaluated, stepped) -> None:
+def test_apex_errors_equal_the_environment(evaluated, stepped) -> None:
     _, recording = evaluated
     bounces = settled_bounces(recording, 0)
     errors = apex_errors(recording, bounces)
@@ -92,7 +92,7 @@ def test_apex_errors_are_those_of_the_environment(evaluated, stepped) -> None:
 
 
 def made_up(steps: int, episodes: int) -> Recording:
-    """A recording of nothing, in which a test writes."""
+    """An empty recording for a test to fill."""
     return Recording(
         joint_angles=np.zeros((steps, 6, episodes), np.float32),
         ball=np.zeros((steps, 3, episodes), np.float32),
@@ -123,7 +123,7 @@ def test_apex_errors_have_a_sign() -> None:
 
 
 def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
-    """A ball put over a known point of a turned paddle is found there."""
+    """A ball placed above a known point of a rotated paddle is found at that point."""
     rng = np.random.default_rng(0)
     recording = made_up(5, 3)
     data = mujoco.MjData(env.mj_model)
@@ -141,7 +141,7 @@ def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
     np.testing.assert_allclose(hit_points(env, recording, bounces), points[bounces], atol=1e-6)
 
 
-def test_only_so_many_episodes_are_recorded(env: BounceBall, networks) -> None:
+def test_the_number_of_recorded_episodes_is_limited(env: BounceBall, networks) -> None:
     policy = jax.eval_shape(
         lambda key: Policy(init_normalizer(29), networks.policy_network.init(key)),
         jax.random.PRNGKey(0),
@@ -154,19 +154,19 @@ def test_only_so_many_episodes_are_recorded(env: BounceBall, networks) -> None:
 
 
 class NoisyBall(BounceBall):
-    """Its sensors see nothing but noise."""
+    """An environment whose sensors return only noise."""
 
     def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
         return jnp.sin(1e4 * super().observe(kinematics, task))
 
 
 def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
-    """The results and the recording are of the true state, under a policy that is blind to it."""
+    """The results and the recording use the true state, even if the policy cannot see it."""
     layers = policy.params["params"] | {
         "Dense_0": {"kernel": jnp.zeros((8, 6)), "bias": jnp.array([0, 0.3, -0.4, 0, 0.1, 0.2])}
     }
     blind = policy._replace(params={"params": layers})
-    (statistics, recording), (noisy, of_noisy) = (
+    (statistics, recording), (noisy, noisy_recording) = (
         make_recording_evaluator(ball, networks, EPISODES, RECORDED)(blind, jax.random.PRNGKey(2))
         for ball in (env, NoisyBall(env.config))
     )
@@ -176,9 +176,10 @@ def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, p
             getattr(noisy, name), getattr(statistics, name), rtol=1e-3, err_msg=name
         )
     running = recording.running
-    np.testing.assert_array_equal(of_noisy.running, running)
+    np.testing.assert_array_equal(noisy_recording.running, running)
     for name in ("ball", "paddle", "joint_angles"):
         kept, seen = (
-            np.moveaxis(np.asarray(getattr(r, name)), 1, 2)[running] for r in (recording, of_noisy)
+            np.moveaxis(np.asarray(getattr(r, name)), 1, 2)[running]
+            for r in (recording, noisy_recording)
         )
         np.testing.assert_allclose(seen, kept, atol=1e-3, err_msg=name)

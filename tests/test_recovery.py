@@ -1,5 +1,5 @@
-"""A training survives an end between any two steps, signals, full disks and numbers that are not
-finite. The resumed training reaches the very state of an undisturbed one."""
+"""A training survives interruptions between any two steps, signals, full disks and numbers that are
+not finite. The resumed training reaches exactly the state of an undisturbed one."""
 
 import concurrent.futures
 import contextlib
@@ -52,7 +52,7 @@ from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled programs are kept: in this process by their config, for others in a cache."""
+    """Keeps compiled programs: in this process by config, and for other processes in a cache."""
     compile_training, compile_evaluator, kept = PPOTrainer.compile, Evaluators._compile, {}
 
     def key(config: TrainConfig, *rest: object) -> str:
@@ -99,7 +99,7 @@ def evaluations(run: Path) -> list[dict]:
 
 
 def assert_same_training(run: Path, straight: Path) -> None:
-    """Bit for bit the same state, evaluations and best checkpoint."""
+    """Checks that state, evaluations and best checkpoint are the same bit for bit."""
     for find in (latest_checkpoint, best_checkpoint):
         assert find(run).steps == find(straight).steps
         ours, theirs = arrays(find(run)), arrays(find(straight))
@@ -111,7 +111,7 @@ def assert_same_training(run: Path, straight: Path) -> None:
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 256 steps to which nothing happened."""
+    """A run of 256 steps without an interruption."""
     return train(tmp_path_factory.mktemp("straight"), STEPS)
 
 
@@ -130,7 +130,7 @@ def run(half: Path, tmp_path: Path) -> Path:
 # Resuming
 
 
-def test_checkpoint_holds_all_that_training_goes_on_from(straight: Path) -> None:
+def test_checkpoint_holds_the_whole_training_state(straight: Path) -> None:
     checkpoint = latest_checkpoint(straight)
     names = set(arrays(checkpoint))
     for group in (
@@ -155,7 +155,7 @@ def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
 
 
 def test_results_that_are_newer_than_the_checkpoint_do_not_count(run: Path, straight: Path) -> None:
-    # As after a crash that lost the last checkpoint, but not what had been written after it.
+    # As after a crash that lost the last checkpoint, but not the files that were written after it.
     for newer in ("results.json", "config.yaml"):
         shutil.copy(straight / newer, run)
     shutil.rmtree(run / "checkpoints/best")
@@ -177,7 +177,7 @@ def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight
 def test_a_checkpoint_counts_until_the_next_is_complete(
     run: Path, straight: Path, moment: str
 ) -> None:
-    # As after a crash while a checkpoint was replaced by another of the same steps.
+    # As after a crash while a checkpoint was being replaced by another one of the same steps.
     latest = latest_checkpoint(run).folder
     partial, old = (latest.with_name(latest.name + end) for end in (".partial", ".discarded"))
     shutil.copytree(latest, partial)
@@ -195,8 +195,8 @@ def test_a_checkpoint_counts_until_the_next_is_complete(
     assert [p.name for p in latest.parent.iterdir()] == [str(STEPS)]
 
 
-def test_lost_evaluation_is_made_up_for(tmp_path: Path, straight: Path) -> None:
-    # As after a signal at a step at which an evaluation was due.
+def test_lost_evaluation_is_repeated(tmp_path: Path, straight: Path) -> None:
+    # As after a signal at a step where an evaluation was due.
     run = train(tmp_path, STEPS // 2, "--eval-every", str(STEPS))
     for name in ("latest", "best"):
         path = run / f"checkpoints/{name}/{STEPS // 2}/run.json"
@@ -243,7 +243,7 @@ def resume_command(said: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
-def test_signal_saves_and_says_how_to_go_on(
+def test_signal_saves_and_says_how_to_resume(
     tmp_path: Path, straight: Path, number: signal.Signals
 ) -> None:
     args = [*TINY, "--total-steps", 10**6, "--log-dir", tmp_path / "runs"]
@@ -266,7 +266,7 @@ def test_signal_saves_and_says_how_to_go_on(
 
 @pytest.mark.slow
 def test_signal_while_compiling_ends_at_once_and_leaves_nothing(tmp_path: Path) -> None:
-    # Layers of their own, so that the cache does not hold the programs.
+    # Unusual layers, so that the programs are not in the cache.
     args = [*TINY, "--hidden-layers", 24, 24, "--total-steps", 256, "--log-dir", tmp_path / "runs"]
     with job(tmp_path / "log", *args) as training:
         training.wait_until_said("device:")
@@ -311,7 +311,7 @@ def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
         assert process.stdout.readline() == "requested\n"
         time.sleep(pause)
         process.send_signal(signal.SIGINT)
-        # A launcher that hands the same Ctrl-C on must not turn it into a second one.
+        # A launcher that forwards the same Ctrl-C must not turn it into a second one.
         assert process.wait(TIMEOUT) == (-signal.SIGINT if pause else 0)
 
 
@@ -323,8 +323,9 @@ def _train_in_silence(args: list[str]) -> None:
 
 @pytest.mark.slow
 def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
-    """kill -9 of one training, nine times: while it starts, trains, writes a checkpoint and removes
-    the one before. Each process goes on from the checkpoint that the one before left."""
+    """One training is killed with kill -9 nine times: while it starts, trains, writes a checkpoint
+    and removes the previous one. Each process resumes from the checkpoint that the previous process
+    left."""
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["bounce_mjx.commands.train"])
     random_seconds = random.Random(0).uniform
@@ -333,7 +334,8 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     saved = 0
 
     def written() -> list[int]:
-        """Changes whenever something is written to the folder of the latest checkpoint."""
+        """A value that changes whenever something is written to the folder of the latest
+        checkpoint."""
         return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints/latest")]
 
     def wait_until(happens: Callable[[], bool]) -> None:
@@ -436,7 +438,7 @@ def test_a_path_may_have_square_brackets(tmp_path: Path, straight: Path, capfd) 
     assert_same_training(run, straight)
 
 
-# What is measured
+# Evaluations and logs
 
 
 def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
@@ -500,7 +502,8 @@ def test_the_time_left_is_never_negative() -> None:
 
 
 def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> None:
-    """Even if the process dies right after the save: a second SIGTERM does not wait."""
+    """This holds even if the process dies right after the save, because a second SIGTERM does not
+    wait."""
     logged = []
     save = CheckpointWriter.save
 
@@ -544,7 +547,7 @@ def finish_once_there_is_room(training: Job, make_room: Callable[[], None], reas
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["full", "read-only"])
-def test_disk_without_room_loses_nothing(tmp_path: Path, straight: Path, what: str) -> None:
+def test_full_disk_loses_nothing(tmp_path: Path, straight: Path, what: str) -> None:
     disk, filler = tmp_path / "disk", tmp_path / "disk/filler"
     remount = ["mount", "-o", "remount,size=4m,"]
     with (
@@ -572,7 +575,7 @@ def test_disk_without_room_loses_nothing(tmp_path: Path, straight: Path, what: s
 
 
 @pytest.mark.slow
-def test_file_that_may_not_grow_loses_nothing(tmp_path: Path, straight: Path) -> None:
+def test_file_size_limit_loses_nothing(tmp_path: Path, straight: Path) -> None:
     with job(
         tmp_path / "log", *TINY, "--total-steps", STEPS, "--log-dir", tmp_path / "runs"
     ) as training:
@@ -610,7 +613,7 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
 
 
 def change_state(monkeypatch, iteration: int, change: Callable) -> None:
-    """Changes the state of every training before that iteration."""
+    """Changes the state of every training before the given iteration."""
     run = PPOTrainer.run
 
     def run_changed(trainer: PPOTrainer):
@@ -640,35 +643,36 @@ def test_divergence_ends_the_training_and_keeps_the_last_good_state(
 
 
 @pytest.mark.parametrize("quantity", CHECKED)
-def test_first_fault_names_what_went_first(quantity: str) -> None:
+def test_first_fault_names_the_first_quantity(quantity: str) -> None:
     def value(name: str):
-        """That of a quantity: broken from there on, as everything after it would be."""
+        """The value of a quantity: NaN from the first broken quantity on, as everything computed
+        after it would be."""
         return jnp.where(CHECKED.index(name) >= CHECKED.index(quantity), jnp.nan, 1.0)
 
     def minibatches(name: str):
         return jnp.ones((2, 3)).at[1, 1].set(value(name)).at[1, 2].set(value("parameters"))
 
-    of_minibatches = {
+    minibatch_metrics = {
         "loss/value": minibatches("loss/value"),
         "loss/policy": minibatches("loss/policy"),
         "loss/gradient_norm": minibatches("gradient"),
     }
     if quantity == "parameters":
-        of_minibatches = dict.fromkeys(of_minibatches, jnp.ones((2, 3)))
+        minibatch_metrics = dict.fromkeys(minibatch_metrics, jnp.ones((2, 3)))
     number = first_fault(
-        value("reward"), {"mean": value("observation")}, of_minibatches, value("parameters")
+        value("reward"), {"mean": value("observation")}, minibatch_metrics, value("parameters")
     )
     assert CHECKED[number - 1] == quantity
 
 
 def test_no_fault_where_all_is_finite() -> None:
-    of_minibatches = dict.fromkeys(
+    minibatch_metrics = dict.fromkeys(
         ("loss/value", "loss/policy", "loss/gradient_norm"), jnp.ones((2, 3))
     )
-    assert first_fault(jnp.ones(()), jnp.ones(3), of_minibatches, jnp.ones(4)) == 0
+    assert first_fault(jnp.ones(()), jnp.ones(3), minibatch_metrics, jnp.ones(4)) == 0
 
 
-def test_state_that_is_not_finite_is_reset_told_and_stays_alone(
+def test_non_finite_state_is_reset_reported_and_does_not_spread(
     run: Path, straight: Path, monkeypatch, capfd
 ) -> None:
     def spoil(state):

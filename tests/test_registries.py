@@ -1,4 +1,4 @@
-"""Gymnasium and MuJoCo Playground know the environment, and their own checks pass."""
+"""Gymnasium and MuJoCo Playground list the environment, and their own checks pass."""
 
 import subprocess
 import sys
@@ -37,7 +37,7 @@ def vectorised(opengl):
 
 
 def episode(env, seed: int, steps: int) -> list:
-    """Everything that an environment gives under the same actions, copied."""
+    """Copies of everything that an environment returns for given actions."""
     given = [env.reset(seed=seed)]
     rng = np.random.default_rng(0)
     for _ in range(steps):
@@ -55,7 +55,7 @@ def test_import_registers_whichever_comes_first():
         assert done.stdout.split() == [ENV_ID, "False"], done.stderr
 
 
-def test_spaces_are_those_of_the_specification(single, vectorised):
+def test_spaces_equal_the_specification(single, vectorised):
     action, observation = single.action_space, single.observation_space
     assert action == gymnasium.spaces.Box(-1.0, 1.0, (6,))
     assert observation == gymnasium.spaces.Box(-np.inf, np.inf, (29,))
@@ -89,7 +89,8 @@ def test_single_environment_truncates_and_reports(single):
 
 
 def test_vectorised_environments_meet_the_interface(vectorised):
-    """Gymnasium has no check for them, so: spaces, types, and its same-step autoreset."""
+    """Gymnasium has no checker for vectorised environments, so the test checks spaces, types and
+    the same-step autoreset."""
     assert vectorised.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     given = episode(vectorised, 1, EPISODE_STEPS + 1)
     for observation, reward, terminated, truncated, info in given[1:]:
@@ -100,7 +101,7 @@ def test_vectorised_environments_meet_the_interface(vectorised):
         assert info["final_obs"].shape == (3, 29)
     before, last, after = given[-3], given[-2], given[-1]
     assert last[3].all() and not before[3].any() and not after[3].any()
-    # The target height of an episode never changes, and a reset draws another.
+    # The target height never changes within an episode, and a reset draws a new one.
     np.testing.assert_array_equal(last[4]["final_obs"][:, 28], before[0][:, 28])
     assert (last[0][:, 28] != before[0][:, 28]).all()
     np.testing.assert_array_equal(before[4]["final_obs"], before[0])
@@ -114,7 +115,7 @@ def test_vectorised_environments_work_in_gymnasiums_wrappers(vectorised):
     np.testing.assert_allclose(given[-1][4]["episode"]["r"], total, rtol=1e-5)
 
 
-def test_returned_arrays_are_the_users(vectorised):
+def test_returned_arrays_belong_to_the_user(vectorised):
     observation, _ = vectorised.reset(seed=0)
     following, reward, *_ = vectorised.step(np.zeros((3, 6), np.float32))
     for array in (observation, following, reward):
@@ -126,7 +127,7 @@ def test_pictures_show_the_state(single, vectorised):
     single.reset(seed=0)
     first = single.render()
     assert first.shape == (480, 640, 3) and first.dtype == np.uint8
-    # Orange as the arm is.
+    # The arm is orange.
     red, green, blue = first.reshape(-1, 3).astype(int).T
     assert ((red > 150) & (green > 50) & (green < 150) & (blue < 80)).sum() > 2000
     for _ in range(EPISODE_STEPS - 1):
@@ -137,14 +138,14 @@ def test_pictures_show_the_state(single, vectorised):
     assert len(pictures) == 3 and not np.array_equal(pictures[0], pictures[1])
 
 
-def test_no_picture_is_told_in_a_sentence(monkeypatch):
+def test_rendering_failure_gives_one_sentence(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
     with pytest.raises(UserError, match="neither EGL nor OSMesa works here; .*libosmesa6"):
         gymnasium.make(ENV_ID, render_mode="rgb_array")
 
 
-def test_wrong_settings_are_told_in_a_sentence():
+def test_wrong_settings_give_one_sentence():
     with pytest.raises(UserError, match="unknown key target_hight_range; did you mean target_h"):
         gymnasium.make(ENV_ID, target_hight_range=(0.3, 0.8))
     with pytest.raises(UserError, match="render_mode is 'human'"):
@@ -185,7 +186,8 @@ def test_playground_loads_the_environment(monkeypatch):
 
 
 def test_randomization_by_playground_is_refused():
-    """It replaces an MJX model that no step uses, so the randomised worlds would all be equal."""
+    """Playground's randomisation replaces an MJX model that no step uses, so all randomised worlds
+    would be equal."""
     pytest.importorskip("mujoco_playground")
     from mujoco_playground import wrapper
 

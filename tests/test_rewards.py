@@ -1,4 +1,5 @@
-"""Reward terms: against a transcription of the specification, by hand, and their gradients."""
+"""Reward terms: against a transcription of the specification, against values computed by hand, and
+their gradients."""
 
 import math
 from functools import partial
@@ -55,7 +56,8 @@ def state(
     last_action=0.0,
     joint_velocity=0.0,
 ) -> dict[str, np.ndarray]:
-    """One state as a batch of one; `dx`, `dy` and `paddle_dx`, `paddle_dy` are off the target."""
+    """One state as a batch of one; `dx`, `dy` and `paddle_dx`, `paddle_dy` are offsets from the
+    target."""
     return {
         "ball_position": np.array([[X_TARGET + dx, dy, z]]),
         "ball_velocity": np.array([[0.3, -0.2, vz]]),
@@ -132,7 +134,8 @@ def branches(states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     reaches = vz**2 > 2 * 9.81 * dh
     v_ideal = np.sqrt(2 * 9.81 * np.maximum(0, dh))
     on_target = err_xy < 0.04
-    # Where the Gaussian factors are not vanishingly small, so that the clips can be seen.
+    # Only states where the Gaussian factors are not vanishingly small, so that the clips have an
+    # effect.
     paced = rising & on_target & (np.abs(vz - np.clip(v_ideal, 0.5, 3.0)) < 1.0)
     return {
         "rising below, reaches the target": rising & below & ~near & reaches,
@@ -179,7 +182,7 @@ def branches(states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def random_comparison():
-    """The package's and the reference's weighted terms of the same random states."""
+    """The weighted terms of the package and of the reference for the same random states."""
     states = random_states(seed=0)
     reference = {
         name: REFERENCE_WEIGHTS[name] * term for name, term in reference_terms(**states).items()
@@ -200,14 +203,14 @@ def test_term_equals_reference(name, random_comparison):
     np.testing.assert_allclose(package[name], reference[name], rtol=1e-6, atol=1e-12)
 
 
-def test_names_are_those_of_the_spec(random_comparison):
+def test_names_equal_the_specification(random_comparison):
     package, reference = random_comparison
     assert tuple(TERM_NAMES) == SPEC_NAMES
     assert tuple(REFERENCE_WEIGHTS) == SPEC_NAMES
     assert set(package) == set(reference) == set(SPEC_NAMES)
 
 
-def test_weights_are_those_of_the_specification():
+def test_weights_equal_the_specification():
     config = EnvConfig().reward
     assert {name: getattr(config, name).weight for name in SPEC_NAMES} == REFERENCE_WEIGHTS
     assert config == RewardConfig()
@@ -329,11 +332,11 @@ PINNED_IDS = [f"{name}-{i}" for i, (name, _, _) in enumerate(PINNED)]
 
 @pytest.fixture(scope="module")
 def pinned_terms():
-    """The package's terms of all pinned states, from one compilation."""
+    """The package's terms for all hand-computed states, from one compilation."""
     return evaluate(RewardConfig(), stack([inputs for _, inputs, _ in PINNED]))
 
 
-def test_every_term_is_pinned():
+def test_every_term_has_hand_computed_values():
     assert {name for name, _, _ in PINNED} == set(SPEC_NAMES)
 
 
@@ -358,7 +361,7 @@ def test_downward_velocity_takes_its_sign_from_the_weight():
     assert penalised == -rewarded
 
 
-# No single state makes all fifteen non-zero: a ball can not rise and fall at once.
+# No single state makes all fifteen terms non-zero: a ball cannot rise and fall at once.
 TWO_STATES = stack(
     [
         state(
@@ -403,7 +406,7 @@ VARIED = ("ball_position", "ball_velocity", "paddle_position", "action", "joint_
 
 
 def directional_derivatives(inputs: RewardInputs, direction: RewardInputs):
-    """Derivatives [N] of the reward along a direction: by JAX, and by central differences of the
+    """Derivatives [N] of the reward along a direction, by JAX and by central differences of the
     fourth order."""
     step = 3e-6
     evaluate = jax.jit(jax.vmap(partial(reward, RewardConfig())))
@@ -426,7 +429,8 @@ def directional_derivatives(inputs: RewardInputs, direction: RewardInputs):
 
 
 def test_gradient_equals_finite_differences():
-    """At states on both sides of every condition, up to the few that a step carries over one."""
+    """Compared at states on both sides of every condition, except for the few states that a
+    difference step moves across one."""
     states = random_states(11)
     rng = np.random.default_rng(12)
     states = states | {"n_bounces": states["n_bounces"].astype(np.float64)}

@@ -13,13 +13,13 @@ from bounce_mjx.gpu.rows import Rows
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 from bounce_mjx.task import vector
 
-# No multiple of a block.
+# Not a multiple of the block size.
 BATCH = 70
 EPISODE_STEPS = 2000
 
 
 def evaluate(function, *args):
-    """A function of arrays, which returns a list of arrays, through its scalars."""
+    """Evaluates a function of arrays, which returns a list of arrays, through its scalar form."""
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
     scalar_function = as_scalars(function, shapes)
     scalars = [x[index] for x in args for index in np.ndindex(*x.shape)]
@@ -59,7 +59,7 @@ def test_scalars_give_the_arrays(function):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
 
 
-def test_equal_entries_are_one_scalar_and_unused_ones_are_told():
+def test_equal_entries_are_one_scalar_and_unused_ones_are_marked():
     shape = jax.ShapeDtypeStruct((3,), jnp.float32)
     scalar_function = as_scalars(lambda x, y: [x, jnp.stack([x[2], x[0]]), x[0] + 1.0], [shape] * 2)
     assert len(scalar_function.dtypes) == 4
@@ -68,12 +68,12 @@ def test_equal_entries_are_one_scalar_and_unused_ones_are_told():
 
 
 @pytest.mark.parametrize("function", [lambda x: [jnp.sort(x)], lambda x: [x[jnp.argmax(x)]]])
-def test_what_has_no_scalar_form_is_refused(function):
+def test_operations_without_a_scalar_form_are_refused(function):
     with pytest.raises(UnsupportedOperation):
         as_scalars(function, [jax.ShapeDtypeStruct((3,), jnp.float32)])
 
 
-def test_what_has_no_scalar_form_stays_as_it_is():
+def test_functions_without_a_scalar_form_are_unchanged():
     x = jax.random.normal(jax.random.PRNGKey(0), (BATCH, 3))
     program = jax.vmap(elementwise.in_one_kernel(jnp.sort, interpret=True))
     assert "pallas_call" not in str(jax.make_jaxpr(program)(x))
@@ -99,7 +99,8 @@ def test_rows_hold_every_type():
 
 
 def test_the_control_step_is_one_kernel(monkeypatch):
-    """Physics, task, reward, ends, time-outs and resets, against the program without a kernel."""
+    """Physics, task, reward, terminations, time-outs and resets, against the program without a
+    kernel."""
     env = BounceBall()
     reset_key, action_key, fresh_key = jax.random.split(jax.random.PRNGKey(0), 3)
     state = jax.jit(lambda key: vector.reset(env, key, BATCH))(reset_key)

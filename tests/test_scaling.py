@@ -1,4 +1,5 @@
-"""Several seeds in one program, several devices, several hosts: each like one of them alone."""
+"""Several seeds in one program, several devices, several hosts: each gives the same training as one
+alone."""
 
 import contextlib
 import json
@@ -69,12 +70,13 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(tmp_path_factory.mktemp("seeds"), "--num-seeds", str(SEEDS))
 
 
-def assert_alike(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> None:
-    """Equal but for the order of sums."""
+def assert_equal_up_to_rounding(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> None:
+    """Checks that two trainings are equal up to the order of summation."""
     assert ours.keys() == theirs.keys()
     for name in theirs:
         if name.startswith("params"):
-            # Adam magnifies the rounding of gradients near zero up to a step of the learning rate.
+            # Adam magnifies the rounding of gradients near zero to at most a step of the learning
+            # rate.
             np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
         elif name in ("key", "iteration", "env.clock", "env.length"):
             np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
@@ -97,7 +99,7 @@ def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expecte
         ("JAX_THREEFRY_GPU_KERNEL_LOWERING", kernel),
         ("XLA_PYTHON_CLIENT_PREALLOCATE", preallocate),
     ):
-        # Set first, so that what the command sets itself is undone as well.
+        # Set first, so that the settings of the command itself are undone as well.
         monkeypatch.setenv(name, value or "")
         if value is None:
             monkeypatch.delenv(name)
@@ -134,9 +136,9 @@ def test_number_of_groups(num_envs, rollout_length, num_minibatches, expected):
 
 def test_groups_hold_the_samples_of_their_environments():
     length, batch, groups = 3, 8, 4
-    of_environment = jnp.broadcast_to(jnp.arange(batch), (length, batch))
+    environment_ids = jnp.broadcast_to(jnp.arange(batch), (length, batch))
     at_time = jnp.broadcast_to(jnp.arange(length)[:, None], (length, batch))
-    dealt = ppo.group(jnp.stack([of_environment, at_time], axis=-1), groups)
+    dealt = ppo.group(jnp.stack([environment_ids, at_time], axis=-1), groups)
     for i, samples in enumerate(np.asarray(dealt)):
         expected = {(env, t) for env in (2 * i, 2 * i + 1) for t in range(length)}
         assert {tuple(sample) for sample in samples.tolist()} == expected
@@ -147,11 +149,11 @@ def test_groups_hold_the_samples_of_their_environments():
 
 
 @pytest.mark.slow
-def test_each_of_several_seeds_is_like_that_seed_alone(seeds: Path, alone: Path, tmp_path: Path):
+def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_path: Path):
     together = arrays(latest_checkpoint(seeds))
     for i, single in enumerate([alone, train(tmp_path / "1", "--seed", "1")]):
         theirs = arrays(latest_checkpoint(single))
-        assert_alike({name: value[i] for name, value in together.items()}, theirs)
+        assert_equal_up_to_rounding({name: value[i] for name, value in together.items()}, theirs)
     assert (together["params.policy.params.Dense_0.kernel"].std(axis=0) > 0).any()
 
 
@@ -219,7 +221,7 @@ def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, mon
     monkeypatch.setattr(PPOTrainer, "run", spoilt)
     run = train(tmp_path / "runs", "--num-seeds", str(SEEDS), "--total-steps", "384")
     best = best_checkpoint(run / "seed_001").steps
-    # It stays diverged in a training that goes on.
+    # It stays diverged when the training is resumed.
     train_command.main(["--resume", str(run), "--total-steps", str(2 * STEPS), "--no-report"])
     assert best_checkpoint(run / "seed_001").steps == best
     said = capsys.readouterr().out
@@ -243,7 +245,7 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
         assert eight.wait() == 0, eight.said
     assert "device: 8 x cpu" in eight.said
     (run,) = (tmp_path / "runs").iterdir()
-    assert_alike(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
+    assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
 
 MESSAGES = """
@@ -269,14 +271,14 @@ print(*re.findall(names, text))
 
 
 @pytest.mark.slow
-def test_devices_exchange_sums_alone(monkeypatch: pytest.MonkeyPatch):
-    """No device sends samples or environments to another: a minibatch is one message."""
+def test_devices_exchange_only_sums(monkeypatch: pytest.MonkeyPatch):
+    """No device sends samples or environments to another; each minibatch needs one message."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
     done = subprocess.run([sys.executable, "-c", MESSAGES], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     messages = done.stdout.split()
     assert set(messages) == {"all-reduce"}
-    # One a minibatch, two for the advantages of an epoch, a few for the rollout's statistics.
+    # One per minibatch, two for the advantages of an epoch, a few for the rollout's statistics.
     assert len(messages) <= 8
 
 
@@ -336,10 +338,10 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     assert "steps/s" in leader and "steps/s" not in follower
     (run,) = (tmp_path / "runs").iterdir()
     assert len(list(run.glob("events.*"))) == 1
-    assert_alike(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
+    assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
-    # The leader has its programs from the cache, the other one compiles them for longer than JAX's
-    # exchange between devices waits; then the other one dies.
+    # The leader finds its programs in the cache. The other process compiles them for longer than
+    # JAX's exchange between devices waits, and then dies.
     flags = ["--resume", run, "--total-steps", 10**9, "--num-processes", "2", "--no-report"]
     flags += ["--coordinator-address", f"127.0.0.1:{free_port()}"]
     with (
@@ -355,7 +357,7 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     assert f"the last checkpoint is {run}/checkpoints/latest/" in sentence
     assert "Traceback" not in leader.said
 
-    # What two processes saved, one goes on from.
+    # One process resumes from the checkpoint of two.
     monkeypatch.delenv("XLA_FLAGS")
     before, steps = arrays(latest_checkpoint(run)), latest_checkpoint(run).steps
     train_command.main(["--resume", str(run), "--total-steps", str(steps + 128), "--no-report"])
@@ -413,7 +415,7 @@ def test_the_death_of_a_process_ends_the_others_with_a_sentence(tmp_path: Path, 
                 )
 
 
-def test_a_stranger_is_no_process_of_the_training():
+def test_a_stranger_cannot_join_the_training():
     peers = Peers(0, 2, 5.0, lambda: "", os._exit)
     address, server = peers.listen()
     accepting = threading.Thread(target=peers.accept, args=(server, address.token))
@@ -458,7 +460,7 @@ def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path, p
     assert re.fullmatch(r"error: .+ did not find each other at .+ within 2 s; .+\n", alone.said)
 
 
-def test_distributed_without_a_launcher_is_one_sentence(tmp_path: Path):
+def test_distributed_without_a_launcher_gives_one_sentence(tmp_path: Path):
     with job(tmp_path / "log", "--distributed") as alone:
         assert alone.wait() == 2
     assert alone.said.startswith("error: the processes of this training cannot be joined")

@@ -1,4 +1,4 @@
-"""The studies in benchmarks/: the search over hyperparameters, and ten minutes on end."""
+"""The studies in benchmarks/: the search over hyperparameters, and ten minutes without a reset."""
 
 import json
 import subprocess
@@ -40,7 +40,7 @@ def states(storage: Path) -> list[str]:
     return [trial.state.name for trial in study.trials]
 
 
-def test_a_search_goes_on_where_it_was_cut_off(sweep, monkeypatch):
+def test_an_interrupted_search_continues(sweep, monkeypatch):
     module, command = sweep
     base = module.read_preset(command.config)
     tried = []
@@ -61,7 +61,7 @@ def test_a_search_goes_on_where_it_was_cut_off(sweep, monkeypatch):
         module.search(command, base)
     monkeypatch.setattr(module, "run_trial", value)
     module.search(command, base)
-    # The one that was cut off is made up for with the same values, which are today's.
+    # The interrupted trial is repeated with the same values, which are the preset's.
     assert tried[0] == base.ppo.discount
     assert states(command.storage).count("COMPLETE") == 2
     module.search(command, base)
@@ -82,7 +82,7 @@ def test_a_trial_trains_a_population(sweep):
 
 @pytest.mark.slow
 def test_the_shipped_policy_keeps_the_ball_up(tmp_path: Path):
-    """For three times as long as an episode that it was trained on."""
+    """The policy runs for three times as long as an episode of its training."""
     done = subprocess.run(
         [sys.executable, "endurance.py", "../pretrained", "--num-envs", "16", "--minutes", "1",
          "--out", tmp_path],

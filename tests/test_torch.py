@@ -1,4 +1,5 @@
-"""The environment for PyTorch: shared memory, the same steps, and its libraries' own interfaces."""
+"""The environment for PyTorch: shared memory, the same steps, and the interfaces of PyTorch
+libraries."""
 
 import itertools
 import subprocess
@@ -34,7 +35,7 @@ from bounce_mjx.learning.statistics import init_statistics, normalize, update
 from bounce_mjx.task import vector
 
 NUM_ENVS = 4
-# Both a fall (the ball reaches the floor after 0.3 s) and time-outs come within a test.
+# Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.
 EPISODE_STEPS = 20
 PPO = PPOConfig(
     num_envs=8, rollout_length=8, num_epochs=2, num_minibatches=2, hidden_layers=(16, 12)
@@ -44,7 +45,7 @@ LIBRARIES = ("rsl_rl", "skrl")
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Threads of PyTorch that wait for a busy core slow tiny networks down a hundredfold."""
+    """PyTorch threads that wait for a busy core slow tiny networks down a hundredfold."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -63,7 +64,7 @@ def env(task) -> TorchVectorEnv:
 
 @pytest.fixture(scope="module")
 def learners(task):
-    """Of each library a learner after two iterations."""
+    """A learner of each library after two iterations."""
     made = {library: make_learner(library, PPO, task, 0) for library in LIBRARIES}
     return {library: (learner, learner.learn(2)) for library, learner in made.items()}
 
@@ -82,14 +83,14 @@ STEP_FIELDS = (
 
 
 def random_actions(steps: int) -> torch.Tensor:
-    """Some beyond the limits [steps, B, 6]."""
+    """Actions [steps, B, 6], some of them beyond the limits."""
     return 1.5 * torch.randn(steps, NUM_ENVS, 6, generator=torch.Generator().manual_seed(0))
 
 
 # Memory
 
 
-def test_observation_is_the_memory_of_jax(env):
+def test_observation_shares_the_memory_of_jax(env):
     env.reset()
     result = env.step(torch.zeros(NUM_ENVS, 6))
     block, taken = result._array.unsafe_buffer_pointer(), []
@@ -104,8 +105,8 @@ def test_observation_is_the_memory_of_jax(env):
     assert taken[-1][1] <= result._array.nbytes
 
 
-def test_a_block_gives_back_what_was_packed():
-    """Of every type, and of bools whose number is no multiple of a word's bytes."""
+def test_unpacking_a_block_gives_the_packed_arrays():
+    """Arrays of every type, and bools whose number is not a multiple of a word's bytes."""
 
     class Arrays(NamedTuple):
         floats: jax.Array
@@ -145,14 +146,14 @@ def test_action_reaches_jax_without_a_copy(env, monkeypatch):
         return step(block, action)
 
     monkeypatch.setattr(env, "_jit_step", spy)
-    # PyTorch aligns a tensor as JAX needs it where it is not a part of another.
+    # PyTorch aligns a tensor as JAX needs it unless it is a part of another tensor.
     action = torch.zeros(NUM_ENVS, 6)
     env.step(action)
     assert seen == [action.data_ptr()]
 
 
 def test_tensors_of_a_step_outlive_the_following_steps(env):
-    """Though the state is donated from step to step."""
+    """They stay valid although the state is donated from step to step."""
     first, _ = env.reset()
     kept, copies = [first], [first.clone()]
     for action in random_actions(2 * EPISODE_STEPS):
@@ -192,7 +193,7 @@ def test_step_waits_for_nothing_on_cuda(task):
 # The same steps
 
 
-def test_steps_are_those_of_vector(task, env):
+def test_steps_equal_vector_steps(task, env):
     """The same resets and actions through `vector.step` give the same episodes."""
     first, _ = env.reset(seed=11)
     _, key = jax.random.split(jax.random.PRNGKey(11))
@@ -274,7 +275,7 @@ except ImportError as error:
 # rsl_rl
 
 
-def test_rsl_rl_hands_on_time_outs_and_terminal_observations(env):
+def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     vec_env = RslRlVecEnv(env)
     vec_env.episode_length_buf = torch.tensor([EPISODE_STEPS - 1, 0, 0, EPISODE_STEPS - 2])
     assert vec_env.episode_length_buf.tolist() == [EPISODE_STEPS - 1, 0, 0, EPISODE_STEPS - 2]
@@ -302,7 +303,7 @@ def test_rsl_rl_log_has_the_mean_reward_terms(env):
 
 
 def test_rsl_rl_runner_trains(task, tmp_path):
-    """rsl_rl's own runner, with its log and its check for numbers that are not finite."""
+    """rsl_rl's own runner trains, with its log and its check for non-finite numbers."""
     env = RslRlVecEnv(TorchVectorEnv(task, PPO.num_envs))
     config = algorithm_config(PPO) | {"check_for_nan": True}
     runner = OnPolicyRunner(env, config, log_dir=str(tmp_path), device=str(env.device))
@@ -317,7 +318,7 @@ def test_rsl_rl_runner_trains(task, tmp_path):
 # skrl
 
 
-def test_skrl_hands_on_terminal_observations(env):
+def test_skrl_gets_terminal_observations(env):
     skrl_env = SkrlEnv(env)
     skrl_env.reset()
     env.clock = torch.tensor([EPISODE_STEPS - 1, 0, 0, 0])
@@ -332,7 +333,7 @@ def test_skrl_hands_on_terminal_observations(env):
 
 
 def test_skrl_trainer_trains(learners):
-    """skrl's own trainer."""
+    """skrl's own trainer runs."""
     learner, _ = learners["skrl"]
     before = [p.clone() for p in learner.agent.policy.parameters()]
     cfg = {
@@ -347,7 +348,7 @@ def test_skrl_trainer_trains(learners):
 
 
 def test_skrl_bootstraps_time_outs_from_the_terminal_observations(learners):
-    """Its memory holds the reward plus the discounted value of the old episode's end."""
+    """skrl's memory holds the reward plus the discounted value of the old episode's last state."""
     learner, _ = learners["skrl"]
     agent, at = learner.agent, learner.agent.memory.memory_index
     learner.vector.clock = torch.full((PPO.num_envs,), EPISODE_STEPS - 1, dtype=torch.int32)
@@ -382,8 +383,9 @@ def test_gymnasium_vector_env_stays_on_the_device(env):
 # Networks
 
 
-def test_normalizer_is_that_of_jax():
-    """Over batches: the statistics, and the normalised observation, also of a constant."""
+def test_normalizer_equals_the_normalizer_in_jax():
+    """The statistics over batches and the normalised observations are equal, also for a constant
+    observation."""
     rng = np.random.default_rng(0)
     normalizer, statistics = Normalizer(3), init_statistics(3)
     for count in (5, 40, 7):
@@ -404,8 +406,9 @@ def test_normalizer_is_that_of_jax():
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_policy_acts_as_the_network_did(learners, library):
-    """The same actions for the same observations, in PyTorch and as a `Policy` in JAX."""
+def test_policy_acts_like_the_network(learners, library):
+    """The PyTorch network and its `Policy` in JAX give the same actions for the same
+    observations."""
     learner, _ = learners[library]
     observation = 3.0 * torch.randn(64, 29, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -421,7 +424,7 @@ def test_policy_acts_as_the_network_did(learners, library):
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_learner_reports_what_the_trainer_in_jax_does(learners, library):
+def test_learner_reports_the_same_metrics_as_the_jax_trainer(learners, library):
     _, metrics = learners[library]
     reported = summarize(metrics)
     assert {"reward/height", "episode/return", "task/ball_xy_error"} < reported.keys()
@@ -431,8 +434,8 @@ def test_learner_reports_what_the_trainer_in_jax_does(learners, library):
     np.testing.assert_allclose(sum(terms), reported["reward"], rtol=1e-4)
 
 
-def test_initial_weights_are_those_of_jax():
-    """Orthogonal with the same gains, so with the same singular values."""
+def test_initial_weights_are_distributed_as_in_jax():
+    """The weights are orthogonal with the same gains, so they have the same singular values."""
     networks = make_networks(PPO, 29, 6)
     params = networks.policy_network.init(jax.random.PRNGKey(0))["params"]
     mlp = make_mlp(PPO, 29, 6)
@@ -447,7 +450,7 @@ def test_initial_weights_are_those_of_jax():
         )
 
 
-def test_network_of_another_shape_is_no_policy():
+def test_network_of_another_shape_is_refused():
     mlp = make_mlp(PPO.model_copy(update={"hidden_layers": (16,)}), 29, 6)
     with pytest.raises(UserError, match="hidden_layers"):
         to_policy(PPO, Normalizer(29), linears_of(mlp), torch.zeros(6))

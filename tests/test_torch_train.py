@@ -1,4 +1,4 @@
-"""train_torch.py: its files, and that the rest of the package can use them."""
+"""train_torch.py: its files, which the rest of the package can use."""
 
 import json
 import re
@@ -34,7 +34,7 @@ TINY = (
 ).split()
 
 
-# As where PyTorch is not installed; some libraries mind a None in sys.modules.
+# As if PyTorch were not installed; some libraries cannot handle a None in sys.modules.
 NO_TORCH = """
 import sys
 class NoTorch:
@@ -47,11 +47,11 @@ sys.meta_path.insert(0, NoTorch())
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory) -> Iterator[None]:
-    """Compiled programs are kept in a cache of this module."""
+    """Keeps compiled programs in a cache for this module."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = [getattr(jax.config, name) for name in names]
     with pytest.MonkeyPatch.context() as patch:
-        # The command leaves the cache alone that the user has chosen.
+        # The command does not change a cache that the user has chosen.
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("user")))
         for name, value in zip(names, (str(tmp_path_factory.mktemp("cache")), 0.0), strict=True):
             jax.config.update(name, value)
@@ -82,7 +82,7 @@ def run(library, tmp_path_factory) -> Path:
     return train(tmp_path_factory.mktemp(library), library)
 
 
-def test_run_folder_is_that_of_the_trainer_in_jax(run):
+def test_run_folder_has_the_same_files_as_in_jax(run):
     results = json.loads((run / "results.json").read_text(encoding="utf-8"))
     assert results["library"] in run.parent.name
     assert [e["steps"] for e in results["evaluations"]] == [128, 256]
@@ -95,7 +95,8 @@ def test_run_folder_is_that_of_the_trainer_in_jax(run):
 
 
 def test_run_is_evaluated_without_torch(run, tmp_path):
-    """By the same command with the same table; the best checkpoint gives its results again."""
+    """The same command prints the same table, and the best checkpoint gives the same results
+    again."""
     out = tmp_path / "results.json"
     seed = load_config(run / "config.yaml").eval_seed
     script = f"""{NO_TORCH}
@@ -108,7 +109,7 @@ main([{str(run)!r}, "--episodes", "4", "--seed", "{seed}", "--json", {str(out)!r
     assert len(json.loads(out.read_text(encoding="utf-8"))["results"]) == 5
 
 
-def test_best_policy_is_the_one_that_was_judged(run):
+def test_best_policy_is_the_evaluated_policy(run):
     config = load_config(run / "config.yaml")
     checkpoint = find_checkpoint(run)
     results = json.loads((run / "results.json").read_text(encoding="utf-8"))
@@ -133,7 +134,7 @@ def test_run_has_a_report(run):
 
 def test_resumed_run_is_the_same_as_an_uninterrupted_one(run, library, tmp_path):
     half = train(tmp_path / "half", library, "--total-steps", "128", "--no-report")
-    # Without --library, which the run knows.
+    # Without --library, which the run records.
     torch_train.main(["--resume", str(half), "--total-steps", "256", "--no-report"])
     ours, theirs = (arrays(latest_checkpoint(folder)) for folder in (half, run))
     assert ours.keys() == theirs.keys()
@@ -145,9 +146,7 @@ def test_resumed_run_is_the_same_as_an_uninterrupted_one(run, library, tmp_path)
     assert both[0]["results"] == both[1]["results"]
 
 
-def test_a_seed_is_trained_as_alone_and_its_divergence_stays(
-    run, library, tmp_path, monkeypatch, capfd
-):
+def test_a_seed_trains_as_if_alone_and_stays_diverged(run, library, tmp_path, monkeypatch, capfd):
     run_block = TorchTrainer.run
 
     def spoilt(trainer: TorchTrainer):
@@ -190,7 +189,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("flags, words", MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_are_told_in_a_sentence(flags, words, tmp_path, monkeypatch, capfd):
+def test_mistakes_give_one_sentence(flags, words, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as exit_info:
         torch_train.main(flags.split())
@@ -202,7 +201,7 @@ def test_mistakes_are_told_in_a_sentence(flags, words, tmp_path, monkeypatch, ca
 
 
 @pytest.mark.parametrize("missing, library", [("rsl_rl", "rsl_rl"), ("skrl", "skrl")])
-def test_missing_library_is_told_in_a_sentence(missing, library, tmp_path):
+def test_missing_library_gives_one_sentence(missing, library, tmp_path):
     script = f"""
 import sys
 sys.modules[{missing!r}] = None
@@ -226,7 +225,7 @@ def test_script_shows_its_flags():
 
 
 def test_evaluation_command_lists_the_run(run, capsys):
-    """The newest run in a folder of runs, whichever trainer made it."""
+    """The newest run in a folder of runs, whichever trainer wrote it."""
     with pytest.raises(SystemExit):
         eval_command.main(["--log-dir", str(run.parent), "--episodes", "4"])
     assert str(run) in capsys.readouterr().out

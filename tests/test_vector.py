@@ -39,7 +39,8 @@ def step(env):
 
 @pytest.fixture(scope="module")
 def actions():
-    """Random actions [STEPS, NUM_ENVS, 6], the last environment's so tame that its ball bounces."""
+    """Random actions [STEPS, NUM_ENVS, 6]; in the last environment they are so small that the ball
+    bounces."""
     drawn = np.random.default_rng(2).uniform(-1, 1, (STEPS, NUM_ENVS, 6)).astype(np.float32)
     drawn[:, -1] = 0
     return drawn
@@ -57,7 +58,7 @@ def run(reset, step, actions, episode_steps):
 
 @pytest.fixture(scope="module")
 def unlimited(reset, step, actions):
-    """A run in which only the task ends episodes."""
+    """A run in which episodes end only by termination."""
     return run(reset, step, actions, NO_LIMIT)
 
 
@@ -68,7 +69,7 @@ def limited(reset, step, actions):
 
 
 def python_loop(single, actions, episode_steps, i):
-    """Environment i alone, in plain Python, as `StepResult` describes it."""
+    """Environment i alone, in plain Python, with the results that `StepResult` describes."""
     reset_one, step_one = single
     state = reset_one(jax.random.split(RESET_KEY, NUM_ENVS)[i])
     episode_return, length, rows = 0.0, 0, []
@@ -115,7 +116,7 @@ def test_run_equals_a_loop_over_single_environments(
     np.testing.assert_array_equal(results.metrics["n_bounces"][:, i], expected["n_bounces"])
 
 
-def test_runs_contain_what_they_are_to_test(unlimited, limited):
+def test_runs_contain_the_events_under_test(unlimited, limited):
     results, _ = unlimited
     assert results.terminated.any() and not results.truncated.any()
     assert results.metrics["bounced"].any()
@@ -190,7 +191,7 @@ def test_time_out_is_exactly_at_the_limit(limited):
     assert results.truncated[times].all()
 
 
-def test_end_of_the_task_at_the_limit_is_no_time_out(unlimited, reset, step, actions):
+def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, actions):
     ended_at, i = np.argwhere(unlimited[0].terminated)[0]
     episode_steps = ended_at + 1
     at_limit, _ = run(reset, step, actions[: episode_steps + 1], int(episode_steps))
@@ -201,7 +202,7 @@ def test_end_of_the_task_at_the_limit_is_no_time_out(unlimited, reset, step, act
 
 
 def test_run_depends_on_the_reset_keys(unlimited, reset, step, actions):
-    """Only from the first end on: before it the keys are not used."""
+    """The runs differ only after the first end of an episode: before it the keys are not used."""
     ended_at, i = np.argwhere(unlimited[0].terminated)[0]
     state = unlimited[1][ended_at]
     _, again = step(state, actions[ended_at], STEP_KEYS[ended_at], NO_LIMIT)

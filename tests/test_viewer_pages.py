@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed"),
 ]
 
-# Without a GPU and as root; and it is to ask nothing of its own of the network.
+# Chromium runs without a GPU and as root, and must make no network requests of its own.
 FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist "
     "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
@@ -33,7 +33,7 @@ PATIENCE = 120.0
 
 
 class Watched:
-    """A page, with what it asked for and complained of."""
+    """A page, with its network requests and its error messages."""
 
     def __init__(self, page: Page):
         self.page = page
@@ -50,15 +50,15 @@ class Watched:
         )
 
     def picture(self) -> np.ndarray:
-        """The page as it is now [height, width, 3]."""
+        """A screenshot of the page [height, width, 3]."""
         return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))
 
     def wait_for_arm(self) -> np.ndarray:
-        """The first picture with an orange arm."""
+        """The first screenshot that shows the orange arm."""
         return self.wait_until(lambda picture: arm_share(picture) > 0.005)
 
     def wait_for_motion(self, picture: np.ndarray) -> np.ndarray:
-        """The first picture in which the canvas differs from another picture."""
+        """The first screenshot whose canvas differs from another screenshot."""
         return self.wait_until(lambda now: (canvas(now) != canvas(picture)).any(-1).sum() > 100)
 
     def wait_until(self, holds: Callable[[np.ndarray], bool]) -> np.ndarray:
@@ -78,7 +78,7 @@ def canvas(picture: np.ndarray) -> np.ndarray:
 
 
 def arm_share(picture: np.ndarray) -> float:
-    """Share of the canvas that has the arm's orange."""
+    """Share of the canvas that has the arm's orange colour."""
     red, green, blue = np.moveaxis(canvas(picture).astype(int), -1, 0)
     return float(((red > 130) & (green < 120) & (blue < 80)).mean())
 
@@ -93,7 +93,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def watch(browser: Browser) -> Iterator[Callable[[str], Watched]]:
-    """A function (address) -> a page that has it open."""
+    """A function (address) -> a page that shows this address."""
     pages = []
 
     def watch(address: str) -> Watched:
@@ -107,7 +107,9 @@ def watch(browser: Browser) -> Iterator[Callable[[str], Watched]]:
         page.close()
 
 
-def test_replay_page_moves_and_asks_for_nothing(watch, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_replay_page_moves_and_makes_no_requests(
+    watch, tmp_path: Path, monkeypatch, capsys
+) -> None:
     monkeypatch.chdir(tmp_path)
     view.main("--actions scripted --num-envs 2 --seconds 3 --html replay[lr].html".split())
     assert "written: replay[lr].html\n" in capsys.readouterr().out
@@ -171,13 +173,13 @@ def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
     page = watched.page
     watched.wait_for_motion(watched.wait_for_arm())
 
-    # The panel tells the reward by its terms, and they change.
+    # The panel shows the reward terms, and they change.
     terms = page.get_by_text("consecutive bounces").locator("xpath=..")
     before = terms.inner_text()
     page.wait_for_function("([e, t]) => e.innerText != t", arg=[terms.element_handle(), before])
     assert page.locator(".uplot").count() == 1
 
-    # Paused, nothing moves; a reset puts the ball elsewhere.
+    # While it is paused nothing moves; a reset moves the ball.
     page.get_by_label("pause").click()
     still = watched.picture()
     for _ in range(20):

@@ -50,7 +50,8 @@ PATIENCE = 60.0
 
 @pytest.fixture(autouse=True)
 def no_opengl_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo says in the environment which OpenGL a process took, and a child would believe it."""
+    """MuJoCo stores the chosen OpenGL library in an environment variable, which a child process
+    would inherit."""
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
 
 
@@ -66,14 +67,14 @@ def scripted(env: BounceBall) -> Simulation:
 
 @pytest.fixture(scope="module")
 def recording(scripted: Simulation) -> Frame:
-    """One step more than an episode."""
+    """A recording that is one step longer than an episode."""
     return scripted.record(SECONDS + scripted.env.dt)
 
 
 # The simulation
 
 
-def test_frames_are_of_one_state(env: BounceBall, recording: Frame) -> None:
+def test_frames_describe_one_state(env: BounceBall, recording: Frame) -> None:
     """MuJoCo's kinematics find the ball and the paddle where the frame has them."""
     display = Display(env)
     for step in (0, 57, 123):
@@ -84,8 +85,8 @@ def test_frames_are_of_one_state(env: BounceBall, recording: Frame) -> None:
             np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
 
 
-def test_ball_flies_as_it_should(recording: Frame, env: BounceBall) -> None:
-    """Where it is high above the paddle it only falls: z'' = -g."""
+def test_ball_falls_freely(recording: Frame, env: BounceBall) -> None:
+    """High above the paddle the ball only falls: z'' = -g."""
     z = recording.ball[:-2, 0, 2]
     high = z[1:-1] > 0.2
     assert high.sum() > 100
@@ -93,7 +94,7 @@ def test_ball_flies_as_it_should(recording: Frame, env: BounceBall) -> None:
     np.testing.assert_allclose(acceleration[high], -GRAVITY, atol=0.02)
 
 
-def test_time_runs_until_the_episode_is_over(recording: Frame, env: BounceBall) -> None:
+def test_time_runs_until_the_episode_ends(recording: Frame, env: BounceBall) -> None:
     steps = round(SECONDS / env.dt)
     np.testing.assert_allclose(recording.time[: steps + 1, 0], np.arange(steps + 1) * env.dt)
     np.testing.assert_array_equal(np.flatnonzero(recording.over[:, 0]), [steps])
@@ -161,7 +162,7 @@ def test_a_push_adds_its_velocity_to_the_ball_once(scripted: Simulation) -> None
 
 
 def ramp(over: tuple[int, ...] = ()) -> Frame:
-    """Eleven frames 0.01 s apart of one environment; every number is its time, in steps."""
+    """Eleven frames of one environment, 0.01 s apart; every value is the frame's time in steps."""
     value = np.arange(11.0)[:, None]
     wide = np.repeat(value[..., None], 3, axis=-1)
     ended = np.zeros((11, 1), bool)
@@ -176,7 +177,7 @@ def test_resampling_interpolates_positions() -> None:
     np.testing.assert_allclose(frames.time[:, 0], times)
     for positions in (frames.qpos, frames.ball, frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
-    # What counts or is drawn is that of the last step.
+    # Counts and rewards come from the last step.
     np.testing.assert_array_equal(frames.n_bounces[:, 0], np.floor(100 * times + 1e-9))
 
 
@@ -197,7 +198,7 @@ SHAPES = """<mujoco><worldbody>
 
 
 @pytest.mark.parametrize("geom", range(5))
-def test_shapes_have_the_size_that_mujoco_gives_them(geom: int) -> None:
+def test_shapes_have_the_sizes_of_mujoco(geom: int) -> None:
     model = mujoco.MjModel.from_xml_string(SHAPES)
     mesh = _primitive(model.geom_type[geom], model.geom_size[geom])
     center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
@@ -214,7 +215,7 @@ def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
     assert shapes == shown
 
 
-def test_markers_are_where_the_task_has_them(env: BounceBall) -> None:
+def test_markers_are_at_the_positions_of_the_task(env: BounceBall) -> None:
     display = Display(env)
     display.pose(env.mj_model.qpos0, 0.61)
     reward = env.config.reward
@@ -241,7 +242,7 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
 # The clock
 
 
-def test_steps_are_due_as_the_clock_goes(monkeypatch) -> None:
+def test_steps_become_due_with_the_clock(monkeypatch) -> None:
     now = 0.0
     monkeypatch.setattr(pace.time, "monotonic", lambda: now)
     clock = Pace(0.01)
@@ -259,11 +260,11 @@ def test_steps_are_due_as_the_clock_goes(monkeypatch) -> None:
     assert clock.due(1.0) == 0
 
 
-# The page's server, which any client may send anything to
+# The page's server, to which any client may send anything
 
 
 class Client:
-    """A client of the page that speaks viser's protocol, and no browser."""
+    """A client of the page that speaks viser's protocol but is not a browser."""
 
     def __init__(self, address: str):
         protocol = Subprotocol(f"viser-v{viser.__version__}")
@@ -289,7 +290,7 @@ class Client:
         return self._controls[label]
 
     def set(self, label: str, value: object, name: str = "value") -> None:
-        """Sets a control, and gives the page the time to look at it."""
+        """Sets a control, and gives the page time to read it."""
         self.send({"type": "GuiUpdateMessage", "uuid": label, "updates": {name: value}})
 
     def look(self, position: list[float]) -> None:
@@ -306,8 +307,8 @@ class Client:
 
 @pytest.fixture
 def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
-    """A client of the served simulation of two environments, and what the page did: the numbers of
-    environments shown, the speeds, the target heights and the pushes."""
+    """A client of a served simulation of two environments, and a record of the page's actions: the
+    numbers of environments shown, the speeds, the target heights and the pushes."""
     did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
 
     def watch(owner: type, method: str, record: Callable[..., None]) -> None:
@@ -391,14 +392,14 @@ def test_no_client_can_end_or_stall_the_server(page) -> None:
     assert speeds == {0.2, 1.0}
 
 
-def test_a_title_is_no_markup(page) -> None:
+def test_a_title_is_not_markup(page) -> None:
     client, _ = page
     client.control("robots")
     assert any("exp[lr] &lt;b&gt;" in text for text in client.texts)
 
 
-def test_an_invalid_camera_is_left_alone(page) -> None:
-    """One that is no number, and one at the point that it looks at."""
+def test_an_invalid_camera_is_ignored(page) -> None:
+    """One camera position is not a number, and one is the point that the camera looks at."""
     client, did = page
     for position, number in ((NAN, 2), (0.0, 1)):
         client.look(position=[position, 0.0, 0.0])
@@ -407,7 +408,7 @@ def test_an_invalid_camera_is_left_alone(page) -> None:
 
 
 def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
-    """A page stopped in a debugger never answers the goodbye of the server."""
+    """A page that is stopped in a debugger never answers when the server closes the connection."""
     with contextlib.ExitStack() as servers, contextlib.ExitStack() as stack:
         server = servers.enter_context(open_server("127.0.0.1", 0))
         client = stack.enter_context(
@@ -425,8 +426,8 @@ def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
         assert not ending.is_alive()
 
 
-def test_reward_bars_tell_every_term() -> None:
-    """As many as there are."""
+def test_reward_bars_show_every_term() -> None:
+    """The bars show all terms, however many there are."""
     terms = dict.fromkeys(TERM_NAMES, 0.0) | {"position": 2.0, "alignment": -1.25}
     terms["sixteenth_term"] = 0.5
     text = reward_bars(terms)
@@ -482,7 +483,7 @@ def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> N
     red, green, blue = np.moveaxis(frames[0].astype(int), -1, 0)
     orange = (red > 140) & (green < 140) & (blue < 90)
     assert 0.01 < orange.mean() < 0.2
-    # The white ball falls: the middle of what is white beside the caption moves down.
+    # The white ball falls: the centre of the white pixels outside the caption moves down.
     rows = []
     for frame in (frames[0], frames[len(frames) // 3]):
         white = np.all(frame[:, 150:] > 215, axis=-1)
@@ -575,8 +576,8 @@ def fails(tmp_path: Path, monkeypatch, capfd):
 
 @pytest.mark.parametrize("main", [view.main, play.main])
 @pytest.mark.parametrize("case", MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_are_told_in_one_sentence(fails, main, case: tuple, monkeypatch) -> None:
-    # The compilation is not what is tested here, and no mistake may come to light only after it.
+def test_mistakes_give_one_sentence(fails, main, case: tuple, monkeypatch) -> None:
+    # The compilation is not tested here, and every mistake must be found before it.
     if "address" not in case[0]:
         monkeypatch.setattr(Simulation, "__init__", None)
     flags, *words = case
@@ -590,13 +591,13 @@ def test_without_opengl_the_package_is_named(fails, monkeypatch) -> None:
     assert "libosmesa6" in sentence and "libegl1" in sentence
 
 
-def test_a_backend_that_does_not_exist_is_told(fails, monkeypatch) -> None:
+def test_an_unknown_backend_is_refused(fails, monkeypatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     assert "MUJOCO_GL is 'vulkan'" in fails(view.main, ["--video", "a.mp4"])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa are of Linux")
-def test_the_backend_that_works_is_taken(tmp_path: Path, monkeypatch) -> None:
+def test_the_working_backend_is_chosen(tmp_path: Path, monkeypatch) -> None:
     """EGL looks for its drivers in a folder that the environment may name."""
     if "CI" not in os.environ and not offscreen.works("osmesa"):
         pytest.skip("OSMesa is not installed")

@@ -1,4 +1,4 @@
-"""A run so small that a test can make one, and a process that makes one."""
+"""A run that is small enough for a test, and a process that trains one."""
 
 import contextlib
 import functools
@@ -23,7 +23,7 @@ TINY = (
     "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
     "--no-stop-when-solved --episode-seconds 0.5"
 ).split()
-# Generous, as a busy machine compiles slowly.
+# Generous, because a busy machine compiles slowly.
 TIMEOUT = 300.0
 
 
@@ -38,7 +38,7 @@ def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:
-    """Every path under a folder, a file with its bytes."""
+    """Every path under a folder, with the bytes of each file."""
     return {p: p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
 
 
@@ -75,8 +75,8 @@ class Job:
 
 @contextlib.contextmanager
 def job(log: Path, *args: object, code: str | None = None) -> Iterator[Job]:
-    """Starts `train_jax.py args`, or Python code with these arguments, and leaves no process
-    behind."""
+    """Starts `train_jax.py args`, or Python code with these arguments, and ends the process after
+    the test."""
     program = [str(TRAIN_SCRIPT)] if code is None else ["-c", code]
     started = Job(log, [str(arg) for arg in args], program)
     try:

@@ -15,8 +15,8 @@ register_when_imported()
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the public names on first use, as JAX takes two seconds to import (PEP 562), and a
-    deployed policy does without it."""
+    """Imports the public names on first use (PEP 562): JAX takes two seconds to import, and a
+    deployed policy does not need it."""
     if name == "BounceBall":
         from bounce_mjx.task.env import BounceBall
 

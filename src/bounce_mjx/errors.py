@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake raises, and how a command reports it."""
+"""The exception that a user's mistake raises, and how a command reports it."""
 
 import contextlib
 import sys
@@ -8,14 +8,14 @@ from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
 
 
 class UserError(Exception):
-    """A mistake that the user can correct; its text is one sentence: the given value, the
-    expected one, the remedy."""
+    """A mistake that the user can correct. Its text is one sentence with the given value, the
+    expected one and the remedy."""
 
 
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Reports a `UserError` as one sentence on stderr with exit status 2, and Ctrl-C as status 130;
-    neither with a traceback."""
+    """Reports a `UserError` as one sentence on stderr and exits with status 2; Ctrl-C exits with
+    status 130. Neither prints a traceback."""
     try:
         yield
     except UserError as error:

@@ -17,14 +17,14 @@ _POLL_SECONDS = 0.1
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C came while a thread was in work that cannot be stopped."""
+    """Ctrl-C came while a thread was doing work that cannot be stopped."""
 
 
 def run_interruptible(function: Callable[..., Result], *arguments: Any, **keywords: Any) -> Result:
     """Calls a function in a thread of its own and waits for its result.
 
-    Python runs signal handlers in the main thread, between two bytecodes. On that thread a
-    compilation would therefore delay Ctrl-C until its end.
+    Python runs signal handlers in the main thread, between two bytecodes. A compilation on that
+    thread would therefore delay Ctrl-C until it ends.
 
     Raises:
       Interrupted: Ctrl-C came. The thread cannot be stopped: end the process with `leave`.
@@ -50,7 +50,8 @@ def run_interruptible(function: Callable[..., Result], *arguments: Any, **keywor
 def leave(status: int = INTERRUPTED) -> NoReturn:
     """Ends the process at once, without waiting for its threads.
 
-    The interpreter's own way out would free what a compilation in another thread still uses.
+    A normal exit of the interpreter would free memory that a compilation in another thread still
+    uses.
     """
     sys.stdout.flush()
     sys.stderr.flush()

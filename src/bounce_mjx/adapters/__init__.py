@@ -1,1 +1,1 @@
-"""The environment with the interfaces of other libraries, a folder for each library."""
+"""The environment with the interfaces of other libraries."""

@@ -35,7 +35,7 @@ These rules concern several keys:
 - `ppo.critic_metrics` names metrics of the environment.
 """
 
-# A unit follows a comma in the description of a key, at its end or before an addition.
+# In the description of a key, the unit follows a comma, at the end or before an addition.
 _UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces)(?=[.;]| \()")
 
 

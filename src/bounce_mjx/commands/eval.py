@@ -36,11 +36,11 @@ class EvalCommand(StrictModel):
     target_height: Positive | None = None
     """One target height for all episodes, m. The default is the range of the run's config."""
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
-    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -92,7 +92,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _check_writable(json_file: Path) -> None:
-    """Spares the user an evaluation whose results could not be written."""
+    """Fails before the evaluation if its results could not be written."""
     if not os.path.isdir(json_file.absolute().parent):
         raise UserError(f"the folder of --json {json_file} does not exist; make it")
     if os.path.isdir(json_file):

@@ -29,7 +29,7 @@ class ExportCommand(StrictModel):
     jax: Path | None = None
     """File for the same function by jax.export, for the CPU and CUDA."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -36,9 +36,9 @@ bounce-mjx COMMAND --help lists the arguments of a command.
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Runs a command line, of which the first word names the command.
+    """Runs a command line, whose first word names the command.
 
-    A command is imported only when it is chosen, as each brings libraries that take seconds.
+    Only the chosen command is imported, because each command imports libraries that take seconds.
     """
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
@@ -57,8 +57,8 @@ def main(args: Sequence[str] | None = None) -> None:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Lets Ctrl-C end the process at once, without Python's exception: a library that is being
-    imported may turn that into another."""
+    """Lets Ctrl-C end the process at once, without a KeyboardInterrupt: a library that is being
+    imported may turn it into another exception."""
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return

@@ -32,9 +32,9 @@ class PlayCommand(StrictModel):
     target_height: Positive | None = None
     """Target height, m. By default each reset draws it from the range of the run's config."""
     physics: Literal["config", "fused", "mjx"] = "config"
-    """Engine; config is the engine of the training."""
+    """Physics engine; config is the engine of the training."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 

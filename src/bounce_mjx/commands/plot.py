@@ -32,7 +32,7 @@ class PlotCommand(StrictModel):
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
     """File formats of each picture."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -21,7 +21,7 @@ class ReportCommand(StrictModel):
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """A run's folder. The default is the newest run."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -52,7 +52,7 @@ class RobustnessCommand(StrictModel):
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
     for the policy that comes with the package."""
     log_dir: Path = Path("runs/bounce_ball")
-    """Folder of runs in which to find the newest."""
+    """Folder in which to look for the newest run."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -93,9 +93,9 @@ def main(args: Sequence[str] | None = None) -> None:
 def _measure(
     command: RobustnessCommand, config: TrainConfig, policy: Policy, suite: Path, console: Console
 ) -> tuple[list[Outcome], str]:
-    """Measures all conditions, with a bar of their progress."""
+    """Measures all conditions and shows a progress bar."""
     all_conditions = load_suite(suite, config.env)
-    conditions = computed(all_conditions)
+    conditions = computed(all_conditions, command.physics)
     if skipped := {c.perturbation.name for c in all_conditions} - {
         c.perturbation.name for c in conditions
     }:
@@ -115,7 +115,7 @@ def _measure(
 
 
 def _make_folder(out: Path) -> None:
-    """Spares the user an evaluation whose results could not be written."""
+    """Fails before the evaluation if its results could not be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

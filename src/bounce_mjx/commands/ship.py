@@ -34,7 +34,7 @@ class ShipCommand(StrictModel):
     run: Annotated[Path, tyro.conf.Positional]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
     out: Path = Path(PRETRAINED)
-    """Folder to write; an earlier one is replaced."""
+    """Folder to write; an existing one is replaced."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -76,7 +76,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")
 
     made_by = load_results(checkpoint.run)
-    # The place of the run's folder has no part in the result.
+    # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": TrainConfig().log_dir})
     results = {
         "command": f"python train_jax.py --config {PRETRAINED}/{CONFIG_FILE}",

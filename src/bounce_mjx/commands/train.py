@@ -1,4 +1,4 @@
-"""Trains a policy in JAX, and leaves a run's folder (`bounce-mjx train`)."""
+"""Trains a policy in JAX and writes a run's folder (`bounce-mjx train`)."""
 
 import sys
 from collections.abc import Sequence
@@ -18,15 +18,16 @@ PROG = "bounce-mjx train"
 
 
 class TrainCommand(TrainingCommand):
-    """The command line: the config's keys as flags, where to start from, and other hosts."""
+    """The command line: the config's keys as flags, the preset or run to start from, and other
+    hosts."""
 
     distributed: bool = False
     """Train together with the same command on other hosts, started by Slurm, Open MPI or
     Kubernetes."""
     coordinator_address: str | None = None
-    """HOST:PORT of process 0, to train on several hosts without such a launcher."""
+    """HOST:PORT of process 0, to train on several hosts without one of these launchers."""
     num_processes: Annotated[int, Field(ge=1)] | None = None
-    """Number of processes, one a host; with coordinator-address."""
+    """Number of processes, one per host; with coordinator-address."""
     process_id: Annotated[int, Field(ge=0)] | None = None
     """Number of this process, from 0; with coordinator-address."""
     host_timeout: Annotated[int, Field(ge=1, le=10**6)] = hosts.DEFAULT_TIMEOUT
@@ -50,7 +51,7 @@ def read_command(args: Sequence[str]) -> TrainCommand:
 
 
 def _join_hosts(args: Sequence[str]) -> None:
-    """Joins the other hosts, which must come before JAX is asked for its devices."""
+    """Joins the other hosts; this must happen before JAX is asked for its devices."""
     address = early_flag(args, "--coordinator-address")
     words = [early_flag(args, f) for f in ("--num-processes", "--process-id", "--host-timeout")]
     try:

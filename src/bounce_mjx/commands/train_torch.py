@@ -1,4 +1,4 @@
-"""Trains a policy with a PyTorch library's PPO, and leaves a run's folder
+"""Trains a policy with the PPO of a PyTorch library and writes a run's folder
 (`bounce-mjx train-torch`)."""
 
 import functools
@@ -19,10 +19,11 @@ Library = Literal["rsl_rl", "skrl"]
 
 
 class TorchTrainCommand(TrainingCommand):
-    """The command line: the config's keys as flags, where to start from, and the library."""
+    """The command line: the config's keys as flags, the preset or run to start from, and the
+    library."""
 
     library: Library = "rsl_rl"
-    """Library whose PPO trains; a resumed run keeps its own."""
+    """Library whose PPO is used; a resumed run keeps its library."""
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -32,7 +32,7 @@ def parse(
     """Reads a command line into a config.
 
     Args:
-      default: values of the flags that are not given. The default is the type's own values.
+      default: values for the flags that are not given; by default, the type's own default values.
 
     Raises:
       UserError: a flag is unknown or has a bad value.
@@ -127,7 +127,7 @@ def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.Bas
 
 
 def _validation_error() -> pydantic.ValidationError | None:
-    """The validation error that tyro is handling; the event has only its text."""
+    """The validation error that tyro is handling; tyro's event contains only its text."""
     error = sys.exception()
     while error is not None and not isinstance(error, pydantic.ValidationError):
         error = error.__context__
@@ -145,7 +145,8 @@ def _given(args: Sequence[str], flag: str) -> str:
 
 
 def _flags(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | None]:
-    """The settings of a command by the flags as tyro names them; None by a switch's negation."""
+    """The settings of a command, keyed by the flags that tyro gives them; None for the negation of
+    a switch."""
     flags: dict[str, FieldInfo | None] = {}
     for group, prefix in _groups(command_class):
         for name, field in group.model_fields.items():

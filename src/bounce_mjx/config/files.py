@@ -14,7 +14,7 @@ _MAX_ALIASES = 10
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML whose size multiplies, as groups that repeat groups do."""
+    """Refuses YAML whose size multiplies because repeated groups contain repeated groups."""
 
     _aliases = 0
 
@@ -31,21 +31,22 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
     """Reads a YAML file of keys and values; an empty file has none.
 
     Args:
-      kind: of the file, such as "config file", for the errors.
-      example: a file of that kind, for the errors.
+      kind: kind of the file for error messages, such as "config file".
+      example: a file of that kind, for error messages.
 
     Raises:
       UserError: the file is missing or is no YAML mapping.
     """
     try:
-        # To open a pipe would wait for a writer, and a device may have no end.
+        # Opening a pipe would wait for a writer, and a device may have no end.
         if not stat.S_ISREG(path.stat().st_mode):
             raise ValueError("it is not a regular file")
         data = path.read_bytes()
         if len(data) > _MAX_BYTES:
             raise ValueError(f"it is longer than {_MAX_BYTES} bytes")
         values = _Loader(data.decode("utf-8")).get_single_data()
-    # PyYAML raises many types where a value has the form of a number or a date but is none.
+    # PyYAML raises exceptions of many types where a value looks like a number or a date but is not
+    # one.
     except Exception as error:
         reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())
         raise UserError(

@@ -30,9 +30,9 @@ PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
 
 
 def whole_number(value: Any) -> Any:
-    """A whole number in scientific notation, such as "1e6", as an integer; else the value itself.
-
-    YAML reads 1e6 as a word, as its numbers have a point.
+    """A whole number in scientific notation, such as "1e6", as an integer; any other value is
+    returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent need a
+    decimal point.
     """
     if isinstance(value, str) and re.fullmatch(r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+", value):
         number = float(value)

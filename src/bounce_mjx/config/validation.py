@@ -36,7 +36,7 @@ def describe(
     """The first mistake of a validation error as part of a sentence.
 
     Args:
-      spell: writes the dotted name of a setting, such as a flag.
+      spell: turns the dotted name of a setting into the form for the message, such as a flag.
     """
     first = error.errors()[0]
     if first["type"] in ("extra_forbidden", "invalid_key"):
@@ -50,7 +50,7 @@ def describe(
 
 
 class _Repr(reprlib.Repr):
-    """Python's notation, cut short: a value from a file may have no end."""
+    """Python's notation, shortened: a value from a file may be very long."""
 
     def __init__(self):
         super().__init__()

@@ -5,20 +5,41 @@ import numpy as np
 from bounce_mjx.deploy.metadata import Metadata
 
 
-def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
-    """World position [3] of the paddle's centre at joint angles [J] (rad), m."""
-    position, rotation = np.zeros(3), np.eye(3)
-    for link in metadata.chain:
-        position = position + rotation @ link.position
-        angle = 0.5 * (joint_angles[link.joint] - link.reference)
-        turn = (np.cos(angle), *(np.sin(angle) * np.asarray(link.axis)))
-        rotation = rotation @ _matrix(link.quaternion) @ _matrix(turn)
-    return position + rotation @ metadata.paddle
+class Chain:
+    """The hinges from the world to the paddle."""
+
+    def __init__(self, metadata: Metadata):
+        links = metadata.chain
+        self._paddle = np.array(metadata.paddle)
+        self._joints = [link.joint for link in links]
+        self._references = np.array([link.reference for link in links])
+        self._positions = np.array([link.position for link in links])
+        # A hinge's rotation by Rodrigues' formula: R (1 + sin(a) K + (1 - cos(a)) K K).
+        cross = np.array([_cross(link.axis) for link in links])
+        self._fixed = np.array([_matrix(link.quaternion) for link in links])
+        self._of_sine = self._fixed @ cross
+        self._of_cosine = self._of_sine @ cross
+
+    def paddle_position(self, joint_angles: np.ndarray) -> np.ndarray:
+        """World position [3] of the paddle's centre at joint angles [J] (rad), m."""
+        angles = (joint_angles[self._joints] - self._references)[:, None, None]
+        turned = np.sin(angles) * self._of_sine + (1.0 - np.cos(angles)) * self._of_cosine
+        position = self._paddle
+        for origin, rotation in zip(
+            self._positions[::-1], (self._fixed + turned)[::-1], strict=True
+        ):
+            position = origin + rotation @ position
+        return position
 
 
 def _matrix(quaternion: tuple[float, ...]) -> np.ndarray:
     """Rotation matrix [3, 3] of a unit quaternion [w, x, y, z]."""
     w, *v = quaternion
-    x, y, z = v
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = _cross(v)
     return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+
+
+def _cross(vector: tuple[float, ...]) -> np.ndarray:
+    """Matrix [3, 3] of the cross product with a vector [3]."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -113,7 +113,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
             )
         ),
         default_joint_angles=env.default_joint_angles,
-        target_height_range=env.randomization.target_height or env.target_height_range,
+        target_height_range=env.target_heights,
         randomization={name: getattr(env.randomization, name) for name in env.randomization.terms},
         bounce_max_distance=env.bounce_max_distance,
         chain=chain,

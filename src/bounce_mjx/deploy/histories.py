@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from bounce_mjx.deploy.chain import paddle_position
+from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.metadata import Metadata
 
 Measurements = dict[str, np.ndarray]
@@ -24,14 +24,14 @@ _SHORTEST = 1e-3
 class Histories:
     """The last values of each observed quantity.
 
-    The measurements of a step are those that the policy needs: `joint_angles` [J],
+    The measurements of a step are all that the policy needs: `joint_angles` [J],
     `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `target_height` [1],
     `ball_age` [1], and so on; units m, rad and s.
     """
 
     def __init__(self, metadata: Metadata, measured: Measurements):
         """The past of the first control step is as its present."""
-        self._metadata = metadata
+        self._metadata, self._chain = metadata, Chain(metadata)
         self._ball = measured.get("ball_position", np.zeros(3))
         self._ball_velocity = np.zeros(3)
         self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
@@ -50,7 +50,7 @@ class Histories:
             "bounce_interval": zero,
             "bounce_joint_angles": angles,
             "bounce_joint_velocities": measured.get("joint_velocities", joints),
-            "paddle_position": paddle_position(metadata, angles),
+            "paddle_position": self._chain.paddle_position(angles),
         } | measured
         self.values = {
             part.name: np.tile(start[part.name], (part.history, 1)) for part in metadata.observation
@@ -61,7 +61,7 @@ class Histories:
         """Adds the measurements of the next control step, before which the action [J] was taken."""
         metadata = self._metadata
         angles = measured.get("joint_angles")
-        paddle = np.zeros(3) if angles is None else paddle_position(metadata, angles)
+        paddle = np.zeros(3) if angles is None else self._chain.paddle_position(angles)
         measured = measured | {"past_actions": action, "paddle_position": paddle}
         if "ball_position" in measured:
             measured |= self._picture(measured)
@@ -101,7 +101,7 @@ class Histories:
     ) -> dict[str, tuple[bool, np.ndarray]]:
         """The quantities of bounces that change: whether a bounce starts, and the value.
 
-        A bounce starts when the ball is first measured near the paddle, and its values are those of
+        A bounce starts when the ball is first measured near the paddle, and its values belong to
         the ball's lowest measured point.
         """
         if not OF_BOUNCES & self.values.keys():

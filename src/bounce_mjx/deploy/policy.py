@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
 from bounce_mjx.deploy.metadata import Metadata, from_entries
@@ -42,8 +41,14 @@ class DeployedPolicy:
           source: its name, for messages.
 
         Raises:
-          UserError: it is not a policy that `bounce-mjx export` wrote.
+          UserError: it is not a policy that `bounce-mjx export` wrote, or onnxruntime is missing.
         """
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise UserError(
+                "the package onnxruntime is missing, which runs a policy; pip install onnxruntime"
+            ) from error
         options = onnxruntime.SessionOptions()
         # The network is too small to share between threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -54,6 +59,7 @@ class DeployedPolicy:
             )
             entries = self._session.get_modelmeta().custom_metadata_map
             self.metadata: Metadata = from_entries(entries)
+            self._shapes = _shapes(len(self.metadata.joint_names))
             self._check_inputs()
         # onnxruntime raises many types for a damaged file; all of them mean the same here.
         except Exception as error:
@@ -62,18 +68,6 @@ class DeployedPolicy:
                 f"{source} is no policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
-        count = len(self.metadata.joint_names)
-        self._shapes = {
-            "joint_angles": (count,),
-            "joint_velocities": (count,),
-            "ball_position": (3,),
-            "ball_velocity": (3,),
-            "ball_age": (1,),
-            "ball_quaternion": (4,),
-            "ball_angular_velocity": (3,),
-            "target_height": (1,),
-            "time": (1,),
-        }
         self.needs = self._needs()
         """Measurements that every step must be given; `UNITS` has their units."""
         self.reset()
@@ -162,6 +156,9 @@ class DeployedPolicy:
         stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
         actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
         outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
+        known = self._shapes.keys() | OF_BOUNCES | {"past_actions", "paddle_position"}
+        if unknown := stated.keys() - known:
+            raise ValueError(f"its input {min(unknown)} is unknown here")
         if stated != actual or outputs != {"action": [len(self.metadata.joint_names)]}:
             raise ValueError("its inputs or outputs are not as its metadata states")
 
@@ -181,7 +178,7 @@ class DeployedPolicy:
         return tuple(name for name, users in needs.items() if users & seen)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
-        """The measurements as arrays of their own, with the defaults of those that are missing."""
+        """The measurements as arrays of their own, with defaults for the missing ones."""
         for name in measurements:
             if name not in self._shapes:
                 raise UserError(f"{name} is no measurement; a step takes {', '.join(self._shapes)}")
@@ -230,6 +227,14 @@ class DeployedPolicy:
                 f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
             )
         return max(0, round(elapsed / self.metadata.control_dt))
+
+
+def _shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the measurements, in the order of `UNITS`."""
+    shapes = dict.fromkeys(UNITS, (1,))
+    shapes |= {"joint_angles": (num_joints,), "joint_velocities": (num_joints,)}
+    shapes |= dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), (3,))
+    return shapes | {"ball_quaternion": (4,)}
 
 
 def _words(name: str, shape: tuple[int, ...]) -> str:

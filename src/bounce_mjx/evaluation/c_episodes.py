@@ -1,4 +1,4 @@
-"""Evaluation on MuJoCo's C engine: the same task and policy, the physics in threads."""
+"""Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
 
 import os
 from collections.abc import Callable
@@ -77,8 +77,8 @@ def make_mujoco_evaluator(
 
 
 def _rollout_inputs(env: BounceBall, control: Control) -> tuple[jax.Array, jax.Array]:
-    """Inputs of MuJoCo's rollout for N episodes [N, substeps, size]: `ctrl`, and with a force on
-    the ball also `xfrc_applied`; and the velocities that the balls are given [N, 3], m/s.
+    """Inputs of MuJoCo's rollout for N episodes [N, substeps, size] (`ctrl`, and `xfrc_applied` if
+    there is a force on the ball), and the velocities that pushes add to the balls [N, 3], m/s.
 
     Args:
       control: the batch is last.
@@ -97,7 +97,7 @@ def _rollout_inputs(env: BounceBall, control: Control) -> tuple[jax.Array, jax.A
 
 
 def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoco.MjModel]:
-    """One model for all episodes, or one an episode where the parameters [..., N] are given."""
+    """One model for all episodes, or one model per episode where parameters [..., N] are given."""
     parameters = jax.tree.map(np.asarray, parameters)
     given = jax.tree.leaves(parameters)
     if not given:

@@ -15,9 +15,8 @@ from bounce_mjx.task.state import State
 
 def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callable[..., Statistics]:
     """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
-    each from its own reset (`reset_episodes`); it stops when all have ended or the time is over.
-
-    The ranges may be left out.
+    each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
+    limit is reached. The ranges are optional.
     """
     recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
 
@@ -30,7 +29,7 @@ def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callab
 def make_recording_evaluator(
     env: BounceBall, networks: Networks, episodes: int, recorded: int
 ) -> Callable[..., tuple[Statistics, Recording]]:
-    """Like `make_evaluator`, with a recording of the first `recorded` episodes too."""
+    """Like `make_evaluator`, but also returns a recording of the first `recorded` episodes."""
 
     def evaluate(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None
@@ -59,12 +58,12 @@ def make_recording_evaluator(
 def reset_episodes(
     env: BounceBall, key: jax.Array, episodes: int, ranges: Ranges | None = None
 ) -> State:
-    """The starts of N episodes, batch last; consumes the key.
+    """The initial states of N episodes, batch last; consumes the key.
 
     Args:
-      ranges: of several conditions, each end [C, ...]: every condition has N / C episodes, from the
-        same keys as the others, so that conditions differ in their ranges alone. The default is one
-        condition, the config's ranges.
+      ranges: the ranges of C conditions, each end [C, ...]. Every condition has N / C episodes, and
+        all conditions use the same keys, so that they differ only in their ranges. The default is
+        one condition with the config's ranges.
     """
     if ranges is None:
         return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))

@@ -15,7 +15,7 @@ from bounce_mjx.task.env import BounceBall
 
 
 class Evaluation(NamedTuple):
-    """A report, and the engine behind it."""
+    """A report, and the physics engine that it was measured on."""
 
     report: Report
     engine: str
@@ -34,12 +34,13 @@ def evaluate_policy(
     target_height: float | None = None,
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config",
 ) -> Evaluation:
-    """Measures the five results of a policy without its noise.
+    """Measures the five results of a policy without action noise.
 
     Args:
-      env_config, ppo_config: of the policy's training; the latter gives the networks.
-      episodes: each from its own reset.
-      seed: of the resets.
+      env_config, ppo_config: the settings of the policy's training; `ppo_config` defines the
+        networks.
+      episodes: number of episodes, each from its own reset.
+      seed: the seed of the resets.
       target_height: one target height for all episodes, m; None for the config's range.
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
 
@@ -61,6 +62,7 @@ def evaluate_policy(
     return Evaluation(
         judge(env, statistics),
         engine="mujoco" if on_c else env.engine.name,
-        # They tell of models on which MuJoCo's solver does not converge, unlike the fused physics.
+        # The warnings concern models on which MuJoCo's solver does not converge, unlike the fused
+        # physics.
         warnings=env.engine.warnings if on_c else (),
     )

@@ -15,10 +15,10 @@ RECORDED_EPISODES = 32
 
 
 class Recording(NamedTuple):
-    """T control steps of K episodes; entries after an episode's end have no meaning."""
+    """T control steps of K episodes; entries after the end of an episode are undefined."""
 
     joint_angles: jax.Array
-    """Of Joint1..Joint6, after the step [T, 6, K], rad."""
+    """Angles of Joint1..Joint6 after the step [T, 6, K], rad."""
     ball: jax.Array
     """Ball positions after the step [T, 3, K], m."""
     paddle: jax.Array
@@ -51,12 +51,12 @@ def record(
 ) -> Recording:
     """Writes one control step of the first K of E environments (batch last) into the recording.
 
-    It reads the true state and not the observation, which may be noisy.
+    It reads the true state, not the observation, which may be noisy.
 
     Args:
-      states: after the step.
-      running: whether each episode had not ended before it [E], bool.
-      step: its index [], from 0.
+      states: the states after the step.
+      running: whether each episode had not ended before the step [E], bool.
+      step: index of the step [], from 0.
     """
     episodes = recording.running.shape[-1]
     states, running = jax.tree.map(lambda x: x[..., :episodes], (states, running))
@@ -74,7 +74,7 @@ def record(
 
 
 def settled_bounces(recording: Recording, first_step: int) -> np.ndarray:
-    """Bounces that count in the result on the height [T, K], bool: bounces of running episodes from
+    """Bounces that count for the height result [T, K], bool: the bounces of running episodes from
     `first_step` on."""
     bounces = np.array(recording.bounced & recording.running)
     bounces[: max(1, first_step)] = False
@@ -85,7 +85,7 @@ def apex_errors(recording: Recording, bounces: np.ndarray) -> np.ndarray:
     """Apex before each bounce minus the target height [N], m.
 
     Args:
-      bounces: the steps, [T, K] with N true.
+      bounces: whether each step is a bounce to measure [T, K]; N are true.
     """
     before = np.roll(np.asarray(recording.apex), 1, axis=0)
     return (before - recording.target_height)[bounces]
@@ -96,7 +96,7 @@ def hit_points(env: BounceBall, recording: Recording, bounces: np.ndarray) -> np
     centre [N, 2], m.
 
     Args:
-      bounces: the steps, [T, K] with N true.
+      bounces: whether each step is a bounce to measure [T, K]; N are true.
     """
     model, addresses = env.mj_model, find_addresses(env.mj_model)
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The five expected results: their bounds, and the report that judges an evaluation by them."""
+"""The five expected results: their bounds, and the report that compares an evaluation with them."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -13,14 +13,14 @@ from bounce_mjx.task.env import BounceBall
 
 DEFAULT_EPISODES = 1024
 DEFAULT_SEED = 20_000
-"""Seed of the resets; trainings evaluate with another one."""
+"""Seed of the resets; a training evaluates with a different one."""
 
 MIN_CONSECUTIVE_BOUNCES = 3
 MIN_EPISODE_SHARE = 0.99
-"""Least share of the episodes with enough consecutive bounces, and of the stable episodes."""
+"""Minimum share of episodes with enough consecutive bounces, and of stable episodes."""
 
 MIN_STEP_SHARE = 0.95
-"""Least share of the centred steps, and of the accurate bounces."""
+"""Minimum share of centred steps, and of accurate bounces."""
 
 UPWARD_SPEED_RANGE = (0.1, 1.5)
 """Bounds of the mean upward speed, m/s."""
@@ -75,8 +75,8 @@ class Report:
 
     @property
     def score(self) -> tuple[bool, int, float]:
-        """Order of quality: a full evaluation before a screening, then the number of results met,
-        then the mean return."""
+        """Sort key of quality: a full evaluation ranks above a screening, then the number of
+        results met counts, then the mean return."""
         met = sum(result.passed is not False for result in self.results)
         return not self.screening, met, self.details["mean_return"]
 
@@ -103,7 +103,7 @@ def judge(
     """The report of an evaluation: the five expected results, from the statistics of E episodes.
 
     Args:
-      target_heights: their range in these episodes, m; the config's by default.
+      target_heights: range of the target heights in these episodes, m; by default, the config's.
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     episodes = len(s.running)
@@ -133,7 +133,7 @@ def judge(
         ),
         _share_result(
             "stable",
-            f"episodes of {env.config.episode_seconds:g} s without an end",
+            f"episodes that last the full {env.config.episode_seconds:g} s",
             stable,
             MIN_EPISODE_SHARE,
         ),
@@ -149,7 +149,7 @@ def judge(
 
 
 def _share_result(name: str, measured: str, share: float | None, minimum: float) -> Result:
-    """A share of all episodes, steps or bounces; a share of none fails."""
+    """The result for a share of all episodes, steps or bounces; without any of them it fails."""
     return Result(
         name,
         f"{measured}, %",
@@ -160,7 +160,7 @@ def _share_result(name: str, measured: str, share: float | None, minimum: float)
 
 
 def _speed_result(speed: float | None, target_heights: tuple[float, float]) -> Result:
-    """The upward speed, which is judged only for targets between `UPWARD_SPEED_TARGETS`."""
+    """The upward speed, which is judged only if all targets are within `UPWARD_SPEED_TARGETS`."""
     low, high = UPWARD_SPEED_RANGE
     bound = f"{low} to {high}"
     lowest, highest = UPWARD_SPEED_TARGETS
@@ -176,5 +176,5 @@ def _speed_result(speed: float | None, target_heights: tuple[float, float]) -> R
 
 
 def _ratio(total: float, count: float) -> float | None:
-    """A mean or a share; None of nothing."""
+    """A mean or a share; None where the count is 0."""
     return float(total / count) if count else None

@@ -16,7 +16,6 @@ from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
 from bounce_mjx.evaluation.suite import Condition, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import RandomizationConfig, Ranges
@@ -145,11 +144,11 @@ def measure_conditions(
     return outcomes, engine
 
 
-def computed(conditions: Sequence[Condition]) -> list[Condition]:
-    """The conditions whose terms the physics has a parameter for."""
-    parameters = {"torque_limit": "force_limit", "joint_frictionloss": "frictionloss"}
-    lacking = {term for term, name in parameters.items() if name not in PhysicsParameters._fields}
-    return [condition for condition in conditions if lacking.isdisjoint(condition.ranges)]
+def computed(conditions: Sequence[Condition], physics: Physics) -> list[Condition]:
+    """The conditions whose terms the physics computes."""
+    if physics == "mujoco":
+        return list(conditions)
+    return [condition for condition in conditions if "joint_frictionloss" not in condition.ranges]
 
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:

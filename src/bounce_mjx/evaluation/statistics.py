@@ -1,4 +1,4 @@
-"""Running sums over the episodes of an evaluation, from which the five results are judged."""
+"""Running sums over the episodes of an evaluation, from which the five results are computed."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
 
 SETTLING_SECONDS = 2.0
-"""Start of an episode that the horizontal position and the height leave out, s; the height also
-leaves out the time after a change of the target."""
+"""Time at the start of an episode that does not count for the horizontal position and the height,
+s. For the height, the same time after a change of the target does not count either."""
 
 MAX_X_ERROR = 0.05
 """Largest distance of a centred ball from the target point along x, m."""
@@ -35,7 +35,8 @@ class Statistics(NamedTuple):
     centred_steps: jax.Array
     """Settled steps with the ball's x within `MAX_X_ERROR` of the target point [E]."""
     settled_bounces: jax.Array
-    """Bounces after `SETTLING_SECONDS`, and that long after a change of the target [E]."""
+    """Bounces at least `SETTLING_SECONDS` after the reset and after any change of the target
+    [E]."""
     accurate_bounces: jax.Array
     """Settled bounces with an apex within `MAX_APEX_ERROR` of the target height [E]."""
     apex_error: jax.Array
@@ -57,11 +58,11 @@ def accumulate(
 ) -> Statistics:
     """Adds one control step of E environments (batch last) to their statistics.
 
-    It reads the true state and not the observation, which may be noisy.
+    It reads the true state, not the observation, which may be noisy.
 
     Args:
-      states: after the step.
-      step: its index [], from 0.
+      states: the states after the step.
+      step: index of the step [], from 0.
     """
     s, metrics = statistics, states.metrics
     running = s.running

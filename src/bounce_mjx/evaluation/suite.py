@@ -107,7 +107,7 @@ def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
     names, conditions = {NOMINAL}, [_condition(nominal, None, trained, NOMINAL)]
     for perturbation in suite.perturbations:
-        source = f"{shorten(str(path))}, perturbation {shorten(perturbation.name)!r}"
+        source = f"{shorten(path.name, 30)}, perturbation {shorten(perturbation.name, 30)!r}"
         if not perturbation.name.strip() or perturbation.name in names:
             reason = "is taken" if perturbation.name in names else "is empty"
             raise UserError(f"{source}: the name {reason}; give each perturbation its own name")

@@ -20,7 +20,7 @@ def has_kernels() -> bool:
         from jax.experimental.pallas import mosaic_gpu  # noqa: F401
     except ImportError:
         return False
-    # AMD's GPUs have a name here, such as gfx90a.
+    # For AMD's GPUs this is a name, such as gfx90a.
     capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
     return all(
         c.replace(".", "").isdigit() and float(c) >= _MIN_COMPUTE_CAPABILITY for c in capabilities

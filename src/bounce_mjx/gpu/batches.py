@@ -1,4 +1,4 @@
-"""How a kernel meets `jax.vmap` and several devices."""
+"""Kernels under `jax.vmap` and on several devices."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,10 +10,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 
 def batch_by(function: Callable[..., tuple], batched: Callable[..., tuple]) -> Callable[..., tuple]:
-    """`function`, of which `batched` computes a batch.
+    """`function`, with `batched` as its implementation under `jax.vmap`.
 
     Args:
-      batched: takes the arguments with the batch's axis in front, and puts it in front of results.
+      batched: takes the arguments with the batch axis in front, and returns the results with the
+        batch axis in front.
     """
     call = jax.custom_batching.custom_vmap(function)
 
@@ -36,15 +37,17 @@ def partition_by(
     replicated: tuple[str, ...],
     **sizes: int,
 ) -> Callable[..., Any]:
-    """`function`, which each of several devices computes on its shard.
+    """`function`, which each of several devices applies to its shard.
 
     Args:
-      specs: the partitions of the arguments and of the results, from the first argument's.
+      specs: computes the partitions of the arguments and of the results from the partition of the
+        first argument.
       sharding_rule: see `jax.experimental.custom_partitioning`.
-      replicated: the axes of the rule that are never divided.
-      sizes: of an axis in the rule that is part of an array's axis.
+      replicated: the axes of the rule that are never sharded.
+      sizes: size of each axis in the rule that is only part of an array's axis.
     """
-    # On one device a partitioning would only keep the program out of the compilation cache.
+    # On one device, a custom partitioning would have no effect except to keep the program out of
+    # the compilation cache.
     if jax.device_count() == 1:
         return function
     partitioned = custom_partitioning(function)

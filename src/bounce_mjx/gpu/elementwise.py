@@ -1,8 +1,9 @@
 """A long elementwise function as one GPU kernel.
 
-XLA makes a loop of physics steps into one kernel a step, with a copy of every coordinate before the
-first, and takes seconds to fuse one of them. Here the whole function, its loops included, becomes
-one kernel of Pallas' Mosaic GPU backend, in which a thread keeps one environment in its registers.
+XLA turns a loop of physics steps into one kernel per step, with a copy of every coordinate before
+the first one, and takes seconds to fuse one of these kernels. Here the whole function, including
+its loops, becomes one kernel of Pallas' Mosaic GPU backend, in which each thread keeps one
+environment in its registers.
 
 XLA compiles the function everywhere else: on a CPU, on GPUs before NVIDIA's Hopper, for other types
 than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
@@ -37,9 +38,9 @@ def elementwise(
     """The same function of K arrays of one shape, with a GPU kernel for its batches.
 
     Args:
-      function: K arrays of one shape and type -> a tuple of arrays of that shape and type, by
-        elementwise operations alone.
-      num_results: length of that tuple; to count it here would mean another trace.
+      function: K arrays of one shape and type -> a tuple of arrays of that shape and type. It may
+        use only elementwise operations.
+      num_results: length of that tuple; counting the results here would need another trace.
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
     """
 
@@ -64,9 +65,9 @@ def elementwise(
 def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Callable[..., Tree]:
     """The same function of pytrees of small arrays, with one GPU kernel for its batches.
 
-    Where a batch of it, made by `jax.vmap`, runs on a GPU, a thread computes one element. The
-    function stays as it is where there are no kernels, for float64, and where it does what has no
-    form for scalars (`scalars.as_scalars`).
+    On a GPU, each thread computes one element of a batch that `jax.vmap` makes. The function is
+    unchanged on devices without kernels, for float64, and if it contains an operation that cannot
+    be expressed with scalars (`scalars.as_scalars`).
 
     Args:
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
@@ -95,7 +96,7 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
         scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
         used = list(itertools.compress(scalars, scalar_function.used))
 
-        # Jitted inline, so that JAX traces it once for every batch size.
+        # Jitted inline, so that JAX traces it only once, whatever the batch size.
         call = jax.jit(scalar_function.call, inline=True)
 
         def on_floats(*floats: jax.Array) -> Arrays:
@@ -146,7 +147,8 @@ def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
 def in_kernel(
     function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
 ) -> Arrays:
-    """Runs `function` on arrays [...] in one kernel; each of several devices computes its shard."""
+    """Runs `function` on arrays [...] in one kernel; with several devices, each computes its
+    shard."""
 
     def run(packed: jax.Array) -> jax.Array:
         rows, *batch = packed.shape
@@ -197,7 +199,7 @@ def _run_packed(
             grid=(num_blocks,),
             grid_names=("block",),
             # Each thread computes environments of its own. With the other semantics, vectors of a
-            # warpgroup, the kernel takes ten times as long to compile and runs as fast.
+            # warpgroup, the kernel takes ten times as long to compile and runs no faster.
             compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
         )
     return run(jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size))))[:, :size]

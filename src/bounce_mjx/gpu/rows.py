@@ -1,5 +1,5 @@
-"""Many arrays of one batch as the rows of one array, as on a GPU each array that a loop carries
-costs a kernel an iteration."""
+"""Many arrays of one batch as the rows of one array. On a GPU, each array that a loop carries costs
+one kernel per iteration."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from bounce_mjx.gpu.elementwise import KERNEL_TYPES, from_float, to_float
 )
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """A pytree of numbers, or of arrays [..., B], in one array; a loop may carry it."""
+    """A pytree of numbers, or of arrays [..., B], in one array that a loop can carry."""
 
     rows: jax.Array
     """The numbers [R, B] of the pytree, float32. A number on its own is an array [1]."""
@@ -37,7 +37,7 @@ class Rows:
         return cls(jnp.concatenate(rows), structure, tuple((x.shape, x.dtype) for x in leaves))
 
     def tree(self) -> Any:
-        """The pytree; axes that a loop has put in front of the rows come first in each array."""
+        """The pytree. Axes that a loop has added before the rows come first in each array."""
         arrays, start = [], 0
         for shape, dtype in self.types:
             stop = start + math.prod(shape[:-1])
@@ -48,7 +48,7 @@ class Rows:
 
 
 def pack(tree: Any) -> Any:
-    """The pytree as `Rows` where the package's GPU kernels run, else as it is."""
+    """The pytree as `Rows` where the package's GPU kernels run; elsewhere unchanged."""
     return Rows.of(tree) if has_kernels() else tree
 
 

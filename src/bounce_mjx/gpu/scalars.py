@@ -1,9 +1,10 @@
 """A function of small arrays as the same function of scalars.
 
-A kernel in which a thread computes one environment has no small arrays, only scalars in registers.
-`as_scalars` traces a function of small arrays, such as an environment's step, and evaluates the
-trace with an array of Python objects for each small array: indexing, stacking and reshaping vanish,
-sums over an axis become sums of scalars, and every other operation acts on scalars alone.
+If each thread of a kernel computes one environment, the kernel has no small arrays, only scalars in
+registers. `as_scalars` traces a function of small arrays, such as an environment's step, and
+evaluates the trace with an array of Python objects for each small array: indexing, stacking and
+reshaping vanish, sums over an axis become sums of scalars, and every other operation acts on
+scalars alone.
 """
 
 import functools
@@ -21,13 +22,13 @@ Scalar = jax.Array | np.generic
 # An array of scalars, of dtype object.
 Scalars = np.ndarray
 
-# Operations that Mosaic GPU compiles, applied to each element.
+# Operations that Mosaic GPU compiles; they are applied to each element.
 _ELEMENTWISE = frozenset(
     "abs add and bitcast_convert_type cos div eq erf exp exp2 ge gt integer_pow le log lt max min "
     "mul ne neg not or rem round rsqrt select_n sign sin sub square tanh xor convert_element_type "
     "shift_right_logical shift_left".split()
 )
-# Calls, by the parameter that holds what they call.
+# Primitives that call a function, with the parameter that holds it.
 _CALLS = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -50,7 +51,7 @@ _REDUCTIONS = {
 
 
 class UnsupportedOperation(Exception):
-    """An operation that has no form for scalars."""
+    """An operation that cannot be expressed with scalars."""
 
 
 class ScalarFunction(NamedTuple):
@@ -59,11 +60,11 @@ class ScalarFunction(NamedTuple):
     call: Callable[..., list[Scalar]]
     """Scalars of the arguments, in order, -> the distinct scalars of the results."""
     positions: list[np.ndarray]
-    """For each array of the results, the position of each of its entries among those scalars."""
+    """For each result array, the position of each of its entries among those scalars."""
     dtypes: list[jnp.dtype]
     """Type of each of those scalars."""
     used: list[bool]
-    """Whether each scalar of the arguments has an influence."""
+    """For each scalar of the arguments, whether it influences a result."""
 
 
 def as_scalars(
@@ -72,7 +73,8 @@ def as_scalars(
     """Traces a function of arrays, which returns a list of arrays.
 
     Raises:
-      UnsupportedOperation: the function does something that has no form for scalars.
+      UnsupportedOperation: the function contains an operation that cannot be expressed with
+        scalars.
     """
     closed = jax.make_jaxpr(function)(*args)
     consts = [_constant(c) for c in closed.consts]
@@ -157,7 +159,7 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
         return [_reduce(_REDUCTIONS[name], args[0], params["axes"])]
     if name == "unstack":
         entries = np.moveaxis(args[0], params["axis"], 0)
-        # A slice keeps an array around what may be a scalar.
+        # A slice remains an array even where an index would give a bare scalar.
         return [entries[i : i + 1].reshape(entries.shape[1:]) for i in range(len(entries))]
     if name in _SHAPES:
         return [_SHAPES[name](*args, **params)]
@@ -186,7 +188,7 @@ def _reduce(operation: Callable[..., Scalar], array: Scalars, axes: Sequence[int
 
 
 def _scan(equation, args: list[Scalars]) -> list[Scalars]:
-    """A loop whose carry is scalars and which neither reads nor writes arrays step by step."""
+    """A loop that carries scalars and neither reads nor writes a slice of an array per step."""
     inner, num_carry = equation.params["jaxpr"], len(equation.outvars)
     outside = [v.aval.shape for v in (*equation.invars, *equation.outvars)]
     if outside != [a.shape for a in (*inner.in_avals, *inner.out_avals)]:
@@ -220,7 +222,7 @@ def _floor(x: Scalar) -> Scalar:
     return jnp.where(nearest > x, nearest - 1.0, nearest)
 
 
-# Operations that Mosaic GPU does not compile, by others.
+# Operations that Mosaic GPU does not compile, expressed with operations that it does.
 _REWRITTEN: dict[str, Callable[..., Scalar]] = {
     "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
     "copy": lambda x: x,

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-# Steps of the recursion that become one kernel on a GPU.
+# Number of steps of the recursion that are unrolled into one kernel on a GPU.
 _UNROLL = 32
 
 
@@ -19,12 +19,12 @@ def generalized_advantages(
     """Advantages [T, B] of T steps of B environments (Schulman et al. 2016, equation 16).
 
     Args:
-      reward, value: of each step and of the state before it [T, B].
+      reward, value: reward of each step, and value of the state before it [T, B].
       next_value: value of the state after the step [T, B]; at a time-out, the value of the old
         episode's last state, not of the new episode's first one.
       terminated: steps without a following value [T, B], bool.
-      truncated: steps whose following value counts, but over which no advantage flows back
-        [T, B], bool.
+      truncated: steps whose following value counts, but across which no advantage is propagated
+        back [T, B], bool.
     """
     delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
     carried = discount * gae_lambda * (~(terminated | truncated))

@@ -23,8 +23,9 @@ class PPOConfig(StrictModel):
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
     training_episode_seconds: Positive | None = None
-    """Time limit of the training's episodes, s; null for the environment's. A shorter one trains
-    more starts and more drawn worlds; a time-out is bootstrapped and no end."""
+    """Time limit of the training's episodes, s; null for the environment's limit. With a shorter
+    limit the training sees more resets and more drawn worlds; a time-out is bootstrapped and does
+    not count as a termination."""
     num_epochs: Count = 4
     """Passes over the data of one iteration."""
     num_minibatches: Count = 8
@@ -36,11 +37,12 @@ class PPOConfig(StrictModel):
     max_learning_rate: Positive = 3e-3
     """Upper limit of the learning rate at the start of the training."""
     final_max_learning_rate: Positive = 1e-4
-    """Upper limit of the learning rate at and after decay_steps."""
+    """Upper limit of the learning rate from decay_steps on."""
     decay_steps: Steps = 20_000_000
-    """Environment steps over which the upper limit goes down, in equal ratios."""
+    """Environment steps over which the upper limit decays exponentially."""
     target_kl: NonNegative = 0.01
-    """KL divergence of one update to which the learning rate is steered; 0 keeps the rate."""
+    """Target KL divergence of one update, to which the learning rate adapts; 0 keeps the rate
+    constant."""
     discount: UnitInterval = 0.98
     """Discount factor of a control step."""
     gae_lambda: UnitInterval = 0.95
@@ -63,8 +65,8 @@ class PPOConfig(StrictModel):
     """Type of the hidden layers during training; bfloat16 is faster on a GPU. Parameters, outputs,
     losses, the optimizer and all evaluations are float32."""
     critic_metrics: tuple[str, ...] = ("n_bounces",)
-    """Metrics of the environment that are inputs of the value network, with the observation. The
-    reward depends on the bounce count, which the observation lacks."""
+    """Metrics of the environment that are inputs of the value network in addition to the
+    observation. The reward depends on the bounce count, which the observation does not contain."""
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):

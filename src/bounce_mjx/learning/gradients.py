@@ -1,4 +1,4 @@
-"""The interface of the ways to compute the gradients of minibatches."""
+"""The interface between PPO and an implementation of minibatch gradients."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,7 +7,8 @@ import jax
 
 
 class MinibatchGradients(NamedTuple):
-    """A way to compute the gradients of minibatches, with parameters in a form P of its own."""
+    """An implementation of minibatch gradients, which may store the parameters in its own form
+    P."""
 
     pack: Callable[[Any], Any]
     """Parameters of the two networks -> P; linear."""

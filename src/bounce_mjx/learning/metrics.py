@@ -12,11 +12,11 @@ from bounce_mjx.task import vector
 Metrics = dict[str, jax.Array]
 
 PRIVILEGED = ("world/", "true/")
-"""Beginnings of the names of metrics that are there for a critic alone."""
+"""Prefixes of metrics that only a critic may use."""
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """Names among the known ones that the patterns name; a pattern such as world/* names many.
+    """The known names that match the patterns; a pattern such as world/* matches several.
 
     Raises:
       UserError: a pattern matches none.
@@ -49,7 +49,7 @@ def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
         "bounced": result.metrics["bounced"],
         "non_finite": result.metrics["non_finite"],
     }
-    # One array, as on a GPU each small one costs a kernel.
+    # One array, because on a GPU each small array costs a kernel.
     rows = jnp.stack([x.astype(result.reward.dtype) for x in (means | totals).values()])
     sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
     count = result.reward.size // groups

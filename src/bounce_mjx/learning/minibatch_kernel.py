@@ -53,7 +53,7 @@ class Batch(NamedTuple):
 
 
 def supports(config: PPOConfig, num_inputs: int, num_actions: int) -> bool:
-    """Whether the kernel computes networks and minibatches of these sizes."""
+    """Whether the kernel supports networks and minibatches of these sizes."""
     widths = config.hidden_layers
     return (
         config.compute_dtype == "bfloat16"
@@ -94,10 +94,10 @@ def _pack_network(first: Any, second: Any, last: Any, log_std: jax.Array):
 def kernel_gradients(
     config: PPOConfig, num_actions: int, shapes: tuple[Any, Any]
 ) -> MinibatchGradients:
-    """The gradients of minibatches by this kernel.
+    """The implementation of minibatch gradients by this kernel.
 
     Args:
-      shapes: of the parameters of the policy and of the value network.
+      shapes: shapes of the parameters of the policy and of the value network.
     """
     is_parameter = parameter_mask(shapes)
 
@@ -140,7 +140,7 @@ def kernel_gradients(
 
 
 def parameter_mask(shapes: tuple[Any, Any]) -> PackedParams:
-    """Which numbers of the packed parameters are parameters and not padding, bool; NumPy, as JAX
+    """Mask of the packed parameters that is False in the padding, bool. It uses NumPy because JAX
     would compile programs for it."""
     policy, value = (network["params"] for network in shapes)
     width = value["hidden_1"]["kernel"].shape[0]
@@ -175,7 +175,7 @@ def loss_gradient(
     """Gradient of the loss of one minibatch without the entropy bonus, and its metrics.
 
     Args:
-      index: of the minibatch [], int32.
+      index: index of the minibatch [], int32.
       interpret: parameters of Pallas' interpreter for GPU kernels, for tests on a processor.
 
     Returns:
@@ -193,7 +193,7 @@ def loss_gradient(
 
 @functools.lru_cache
 def _batched_call(config: PPOConfig, num_actions: int, interpret: Any):
-    """The kernel as a function that `jax.vmap` may batch, as of several seeds."""
+    """The kernel as a function that `jax.vmap` can batch, for example over several seeds."""
 
     def batched(*args: jax.Array) -> tuple[jax.Array, ...]:
         return _call(config, num_actions, interpret, args)
@@ -236,17 +236,17 @@ def _run(
     exact_output: jax.Array,
     index: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """The kernel, of S seeds.
+    """Runs the kernel for S seeds.
 
     Args:
-      num_samples: of the whole minibatch, of which a device may have a part.
-      inputs, action, scalars: those of `Batch`, [S, ...].
+      num_samples: number of samples of the whole minibatch; a device may hold only some of them.
+      inputs, action, scalars: the fields of `Batch`, [S, ...].
       hidden, output: bfloat16 parameters [S, ...].
       exact_output: the same as `output`, float32.
-      index: of the minibatch [S].
+      index: index of the minibatch [S].
 
     Returns:
-      For each tile of samples, sums over it: gradients [S, 2, tiles, ...] in the form of the
+      Sums over each tile of samples: gradients [S, 2, tiles, ...] in the form of the
       parameters, and policy loss, KL divergence and value loss as [S, 2, tiles, 2].
     """
     from jax.experimental import pallas as pl
@@ -279,7 +279,8 @@ def _run(
         plgpu.barrier_wait(barrier)
 
         def matmul(a, b, rows: int, cols: int, flip_a=False, flip_b=False) -> jax.Array:
-            """Product [rows, cols] of two shared arrays, transposed where they are flipped."""
+            """Product [rows, cols] of two arrays in shared memory; a flipped operand is
+            transposed."""
             if interpret is not None:
                 a, b = (x[...].T if flip else x[...] for x, flip in ((a, flip_a), (b, flip_b)))
                 return jnp.dot(a, b, preferred_element_type=float32)
@@ -359,19 +360,19 @@ def _run(
         metrics_ref[seed, network, tile, 0] = jnp.sum(losses) * mean_of
         metrics_ref[seed, network, tile, 1] = jnp.sum(ratio - 1.0 - log_ratio) * mean_of
 
-        of_hidden = hidden_gradient_ref.at[seed, network, tile]
-        of_output = output_gradient_ref.at[seed, network, tile]
-        of_output[output_bias] = jnp.sum(by_result, axis=0)
-        of_output[noise_row] = jnp.sum(by_log_prob * (deviation * deviation - 1.0), axis=0)
-        of_output[pl.ds(0, width)] = matmul(h2, out_gradient, width, NUM_OUTPUTS, flip_a=True)
+        hidden_result = hidden_gradient_ref.at[seed, network, tile]
+        output_result = output_gradient_ref.at[seed, network, tile]
+        output_result[output_bias] = jnp.sum(by_result, axis=0)
+        output_result[noise_row] = jnp.sum(by_log_prob * (deviation * deviation - 1.0), axis=0)
+        output_result[pl.ds(0, width)] = matmul(h2, out_gradient, width, NUM_OUTPUTS, flip_a=True)
         gradient = matmul(out_gradient, w3, TILE, width, flip_b=True)
         gradient *= load(slope2).astype(float32)
-        of_hidden[hidden_bias] = jnp.sum(gradient, axis=0)
+        hidden_result[hidden_bias] = jnp.sum(gradient, axis=0)
         store(slope2, gradient)
-        of_hidden[second] = matmul(h1, slope2, width, width, flip_a=True)
+        hidden_result[second] = matmul(h1, slope2, width, width, flip_a=True)
         gradient = matmul(slope2, w2, TILE, width, flip_b=True) * load(slope1).astype(float32)
         store(slope1, gradient)
-        of_hidden[first] = matmul(x, slope1, NUM_INPUTS, width, flip_a=True)
+        hidden_result[first] = matmul(x, slope1, NUM_INPUTS, width, flip_a=True)
 
     # Operands of one product need the same swizzle, which their narrowest dimension bounds.
     wide = (plgpu.TilingTransform((8, 64)), plgpu.SwizzleTransform(128))

@@ -1,7 +1,7 @@
 """The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights.
 
-A policy's file holds the parameters under the names that the modules have here; so a module
-keeps its name.
+A policy's file stores the parameters under the names of these modules, so the names must not
+change.
 """
 
 import math

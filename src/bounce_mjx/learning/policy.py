@@ -12,10 +12,10 @@ from bounce_mjx.learning.statistics import Normalizer, normalize
 
 
 class Policy(NamedTuple):
-    """Everything that acting needs: a pytree of arrays."""
+    """The arrays that are needed to act, as a pytree."""
 
     normalizer: Normalizer
-    """Of the observation [N]."""
+    """Normaliser of the observation [N]."""
     params: Any
     """Parameters of the policy network."""
 
@@ -41,7 +41,8 @@ class Networks(NamedTuple):
 def make_networks(
     config: PPOConfig, observation_size: int, action_size: int, num_critic_metrics: int = 0
 ) -> Networks:
-    """The networks of a config for an environment with these sizes; acting needs no critic."""
+    """The networks of a config for an environment with these sizes; the critic is not needed to
+    act."""
     policy = PolicyNetwork(config.hidden_layers, action_size, config.init_noise_std)
     value = MLP((*config.hidden_layers, 1), activate_final=False)
     critic_size = observation_size + num_critic_metrics

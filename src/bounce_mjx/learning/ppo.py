@@ -35,8 +35,8 @@ from bounce_mjx.task.state import Env
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
-# Number of groups in which the environments are shuffled, at least; and the environments in a
-# group, at most, where there are more groups.
+# Minimum number of groups in which samples are shuffled, and the maximum number of environments per
+# group if there are more groups.
 _MIN_GROUPS, _GROUP_ENVS = 64, 64
 
 # Quantities that must be finite, in the order in which an iteration computes them.
@@ -56,7 +56,7 @@ class TrainingState(NamedTuple):
     params: Params
     optimizer: optax.OptState
     statistics: RunningStatistics
-    """Of the networks' inputs [N + K]: the observation and K critic metrics."""
+    """Statistics of the networks' inputs [N + K]: the observation and K critic metrics."""
     learning_rate: jax.Array
     """Current learning rate []."""
     env: vector.VectorState
@@ -72,11 +72,11 @@ class Rollout(NamedTuple):
     inputs: jax.Array
     """Normalised observation and critic metrics [T, B, N + K]."""
     action: jax.Array
-    """As drawn, before clipping [T, B, A]."""
+    """Drawn action before clipping [T, B, A]."""
     log_prob: jax.Array
-    """Of the action [T, B]."""
+    """Logarithm of the action's probability density [T, B]."""
     reward: jax.Array
-    """Scaled [T, B]."""
+    """Scaled reward [T, B]."""
     terminated: jax.Array
     """[T, B], bool."""
     truncated: jax.Array
@@ -87,7 +87,7 @@ class StepOfRollout(NamedTuple):
     """One step of B environments, the batch last: the fields of `Rollout`."""
 
     raw_inputs: jax.Array
-    """Before their normalisation [N + K, B]."""
+    """Inputs of the networks before normalisation [N + K, B]."""
     action: jax.Array
     """[A, B]."""
     log_prob: jax.Array
@@ -97,20 +97,20 @@ class StepOfRollout(NamedTuple):
 
 
 class Collection(NamedTuple):
-    """A rollout with the states at its ends."""
+    """A rollout, with the data that its update needs."""
 
     env: vector.VectorState
-    """Environments after the last step."""
+    """States of the environments after the last step."""
     rollout: Rollout
     raw_inputs: jax.Array
-    """The rollout's inputs before their normalisation [T, B, N + K]."""
+    """The rollout's inputs before normalisation [T, B, N + K]."""
     statistics: RunningStatistics
     """Statistics including the rollout."""
     last_inputs: jax.Array
     """Normalised inputs after the last step [B, N + K]."""
     timeout_inputs: jax.Array
-    """Normalised inputs at each environment's time-out, before its reset; of no meaning in an
-    environment without one [B, N + K]."""
+    """Normalised inputs at each environment's time-out, before its reset [B, N + K]; unused for an
+    environment that did not time out."""
 
 
 class Samples(NamedTuple):
@@ -165,7 +165,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return inputs.astype(config.compute_dtype) if casts else inputs
 
     def cast_params(params: Params) -> Params:
-        """Parameters with the hidden layers in their type."""
+        """Parameters with the hidden layers in the training's type."""
         if not casts:
             return params
         dtype = jnp.dtype(config.compute_dtype)
@@ -179,7 +179,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return networks.value_network.apply(params.value, inputs)
 
     def make_inputs(observation: jax.Array, metrics: Metrics) -> jax.Array:
-        """Inputs of the networks before their normalisation [B, N + K]."""
+        """Inputs of the networks before normalisation [B, N + K]."""
         columns = [metrics[name][:, None] for name in critic_metrics]
         return jnp.concatenate([observation, *columns], axis=-1)
 
@@ -196,7 +196,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             networks.policy_network.init(policy_key), networks.value_network.init(value_key)
         )
         env_state = vector.reset(env, env_key, config.num_envs, ranges_at(jnp.int32(0)))
-        # Without different clocks, all episodes would time out together.
+        # With equal clocks, all episodes would time out together.
         clock = jax.random.randint(clock_key, (config.num_envs,), 0, episode_steps)
         return TrainingState(
             params=params,
@@ -237,9 +237,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             metrics = step_metrics(result, groups)
             return pack((env_state, timeout_inputs)), (pack(step_of_rollout), pack(metrics))
 
-        # An environment times out at most once in a rollout, as no episode is shorter than it.
+        # An environment times out at most once in a rollout, because no time limit is shorter than
+        # a rollout.
         noise_key, reset_key = jax.random.split(key)
-        # All at once, as on a GPU each draw costs a kernel or two.
+        # All numbers are drawn at once, because on a GPU each draw costs a kernel or two.
         shape = (config.rollout_length, config.num_envs, env.action_size)
         noise = jax.random.normal(noise_key, shape)
         ranges = ranges_at(state.iteration)
@@ -319,7 +320,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         }
 
     def xla_gradients(unravel: Callable[[jax.Array], Params]) -> MinibatchGradients:
-        """Parameters in one array, so that one kernel clips gradients and one makes a step."""
+        """Gradients by XLA, with the parameters in one array, so that one kernel clips the gradient
+        and one takes the step."""
 
         def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
             return samples, (jnp.moveaxis(order, 1, 0), mean, deviation)
@@ -367,7 +369,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
             return jax.lax.scan(step, carry, minibatches)
 
-        # Between updates the optimizer's moments are flat, whichever way computes the gradients.
+        # Between updates the optimizer's moments are one flat array, whichever implementation
+        # computes the gradients.
         moments = jax.tree.map(
             lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
         )
@@ -426,8 +429,8 @@ def num_groups(config: PPOConfig) -> int:
     """Number of equal groups of environments, a power of two.
 
     Samples are shuffled within their group, and every minibatch takes equally many from each group.
-    So a device with whole groups shuffles only its own samples; and the training does not depend on
-    the number of devices, as the groups do not.
+    A device that holds whole groups therefore shuffles only its own samples, and the training does
+    not depend on the number of devices.
     """
     groups = max(_MIN_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
@@ -443,17 +446,15 @@ def group(x: jax.Array, groups: int) -> jax.Array:
 
 
 def policy_of(state: TrainingState, observation_size: int) -> Policy:
-    """The policy of a training state, or the policies of a population's."""
+    """The policy of a training state, or the policies of a population's state."""
     mean, std = (x[..., :observation_size] for x in state.statistics.normalizer)
     return Policy(Normalizer(mean, std), state.params.policy)
 
 
 def max_learning_rate(config: PPOConfig, iteration: jax.Array) -> jax.Array:
-    """Upper limit of the learning rate []: from max_learning_rate to final_max_learning_rate in
-    equal ratios over decay_steps.
-
-    Without it the KL rule raises the rate once the policy hardly changes, and a late large step
-    ruins the policy.
+    """Upper limit of the learning rate []: an exponential decay from max_learning_rate to
+    final_max_learning_rate over decay_steps. Without this limit the KL rule raises the rate once
+    the policy hardly changes, and a late large step ruins the policy.
     """
     progress = jnp.minimum(1.0, iteration * (config.batch_steps / config.decay_steps))
     ratio = config.final_max_learning_rate / config.max_learning_rate
@@ -463,8 +464,8 @@ def max_learning_rate(config: PPOConfig, iteration: jax.Array) -> jax.Array:
 def adapt_learning_rate(
     config: PPOConfig, learning_rate: jax.Array, kl: jax.Array, limit: jax.Array
 ) -> jax.Array:
-    """The learning rate [] that steers the KL divergence of an update towards target_kl (the
-    adaptive rule of Schulman et al. 2017, section 4, applied to the learning rate)."""
+    """The learning rate [] after an update, adapted so that the KL divergence approaches target_kl
+    (the adaptive rule of Schulman et al. 2017, section 4, applied to the learning rate)."""
     if config.target_kl > 0.0:
         learning_rate = jnp.where(
             kl > 2.0 * config.target_kl,
@@ -482,14 +483,14 @@ def first_fault(
     minibatch_metrics: Metrics,
     params: Params,
 ) -> jax.Array:
-    """Number [], from 1, of the quantity of `CHECKED` that was the first not to be finite in an
-    iteration; 0 if all were finite.
+    """Number [], from 1, of the first quantity of `CHECKED` that was not finite in an iteration; 0
+    if all were finite.
 
     Args:
-      reward: mean of the rollout [].
-      statistics: including the rollout.
+      reward: mean reward of the rollout [].
+      statistics: the statistics that include the rollout.
       minibatch_metrics: each [epochs, minibatches].
-      params: after the update.
+      params: the parameters after the update.
     """
     names = ("loss/value", "loss/policy", "loss/gradient_norm")
     flags = jnp.stack([jnp.isfinite(minibatch_metrics[n]).ravel() for n in names], axis=-1)

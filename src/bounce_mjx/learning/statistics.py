@@ -1,4 +1,4 @@
-"""Running statistics of the networks' inputs, and the normalisation by them."""
+"""Running statistics of the networks' inputs, and normalisation with them."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 
 class Normalizer(NamedTuple):
-    """Mean and standard deviation [N] by which inputs are normalised."""
+    """Mean and standard deviation [N] with which inputs are normalised."""
 
     mean: jax.Array
     std: jax.Array
@@ -26,15 +26,15 @@ class RunningStatistics(NamedTuple):
     count: jax.Array
     """Number of inputs []. As float32 it is exact up to 2^24 times the size of a batch."""
     mean: jax.Array
-    """Their mean [N]; 0 before the first input."""
+    """Mean of the inputs [N]; 0 before the first input."""
     summed_variance: jax.Array
-    """Sum of their squared distances from the mean [N]."""
+    """Sum of the squared distances of the inputs from their mean [N]."""
     std: jax.Array
-    """Their standard deviation [N], with MIN_VARIANCE; 1 before the first input."""
+    """Standard deviation of the inputs [N], including MIN_VARIANCE; 1 before the first input."""
 
     @property
     def normalizer(self) -> Normalizer:
-        """The normaliser by these statistics."""
+        """The normaliser that uses these statistics."""
         return Normalizer(self.mean, self.std)
 
 
@@ -66,8 +66,8 @@ def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
     """Inputs [..., N] in standard deviations from their mean, clipped to +-MAX_NORMALIZED.
 
     An input that never varied becomes 0, whatever its value. The fused physics keeps the ball's
-    quaternion and spin constant; other engines let them drift by rounding, which must not be
-    magnified to a signal.
+    quaternion and spin constant; on other engines they drift by rounding, and this drift must not
+    be magnified into a signal.
     """
     standardized = (inputs - normalizer.mean) / normalizer.std
     clipped = jnp.clip(standardized, -MAX_NORMALIZED, MAX_NORMALIZED)

@@ -108,7 +108,8 @@ def step(
     addresses = constants.addresses
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
-        return mjx.step(model, data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype))))
+        data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
+        return mjx.step(_with_saturated_servos(model, constants, data), data)
 
     with _full_precision():
         model = in_world(constants, parameters)
@@ -123,6 +124,49 @@ def step(
             data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
+
+
+def _with_saturated_servos(model: mjx.Model, constants: MjxModel, data: mjx.Data) -> mjx.Model:
+    """The model of one step, in which a servo at its force limit is a constant force.
+
+    MJX's implicit integrator gives such a servo its damping; MuJoCo's C engine does not.
+    """
+    m, at = constants.mj_model, constants.addresses
+    servos = np.array(at.actuators)
+    affine = (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (
+        m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    )
+    servos = servos[(model.actuator_forcelimited & affine)[servos]]
+    if m.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST or not len(servos):
+        return model
+    joints = m.actuator_trnid[servos, 0]
+    gear = m.actuator_gear[servos, 0]
+    gain, bias = model.actuator_gainprm, model.actuator_biasprm
+    limited = m.actuator_ctrllimited.astype(bool)[:, None]
+    limits = np.where(limited, m.actuator_ctrlrange, [-np.inf, np.inf])
+    inputs = jnp.clip(data.ctrl, *limits.T)[servos]
+    if m.na:
+        filtered = m.actuator_dyntype[servos] != mujoco.mjtDyn.mjDYN_NONE
+        inputs = jnp.where(filtered, data.act[m.actuator_actadr[servos]], inputs)
+    force = (
+        gain[servos, 0] * inputs
+        + bias[servos, 0]
+        + bias[servos, 1] * gear * data.qpos[m.jnt_qposadr[joints]]
+        + bias[servos, 2] * gear * data.qvel[m.jnt_dofadr[joints]]
+    )
+    least, most = jnp.asarray(model.actuator_forcerange)[servos].T
+    saturated = (force <= least) | (force >= most)
+    constant = jnp.zeros((len(servos), 3)).at[:, 0].set(jnp.clip(force, least, most))
+    return model.tree_replace(
+        {
+            "actuator_gainprm": jnp.asarray(gain)
+            .at[servos, 0]
+            .set(jnp.where(saturated, 0.0, gain[servos, 0])),
+            "actuator_biasprm": jnp.asarray(bias)
+            .at[servos, :3]
+            .set(jnp.where(saturated[:, None], constant, bias[servos, :3])),
+        }
+    )
 
 
 def paddle_position(

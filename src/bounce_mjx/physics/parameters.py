@@ -40,10 +40,14 @@ class PhysicsParameters(NamedTuple):
     """Stiffness [6] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
     """Damping [6] of the position servos, N m s/rad: `kv`."""
+    force_limit: Array | None = None
+    """Largest forces [6] of the position servos, N m: the symmetrical `forcerange`."""
     armature: Array | None = None
     """Rotor inertia [6] at the joints, kg m^2."""
     damping: Array | None = None
     """Viscous damping [6] of the joints, N m s/rad."""
+    frictionloss: Array | None = None
+    """Dry friction [6] of the joints, N m; on MuJoCo's C engine alone."""
     link_mass: Array | None = None
     """Masses [6] of the links, kg; first moment and inertia change in proportion, the centre of
     mass stays."""
@@ -67,8 +71,10 @@ SHAPES = PhysicsParameters(
     contact_friction=(),
     servo_gain=(_NUM_JOINTS,),
     servo_damping=(_NUM_JOINTS,),
+    force_limit=(_NUM_JOINTS,),
     armature=(_NUM_JOINTS,),
     damping=(_NUM_JOINTS,),
+    frictionloss=(_NUM_JOINTS,),
     link_mass=(_NUM_JOINTS,),
     paddle_position=(3,),
     paddle_rotation=(4,),
@@ -148,10 +154,16 @@ def edited_fields(
         put("actuator_biasprm", (servos, 1), -p.servo_gain)
     if p.servo_damping is not None:
         put("actuator_biasprm", (servos, 2), -p.servo_damping)
+    if p.force_limit is not None:
+        put("actuator_forcelimited", servos, True)
+        put("actuator_forcerange", (servos, 0), -p.force_limit)
+        put("actuator_forcerange", (servos, 1), p.force_limit)
     if p.armature is not None:
         put("dof_armature", dofs, p.armature)
     if p.damping is not None:
         put("dof_damping", dofs, p.damping)
+    if p.frictionloss is not None:
+        put("dof_frictionloss", dofs, p.frictionloss)
     if p.link_mass is not None:
         ratio = p.link_mass / m.body_mass[links]
         put("body_mass", links, p.link_mass)

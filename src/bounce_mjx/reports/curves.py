@@ -1,4 +1,4 @@
-"""Learning curves from the TensorBoard logs of runs, grouped by config apart from the seed."""
+"""Learning curves from the TensorBoard logs of runs, grouped by config (ignoring the seed)."""
 
 import json
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
 
-# Settings that may differ within a group: the seed, the place of the run, its end, its devices.
+# Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
-# Number of settings in a label.
+# Maximum number of settings in a label.
 _MAX_NAMED = 3
 
 
@@ -23,7 +23,7 @@ class Curve(NamedTuple):
     steps: np.ndarray
     """Environment steps [N], in ascending order."""
     values: np.ndarray
-    """[N]."""
+    """Values at these steps [N]."""
 
 
 class RunCurves(NamedTuple):
@@ -31,7 +31,7 @@ class RunCurves(NamedTuple):
 
     run: Path
     curves: dict[str, Curve]
-    """By the scalar's name, such as "episode/return"."""
+    """Curves by the scalar's name, such as "episode/return"."""
     solved_steps: int | None
     """Environment steps at the first evaluation that met all five results."""
 
@@ -40,7 +40,7 @@ class Group(NamedTuple):
     """Runs whose configs differ only in `_FREE_KEYS`."""
 
     label: str
-    """The first settings that tell this group from the others, and the number of seeds."""
+    """The first settings that distinguish this group from the others, and the number of seeds."""
     runs: list[RunCurves]
 
 
@@ -50,10 +50,10 @@ def read_curves(run: Path) -> RunCurves:
     Raises:
       UserError: the log has no scalars.
     """
-    # At the top of the file, this import would delay the start of a training.
+    # At the top of the module, this import would delay the start of a training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    # 0 keeps every point; the default drops points beyond 10,000.
+    # 0 keeps every point; by default, at most 10,000 points are kept.
     log = EventAccumulator(str(run), size_guidance={"scalars": 0}).Reload()
     curves = {}
     for name in log.Tags()["scalars"]:
@@ -70,7 +70,7 @@ def read_curves(run: Path) -> RunCurves:
 
 
 def group_runs(runs: Sequence[Path]) -> list[Group]:
-    """Reads the curves of runs, grouped by config apart from the seed.
+    """Reads the curves of runs, grouped by config (ignoring the seed).
 
     Raises:
       UserError: a run has no config or no scalars.
@@ -103,7 +103,7 @@ def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _settings(config: TrainConfig) -> dict[str, Any]:
-    """The settings that affect the learning, by dotted name."""
+    """The settings that affect the training, by dotted name."""
     flat: dict[str, Any] = {}
 
     def flatten(group: dict[str, Any], prefix: str) -> None:

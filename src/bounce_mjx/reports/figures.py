@@ -1,6 +1,6 @@
 """Figures of a training and of an evaluation, drawn with matplotlib.
 
-They do without pyplot, so they need no screen and can be drawn in several threads.
+They do not use pyplot, so they need no display and can be drawn in several threads.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ CURVES = (
     ("episode/bounces", "bounces in a row at its end", 1.0),
     ("task/apex_error", "|apex − target height|, cm", 100.0),
 )
-# Okabe and Ito's colours, which the colour-blind can tell apart.
+# Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _GREY = "#777777"
 _STYLE = {
@@ -144,8 +144,8 @@ def _coloured(groups: Sequence[Group]) -> list[tuple[Group, str]]:
 
 
 def _draw_curve(axes: Axes, groups: Sequence[Group], name: str, title: str, factor: float) -> None:
-    """One line for a group of one run; for several runs faint lines, their mean, and a band of one
-    standard deviation to each side."""
+    """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
+    standard deviation on each side."""
     for group, colour in _coloured(groups):
         curves = [run.curves[name] for run in group.runs if name in run.curves]
         if not curves:

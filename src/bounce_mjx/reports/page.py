@@ -55,8 +55,8 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
       The page's path, and its figure of the evaluation.
 
     Raises:
-      UserError: the run has no results or no log yet, a file of them is damaged, or the page cannot
-        be written.
+      UserError: the run has no results or no log yet, one of their files is damaged, or the page
+        cannot be written.
     """
     results = load_results(run)
     if results is None:

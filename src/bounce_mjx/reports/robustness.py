@@ -38,9 +38,9 @@ _HEADERS = {
     "height": "height",
     "upward speed": "speed",
 }
-# From vermilion over sand to blue, which the colour-blind can tell apart.
+# From vermilion through sand to blue, which colour-blind readers can distinguish.
 _COLOURS = LinearSegmentedColormap.from_list("stable", ["#c2451e", "#f4e3c3", "#2b7bba"])
-# Most of the colours are for the shares that matter, near 100%.
+# Most of the colours are used for the shares that matter, near 100%.
 _SCALE = PowerNorm(2.5, 0.0, 100.0)
 _INK, _PAPER = "#222222", "#ffffff"
 
@@ -98,8 +98,8 @@ def robustness_table(report: RobustnessReport) -> Table:
 
 
 def robustness_figure(report: RobustnessReport) -> Figure:
-    """Perturbations by strength: a cell has the colour of the share of stable episodes, a tick or
-    the initials of the missed results, and a frame where the training's ranges contain it."""
+    """Perturbations by strength. The colour of a cell is the share of stable episodes. A cell has a
+    tick or the initials of the missed results, and a frame if the training's ranges contain it."""
     columns = _columns(report.outcomes)
     lines = max(sum(_lines(group) for group in column) for column in columns)
     height = _LINE * lines + _TOP + _BOTTOM

@@ -8,7 +8,7 @@ from bounce_mjx.evaluation.results import Report, Result
 
 
 def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit: str = "") -> str:
-    """A measured figure, times `scale`, as text; "none" where there was nothing to measure."""
+    """A measured figure times `scale`, as text; "none" if there was nothing to measure."""
     return "none" if value is None else f"{scale * value:{spec}}{unit}"
 
 
@@ -42,7 +42,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     the five results, the consecutive bounces and the apex error.
 
     Args:
-      reports: by seed; None for a seed that diverged before its first evaluation.
+      reports: reports by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
     table = _plain_table("best checkpoint of each seed")
@@ -61,7 +61,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     table.add_section()
     columns = list(zip(*map(_seed_figures, known), strict=True))
     passed = sum(report.passed for report in known)
-    # Where a seed lacks a figure, a mean of the other seeds would flatter the training.
+    # If a seed lacks a figure, the mean of the other seeds would be too favourable.
     for name, statistic, met in (
         ("mean", np.mean, f"{passed}/{len(reports)}"),
         ("std", np.std, ""),
@@ -85,7 +85,7 @@ def results_markdown(report: Report) -> str:
     """The five results as a Markdown table."""
     lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
     for result in report.results:
-        # A bare | would begin a new cell.
+        # An unescaped | would begin a new cell.
         measured = result.measured.replace("|", "&#124;")
         cells = (result.name, measured, figure_text(result.value), result.bound, verdict(result))
         lines.append(f"| {' | '.join(cells)} |")
@@ -98,7 +98,7 @@ def verdict(result: Result) -> str:
 
 
 def details_line(report: Report) -> str:
-    """The further figures of an evaluation, in one line."""
+    """The other figures of an evaluation, in one line."""
     details = report.details
     apex_error = figure_text(details["mean_apex_error_m"], ".1f", 100.0, " cm")
     return (

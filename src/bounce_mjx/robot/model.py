@@ -18,7 +18,7 @@ JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
 
-# Numbers that MuJoCo's compiler can compute from others.
+# Fields that MuJoCo's compiler can compute from others.
 _DERIVED_FIELDS = frozenset(
     (
         "actuator_acc0",
@@ -36,7 +36,7 @@ _DERIVED_FIELDS = frozenset(
 
 
 class Addresses(NamedTuple):
-    """Indices of the named parts in the model's arrays."""
+    """Indices of the named parts in the arrays of the model."""
 
     arm_joints: tuple[int, ...]
     """Ids of Joint1..Joint6."""
@@ -94,7 +94,7 @@ def _check_numbers(mj_model: mujoco.MjModel) -> None:
         raise UserError(f"the timestep {step}; give a positive number of seconds")
     fields = [(mj_model, name) for name in _physical_fields(mj_model)]
     fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
-    # Derived numbers come last: the message must name the number in the file.
+    # Derived fields come last: the message must name a number that is in the file.
     for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
         values = np.asarray(getattr(owner, name))
         if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
@@ -103,7 +103,7 @@ def _check_numbers(mj_model: mujoco.MjModel) -> None:
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Refuses actuators whose control is not the position that they drive their joint to."""
+    """Refuses actuators whose control is not a target position of their joint."""
     plain_or_filtered = (
         mujoco.mjtDyn.mjDYN_NONE,
         mujoco.mjtDyn.mjDYN_FILTER,
@@ -128,7 +128,7 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     """Addresses of the task's parts.
 
     Raises:
-      UserError: a needed name is missing; the text starts with what the model lacks.
+      UserError: a needed name is missing; the text starts with the missing part.
     """
     joints = tuple(_find(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in JOINT_NAMES)
     ball_body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, BALL_BODY_NAME)
@@ -183,7 +183,7 @@ def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> 
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
-    """A hash of the numbers that a simulation depends on; colours and markers do not enter it."""
+    """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
     for owner, names in (
         (mj_model, _physical_fields(mj_model)),
@@ -195,7 +195,7 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
 
 
 def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
-    """Checks a model against its `fingerprint` from before.
+    """Compares a model with its earlier `fingerprint`.
 
     Raises:
       UserError: the model was edited, and the engines built from it would ignore the edit.
@@ -215,13 +215,13 @@ def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
     """The ball's geom in the contact pair; without a pair, its first geom."""
-    of_ball = {
+    ball_geoms = {
         int(geom)
         for pair in range(mj_model.npair)
         for geom in (mj_model.pair_geom1[pair], mj_model.pair_geom2[pair])
         if mj_model.geom_bodyid[geom] == ball_body
     }
-    return min(of_ball, default=int(mj_model.body_geomadr[ball_body]))
+    return min(ball_geoms, default=int(mj_model.body_geomadr[ball_body]))
 
 
 def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

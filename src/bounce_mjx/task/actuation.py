@@ -1,5 +1,5 @@
-"""From the policy's action to the inputs of the physics: late and lagging servo targets, air drag
-and pushes."""
+"""From the policy's action to the inputs of the physics: servo targets with latency and lag, air
+drag and pushes."""
 
 import math
 from typing import NamedTuple
@@ -12,13 +12,13 @@ from bounce_mjx.physics.control import servo_target
 from bounce_mjx.task import noise
 from bounce_mjx.task.randomization import RandomizationConfig, World
 
-# Time between pushes where only their speed is given, s.
+# Time between pushes if only their speed is given, s.
 DEFAULT_PUSH_INTERVAL = 2.0
 _PUSH_STREAM = 3
 
 
 class Actuation(NamedTuple):
-    """Memory of the actuation; None where no term needs it."""
+    """Memory of the actuation; a field is None if no term needs it."""
 
     targets: jax.Array | None
     """Servo targets of the last control steps [K, nu], the newest first."""
@@ -46,7 +46,7 @@ def delayed(
     control_dt: float,
     num_substeps: int,
 ) -> tuple[Control, Actuation | None]:
-    """The control of a control step, given the targets [nu] that its action asks for.
+    """The control of a control step, given the targets [nu] of its action.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
     them.
@@ -58,7 +58,8 @@ def delayed(
     if queue is not None:
         queue = jnp.concatenate([targets[None], queue[:-1]])
         latency = world["action_latency"] / control_dt
-        # Rounding must not make 10 ms of 10 ms steps into one step less and a whole switch.
+        # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
+        # and a switch at the end of the step.
         whole = jnp.floor(latency + 1e-4)
         control = Control(
             ctrl=taken(queue, whole),
@@ -74,9 +75,9 @@ def delayed(
 
 
 def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
-    """The entry of a queue [K, ...] at an index [], which is a whole number; the last one at most.
+    """The entry of a queue [K, ...] at an index [], a whole number; beyond the end, the last entry.
 
-    A chain of selections, as the kernel has no indexing.
+    It is a chain of selections because the GPU kernel has no indexing.
     """
     entry = queue[0]
     for i in range(1, len(queue)):
@@ -85,7 +86,7 @@ def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
 
 
 def drag_force(world: World, velocity: jax.Array, mass: jax.Array | float) -> jax.Array:
-    """Force [3] of the air on a ball of this velocity [3] (m/s) and mass (kg), N."""
+    """Drag force [3] of the air on a ball with this velocity [3] (m/s) and mass (kg), N."""
     speed_squared = jnp.sum(jnp.square(velocity))
     positive = speed_squared > 0.0
     speed = jnp.where(positive, jnp.sqrt(jnp.where(positive, speed_squared, 1.0)), 0.0)
@@ -95,11 +96,12 @@ def drag_force(world: World, velocity: jax.Array, mass: jax.Array | float) -> ja
 def push(
     world: World, counter: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float
 ) -> jax.Array:
-    """Velocity [3] that the ball is given at the start of a control step, m/s; mostly 0.
+    """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most
+    steps.
 
     Args:
-      counter: of the random numbers.
-      phase: share of an interval that was over at the reset [].
+      counter: the counter of the random numbers.
+      phase: share of an interval that had passed at the reset [].
       step: control steps since the reset [].
     """
     interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))

@@ -15,10 +15,12 @@ ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
 class EnvConfig(StrictModel):
-    """The task: the model, its time steps, the resets, the bounces, the ends and the reward."""
+    """The task: the model, its time steps, the resets, the bounces, the terminations and the
+    reward."""
 
     physics: Literal["auto", "fused", "mjx"] = "auto"
-    """Physics engine: fused (straight-line, fast), mjx (any MJCF), auto (fused where it can)."""
+    """Physics engine: fused (fast, for one kind of model), mjx (any MJCF), auto (fused if it
+    supports the model)."""
     mjcf: PlainPath | None = None
     """MJCF file to simulate; null for the project's own robot."""
     physics_dt: Positive = 0.001
@@ -28,15 +30,15 @@ class EnvConfig(StrictModel):
     episode_seconds: Positive = 20.0
     """Length of an episode before it is truncated, s."""
     action_scale: Positive = 0.02
-    """Change of the servo target at the action 1, rad."""
+    """Change of the servo target for an action of 1, rad."""
     default_joint_angles: ArmVector = tuple(math.radians(a) for a in (0, 40, 110, 0, -60, 0))
-    """Joint angles of a reset before noise, rad."""
+    """Joint angles at a reset, before noise, rad."""
     joint_angle_noise: NonNegative = 0.1
     """Half-width of the uniform noise of the joint angles at a reset, rad."""
     joint_velocity_noise: NonNegative = 0.01
     """Half-width of the uniform noise of the joint velocities at a reset, rad/s."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
-    """Ball position of a reset before noise, m."""
+    """Ball position at a reset, before noise, m."""
     ball_position_noise: NonNegative = 0.01
     """Half-width of the uniform noise of each ball coordinate at a reset, m."""
     target_height_range: tuple[float, float] = (0.4, 0.6)
@@ -44,9 +46,9 @@ class EnvConfig(StrictModel):
     bounce_min_velocity: NonNegative = 0.01
     """Vertical velocity above which the ball counts as rising, m/s."""
     bounce_max_distance: Positive = 0.12
-    """Vertical distance ball-paddle within which a reversal is a bounce, m."""
+    """Vertical distance between ball and paddle within which a reversal is a bounce, m."""
     apex_tolerance: NonNegative = 0.1
-    """How far below the target an apex may stay and still continue the bounce count, m."""
+    """Distance below the target up to which an apex continues the bounce count, m."""
     min_ball_height: Finite = 0.05
     """The episode ends when the ball is below this height, m."""
     max_height_above_target: Positive = 1.0

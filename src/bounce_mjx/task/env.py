@@ -27,7 +27,7 @@ from bounce_mjx.robot.model import (
 from bounce_mjx.task import actuation, noise, sensing
 from bounce_mjx.task.actuation import Actuation
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.observation import OF_BOUNCES, Kinematics
+from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics
 from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
 from bounce_mjx.task.rewards import (
     TERM_NAMES,
@@ -40,12 +40,12 @@ from bounce_mjx.task.state import State
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-# Streams of random numbers, besides those of sensors and pushes.
+# Stream of random numbers for the target height; sensors and pushes have their own streams.
 _TARGET_STREAM = 4
 
 
 class TaskState(NamedTuple):
-    """State of an episode besides the physics."""
+    """State of an episode, apart from the physics."""
 
     target_height: jax.Array
     """Target height of the bounces [], m."""
@@ -60,18 +60,18 @@ class TaskState(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State that only a randomised world or an observation of the past needs."""
+    """State that only a randomised world or an observation with a history needs."""
 
     counter: jax.Array
-    """Of the random numbers [], int32."""
+    """Counter of the random numbers [], int32."""
     step: jax.Array
     """Control steps since the reset [], int32."""
     phases: jax.Array
-    """Shares of an interval that were over at the reset [3]: camera, pushes, targets."""
+    """Share of the current interval that had passed at the reset [3]: camera, pushes, targets."""
     target_age: jax.Array
     """Time since the target height was drawn [], s."""
     target_range: tuple[jax.Array, jax.Array] | None
-    """Range of the later target heights, m; None where the target stays."""
+    """Range of later target heights, m; None if the target does not change."""
     actuation: Actuation | None
     sensing: Sensing | None
 
@@ -84,12 +84,12 @@ class BounceState(NamedTuple):
     parameters: PhysicsParameters = PhysicsParameters()
     """The physics of this environment; drawn at its reset."""
     world: World = {}
-    """The terms of the randomisation that are on, as drawn at the reset."""
+    """The values that the reset drew for the active randomisation terms."""
     memory: Memory | None = None
 
 
 class BounceBall:
-    """One environment, unbatched and pure: use `jax.vmap` and `jax.jit` on `reset` and `step`.
+    """One environment, unbatched and pure: apply `jax.vmap` and `jax.jit` to `reset` and `step`.
 
     It has the interface of brax's `Env` by structure. `done` is 1 where the episode terminated;
     the time limit belongs to the training wrapper.
@@ -103,8 +103,8 @@ class BounceBall:
         """Compiles the model and chooses the physics engine.
 
         Args:
-          randomize: a key -> the world of one episode, drawn at each reset; None for the model's
-            own world.
+          randomize: key -> the physics parameters of one episode, drawn at each reset; None for the
+            model's own parameters.
 
         Raises:
           UserError: the MJCF file or the engine does not fit the task.
@@ -144,7 +144,7 @@ class BounceBall:
 
     @property
     def sys(self) -> None:
-        """brax's system, which its domain randomisation edits; there is none here.
+        """brax's system, which brax's domain randomisation edits; this environment has none.
 
         Raises:
           UserError: always.
@@ -156,12 +156,12 @@ class BounceBall:
 
     @property
     def warmup_steps(self) -> int:
-        """Environment steps of a training over which `ranges` grow."""
+        """Environment steps of a training over which the ranges grow (`ranges`)."""
         return self.config.randomization.warmup_steps
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the randomisation; `progress` [] is the share of the warm-up that is
-        over."""
+        """The ranges of the randomisation; `progress` [] is the share of the warm-up that has
+        passed."""
         return self.config.randomization.ranges(progress)
 
     def reset(
@@ -170,10 +170,10 @@ class BounceBall:
         """Starts an episode.
 
         Args:
-          rng: consumed.
-          ranges: other ranges of the terms that are on, within the config's; the default. The
-            memories of late actions and pictures are as long as the config's ranges need.
-          share: other probability of each term to be drawn; the config's by default.
+          rng: key; consumed.
+          ranges: ranges for the active terms, within the config's ranges, which are the default.
+            The queues of late actions and pictures are only as long as the config's ranges need.
+          share: probability that each term is drawn; by default, the config's.
         """
         check_unedited(self.mj_model, self._fingerprint)
         config, addresses = self.config, self._addresses
@@ -190,7 +190,8 @@ class BounceBall:
             parameters = PhysicsParameters(
                 *(b if a is None else a for a, b in zip(given, parameters, strict=True))
             )
-        # One draw for all: the keys of separate draws would cost more than the numbers.
+        # One draw for all numbers: splitting keys for separate draws would cost more than the
+        # draws.
         draws = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
         dtype = draws.dtype
         zero = jnp.zeros((), dtype)
@@ -260,7 +261,7 @@ class BounceBall:
         world, memory = before.world, before.memory
         if memory is None:
             return state, Control(self.servo_targets(before.physics, action))
-        # The same noise as in the observation that the action answers.
+        # The same noise as in the observation from which the policy chose the action.
         error = sensing.joint_angle_noise(world, memory.counter, action.dtype)
         targets = self.servo_targets(before.physics, action, error)
         control, queue = actuation.delayed(
@@ -287,7 +288,7 @@ class BounceBall:
     def _next_target(
         self, world: World, task: TaskState, memory: Memory
     ) -> tuple[TaskState, Memory]:
-        """Draws another target height where its interval is over."""
+        """Draws a new target height if its interval has passed."""
         now = actuation.passes(
             world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
         )
@@ -305,12 +306,13 @@ class BounceBall:
         scaled action (rad), clipped to the range of each joint that has one, times the gear.
 
         Args:
-          error: of the measured angles [6], rad; without that of an encoder's zero, which the
-            servo shares.
+          error: error of the measured angles [6], rad, without the offset of the encoders' zeros,
+            which the servo shares.
         """
         model, addresses = self.mj_model, self._addresses
         targets = [jnp.zeros_like(action[0])] * model.nu
-        # One scalar a joint, which XLA fuses with the physics; an indexed update would not be.
+        # One scalar per joint, which XLA fuses with the physics; it would not fuse an indexed
+        # update.
         for i, actuator in enumerate(addresses.actuators):
             angle = physics.qpos[addresses.arm_qpos[i]]
             if error is not None:
@@ -324,7 +326,8 @@ class BounceBall:
         return jnp.stack(targets)
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
-        """The task's part of a step: bounces, reward, end and observation.
+        """The task's part of a step after the physics: bounces, reward, termination and
+        observation.
 
         A non-finite physics state ends the episode and is replaced by the previous one, so that
         nothing non-finite leaves the environment.
@@ -339,7 +342,7 @@ class BounceBall:
         finite = jnp.array(True)
         for coordinates in jax.tree.leaves(physics):
             finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
-        # The previous state is checked too, in case the memory was damaged.
+        # The previous state is checked too, in case memory was corrupted.
         physics = jax.tree.map(
             lambda new, old: jnp.where(
                 finite, new, jnp.where(jnp.abs(old) < _MAX_COORDINATE, old, 0.0)
@@ -395,7 +398,7 @@ class BounceBall:
             obs=self.observe(after, kinematics),
             reward=sum(terms.values()),
             done=ended.astype(dtype),
-            # Wrappers add metrics of their own, which a step must keep.
+            # Wrappers add their own metrics, which a step must keep.
             metrics=state.metrics | metrics | self._privileged(before.world, kinematics),
         )
 
@@ -416,7 +419,7 @@ class BounceBall:
         """The observation [observation_size] of a state, laid out as `layout`.
 
         Args:
-          truth: `kinematics(state)`, if it is at hand.
+          truth: `kinematics(state)`, if it has already been computed.
         """
         target_height = state.task.target_height[None]
         if state.memory is None or state.memory.sensing is None:
@@ -435,7 +438,7 @@ class BounceBall:
 
     def _first_memory(self, state: BounceState, truth: Kinematics, rng: jax.Array) -> Memory:
         config, dtype = self.config, truth.ball_position.dtype
-        counter = jax.lax.bitcast_convert_type(jax.random.bits(rng), jnp.int32)
+        counter = jax.lax.bitcast_convert_type(jax.random.bits(rng, dtype=jnp.uint32), jnp.int32)
         return Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),
@@ -507,12 +510,14 @@ class BounceBall:
         """Whether the measured paddle position differs from the true one, and matters."""
         observation = self.config.observation
         wrong = {"encoder_bias", "joint_angle_noise", "paddle_offset", "paddle_tilt"}
-        matters = observation.paddle_position or any(getattr(observation, q) for q in OF_BOUNCES)
+        matters = observation.paddle_position or any(
+            getattr(observation, q) for q in BOUNCE_QUANTITIES
+        )
         return bool(matters and wrong & set(self.config.randomization.terms))
 
     def _privileged(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
-        """Numbers that only a critic may see: `world/<term>` and, where the sensors differ from the
-        truth, `true/<quantity>`; with an index for each entry of an array."""
+        """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
+        the truth, `true/<quantity>`. Each entry of an array has its own name with an index."""
         named = {f"world/{name}": value for name, value in world.items()}
         if self._needs_sensing:
             hidden = ("joint_angles", "ball_position", "joint_velocities", "ball_velocity")

@@ -1,13 +1,15 @@
 """Random numbers within a control step, from a counter in the state.
 
-`step` of an environment takes no key, and a GPU kernel has no generator of JAX; a few integer
-operations make numbers that are random enough for sensor noise.
+An environment's `step` takes no key, and JAX's generators are not available in a GPU kernel. A few
+integer operations give numbers that are random enough for sensor noise.
 """
 
 import math
 
 import jax
 import jax.numpy as jnp
+
+from bounce_mjx.physics.fused.scalars import sine_cosine
 
 
 def next_counter(counter: jax.Array) -> jax.Array:
@@ -17,7 +19,8 @@ def next_counter(counter: jax.Array) -> jax.Array:
 
 
 def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Numbers in (0, 1) of the given shape; each stream of a counter has its own."""
+    """Uniform numbers in (0, 1) of the given shape; each stream of a counter has its own
+    numbers."""
     size = math.prod(shape)
     index = jnp.arange(size, dtype=jnp.int32) + jnp.int32(stream * 1024)
     bits = _mixed(counter + _mixed(index))
@@ -26,17 +29,19 @@ def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.
 
 
 def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Normal numbers of mean 0 and variance 1 (Box and Muller 1958)."""
+    """Normally distributed numbers with mean 0 and variance 1 (Box and Muller 1958)."""
     size = math.prod(shape)
     pairs = (size + 1) // 2
     numbers = uniform(counter, stream, (2, pairs), dtype)
-    radius, angle = jnp.sqrt(-2.0 * jnp.log(numbers[0])), 2.0 * math.pi * numbers[1]
-    both = jnp.concatenate([radius * jnp.cos(angle), radius * jnp.sin(angle)])
+    radius = jnp.sqrt(-2.0 * jnp.log(numbers[0]))
+    sine, cosine = sine_cosine(2.0 * math.pi * numbers[1])
+    both = jnp.concatenate([radius * cosine, radius * sine])
     return both[:size].reshape(shape)
 
 
 def _mixed(x: jax.Array) -> jax.Array:
-    """A bijection of int32 whose bits all depend on all (lowbias32 of Wellons, hash-prospector)."""
+    """A bijection of int32 in which every output bit depends on every input bit (lowbias32 of
+    Wellons, hash-prospector)."""
     shift = lambda x, n: jax.lax.shift_right_logical(x, jnp.int32(n))  # noqa: E731
     x = (x ^ shift(x, 16)) * jnp.int32(0x7FEB352D)
     x = (x ^ shift(x, 15)) * jnp.int32(0x846CA68B - 2**32)

@@ -40,10 +40,10 @@ QUANTITIES = (
     Part("bounce_joint_angles", 6, "rad"),
     Part("bounce_joint_velocities", 6, "rad/s"),
 )
-"""The quantities that an observation may hold, in its order, and the size of one value of each."""
+"""The quantities that an observation may contain, in order, and the size of one value of each."""
 
-OF_BOUNCES = frozenset(part.name for part in QUANTITIES[10:])
-"""Quantities that have a value for each bounce in place of each control step."""
+BOUNCE_QUANTITIES = frozenset(part.name for part in QUANTITIES[10:])
+"""Quantities that have one value per bounce instead of one per control step."""
 
 
 class ObservationConfig(StrictModel):
@@ -82,7 +82,7 @@ class ObservationConfig(StrictModel):
     bounce_joint_velocities: History = 0
     """Measured joint velocities at the lowest points of the last bounces."""
     velocity: Literal["measured", "differences"] = "measured"
-    """Source of ball_velocity: a sensor, or differences of the pictures."""
+    """Source of ball_velocity: a sensor, or the differences between pictures."""
 
     @functools.cached_property
     def layout(self) -> "ObservationLayout":
@@ -92,7 +92,7 @@ class ObservationConfig(StrictModel):
 
     @property
     def is_momentary(self) -> bool:
-        """Whether one instant's true state gives the whole observation."""
+        """Whether the true state of one instant determines the whole observation."""
         past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
         remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
         return not past and not remembered and self.velocity == "measured"
@@ -123,7 +123,7 @@ class ObservationLayout:
 
     def pack(self, values: dict[str, jax.Array]) -> jax.Array:
         """The observation [size] from the value of every part, [part.size]."""
-        # One scalar an entry, which XLA fuses with the physics; whole arrays would be copied.
+        # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
         return jnp.stack([values[part.name][i] for part in self.parts for i in range(part.size)])
 
 
@@ -136,16 +136,16 @@ class Kinematics(NamedTuple):
     may have."""
 
     joint_angles: jax.Array
-    """Of Joint1..Joint6 [6], rad."""
+    """Angles of Joint1..Joint6 [6], rad."""
     ball_position: jax.Array
     """World position of the centre [3], m."""
     ball_quaternion: jax.Array
     """Orientation [4] in the order w, x, y, z."""
     joint_velocities: jax.Array
-    """Of Joint1..Joint6 [6], rad/s."""
+    """Velocities of Joint1..Joint6 [6], rad/s."""
     ball_velocity: jax.Array
     """World velocity [3], m/s."""
     ball_angular_velocity: jax.Array
-    """In the ball's frame [3], rad/s."""
+    """Angular velocity in the ball's frame [3], rad/s."""
     paddle_position: jax.Array
     """World position of the centre [3], m."""

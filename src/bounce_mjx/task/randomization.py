@@ -1,7 +1,7 @@
 """Domain randomisation: the world that each episode draws.
 
-A term is one key of the config with a range (low, high), from which a reset draws every entry of
-the term uniformly. A term that is null is off and costs nothing.
+A term is a key of the config with a range (low, high), from which a reset draws every entry of the
+term uniformly. A term that is null is inactive and costs nothing.
 """
 
 from typing import Annotated, NamedTuple
@@ -20,10 +20,11 @@ from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
 Range = tuple[Finite, Finite]
 
 World = dict[str, jax.Array]
-"""The numbers that an episode drew, by the names of the terms that are on."""
+"""The values that an episode drew, by the names of the active terms."""
 
 Ranges = dict[str, tuple[jax.Array, jax.Array]]
-"""Lower and upper ends of the terms that are on, each a number [] or of the term's shape."""
+"""Lower and upper ends of the active terms' ranges, each a number [] or an array of the term's
+shape."""
 
 
 class Term(NamedTuple):
@@ -32,9 +33,10 @@ class Term(NamedTuple):
     shape: tuple[int, ...]
     """Shape of one episode's draw."""
     nominal: float | None
-    """Value without randomisation, from which the range grows; None for a range that does not."""
+    """Value without randomisation, from which the range grows; None for a range that does not
+    grow."""
     limits: tuple[float, float]
-    """Least and greatest sensible value."""
+    """Smallest and largest sensible value."""
 
 
 _J = (len(JOINT_NAMES),)
@@ -91,8 +93,8 @@ class RandomizationConfig(StrictModel):
     ball_radius: Range | None = None
     """Factor of the ball's radius."""
     air_drag: Range | None = None
-    """Deceleration of the ball by the air over its squared speed, 1/m; a table-tennis ball's is
-    about 0.11."""
+    """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
+    table-tennis ball."""
     contact_friction: Range | None = None
     """Coefficient of sliding friction between ball and paddle."""
     servo_gain: Range | None = None
@@ -122,8 +124,8 @@ class RandomizationConfig(StrictModel):
     ball_latency: Range | None = None
     """Time from a picture of the ball to its use, s."""
     camera_rate: Range | None = None
-    """Pictures of the ball per second, Hz; the last picture holds until the next. Off: a picture at
-    every control step."""
+    """Pictures of the ball per second, Hz; each picture is used until the next one arrives. Without
+    a rate there is a picture at every control step."""
     frame_drop: Range | None = None
     """Probability that a picture is lost."""
     ball_position_noise: Range | None = None
@@ -147,7 +149,7 @@ class RandomizationConfig(StrictModel):
     push_interval: Range | None = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
     target_height: Range | None = None
-    """Target height, m; in the place of target_height_range."""
+    """Target height, m; replaces target_height_range."""
     target_interval: Range | None = None
     """Time between two draws of the target height within an episode, s."""
     ball_start: Range | None = None
@@ -155,8 +157,9 @@ class RandomizationConfig(StrictModel):
     joint_start: Range | None = None
     """Displacement of each joint angle at a reset, rad."""
     share: UnitInterval = 1.0
-    """Probability that a term with a nominal value is drawn in an episode; else it is nominal. A
-    small share trains for wide ranges of single terms whose extremes together no policy masters."""
+    """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
+    value. A small share allows wide ranges of single terms, even if no policy can handle all their
+    extremes together."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps of the training over which the ranges grow from the nominal values."""
 
@@ -174,14 +177,14 @@ class RandomizationConfig(StrictModel):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Names of the terms that are on."""
+        """Names of the active terms."""
         return tuple(name for name in TERMS if getattr(self, name) is not None)
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the terms that are on.
+        """The ranges of the active terms.
 
         Args:
-          progress: share of the warm-up that is over [], from 0 to 1.
+          progress: share of the warm-up that has passed [], from 0 to 1.
         """
 
         def grown(name: str, end: float) -> jax.Array:
@@ -198,11 +201,11 @@ def draw_world(
     """The world of one episode; consumes the key.
 
     Args:
-      share: probability of each term with a nominal value to be drawn [].
+      share: probability [] that each term with a nominal value is drawn.
     """
-    # In one order, though a traced dictionary has its keys sorted.
+    # A fixed order: JAX sorts the keys of a traced dictionary.
     sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
-    # One draw for all: the keys of separate draws would cost more than the numbers.
+    # One draw for all numbers: splitting keys for separate draws would cost more than the draws.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
@@ -267,7 +270,8 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     return PhysicsParameters(**given)
 
 
-# Damping ratio of the contact, and the restitution of drops at 1 to 4 m/s on the level paddle.
+# Damping ratios of the contact, and the measured restitution of drops at 1 to 4 m/s on the level
+# paddle.
 _DAMPING_RATIO = (0.0, 0.005, 0.01, 0.0152, 0.032, 0.05, 0.0697, 0.0921, 0.116, 0.13, 0.16, 0.2)
 _RESTITUTION = (0.993, 0.98, 0.965, 0.95, 0.90, 0.85, 0.80, 0.75, 0.70, 0.674, 0.622, 0.565)
 

@@ -1,4 +1,4 @@
-"""The reward terms of the original specification, in its order and with its symbols.
+"""The reward terms of the original specification, in the same order and with the same symbols.
 
 A term is a config class with the weight and the constants, and below it the formula, which
 `@term` registers under its name. A new term needs nothing else: the config, the metrics
@@ -17,7 +17,7 @@ from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictMode
 
 
 class RewardInputs(NamedTuple):
-    """The state of one environment after a control step, as far as the reward depends on it."""
+    """The part of an environment's state after a control step on which the reward depends."""
 
     ball_position: jax.Array
     """World position [3], m."""
@@ -45,7 +45,7 @@ class Geometry(NamedTuple):
     err_xy: jax.Array
     """Horizontal distance of the ball from the target point, m."""
     d_vert: jax.Array
-    """Vertical distance ball-paddle, m."""
+    """Vertical distance between ball and paddle, m."""
     delta_h: jax.Array
     """Target height minus ball height, m."""
     vz: jax.Array
@@ -86,29 +86,31 @@ def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:
 def safe_sqrt(x: jax.Array) -> jax.Array:
     """Square root of max(0, x), whose derivative is 0 for x <= 0.
 
-    The derivative of `jnp.sqrt` is infinite at 0. Times the zero of an untaken branch, it would
-    make the whole gradient NaN.
+    The derivative of `jnp.sqrt` is infinite at 0. Multiplied by the zero of a branch that is not
+    taken, it would make the whole gradient NaN.
     """
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def horizontal_distance(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Distance [] of two points [2 or 3] in x and y; its derivative is 0 where they coincide."""
+    """Distance [] between two points [2 or 3] in x and y; its derivative is 0 where they
+    coincide."""
     return safe_sqrt(jnp.square(a[0] - b[0]) + jnp.square(a[1] - b[1]))
 
 
 class PositionReward(StrictModel):
-    """Horizontal position: stay above the target point, most of all when the ball is near."""
+    """Horizontal position: keep the ball above the target point, especially when it is near the
+    paddle."""
 
     weight: Finite = 2.0
     """Weight of the term."""
     vertical_scale: Positive = 0.15
-    """Decay of the proximity weight with the vertical distance ball-paddle, m."""
+    """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
     base_scale: Positive = 0.1
     """Width of the Gaussian far from the paddle, m."""
     proximity_gain: NonNegative = 3.0
-    """How much wider the Gaussian is at the paddle, as a factor."""
+    """Factor by which the Gaussian is wider at the paddle."""
 
 
 @term(PositionReward)
@@ -145,7 +147,7 @@ class VelocityMatchingReward(StrictModel):
     desired_velocity: Finite = 0.5
     """Vertical velocity wanted at the target height, m/s."""
     near_distance: Positive = 0.05
-    """Height error under which the current velocity counts, m."""
+    """Height error below which the current velocity is used, m."""
     rising_scale: Positive = 0.2
     """Width of the sigmoid between falling and rising, m/s."""
     below_scale: Positive = 0.02
@@ -160,7 +162,7 @@ class VelocityMatchingReward(StrictModel):
 def velocity_matching(
     config: VelocityMatchingReward, inputs: RewardInputs, geometry: Geometry
 ) -> jax.Array:
-    """The velocity of each case is 0 where the case's condition does not hold."""
+    """The velocity of a case is 0 where the condition of that case does not hold."""
     vz, delta_h = geometry.vz, geometry.delta_h
     rising_below = (vz > 0.0) & (delta_h > 0.0)
     squared_up = jnp.square(vz) - 2.0 * geometry.gravity * delta_h
@@ -192,7 +194,7 @@ def height(config: HeightReward, inputs: RewardInputs, geometry: Geometry) -> ja
 
 
 class HeightProgressReward(StrictModel):
-    """Height progress: be high at all, so that hitting is found early."""
+    """Height progress: get the ball high at all, so that the policy discovers hitting early."""
 
     weight: Finite = 1.0
     """Weight of the term."""
@@ -225,7 +227,7 @@ class ControlledUpwardReward(StrictModel):
     rising_scale: Positive = 0.1
     """Width of the sigmoid between falling and rising, m/s."""
     velocity_limit: Positive = 1.5
-    """Upward velocity above which the term grows no more, m/s."""
+    """Upward velocity above which the term no longer grows, m/s."""
 
 
 @term(ControlledUpwardReward)
@@ -287,14 +289,14 @@ def high_bounce_count(
 
 
 class AlignmentReward(StrictModel):
-    """Alignment: keep the paddle under the ball, most of all at the hit."""
+    """Alignment: keep the paddle under the ball, especially when it hits the ball."""
 
     weight: Finite = 0.6
     """Weight of the term."""
     vertical_scale: Positive = 0.1
-    """Decay of the proximity weight with the vertical distance ball-paddle, m."""
+    """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
     scale: Positive = 0.03
-    """Width of the Gaussian of the horizontal distance ball-paddle, m."""
+    """Width of the Gaussian of the horizontal distance between ball and paddle, m."""
     proximity_gain: NonNegative = 2.0
     """Factor of the proximity weight."""
     bounce_boost: NonNegative = 3.0
@@ -321,7 +323,7 @@ class PaddleHomeReward(StrictModel):
     distance_gain: NonNegative = 0.5
     """Extra reward while the ball is far."""
     distance_threshold: Finite = 0.15
-    """Vertical distance ball-paddle at half the extra reward, m."""
+    """Vertical distance between ball and paddle at half the extra reward, m."""
     distance_scale: Positive = 0.03
     """Width of the sigmoid, m."""
 
@@ -353,8 +355,8 @@ def excessive_upward(
 
 
 class DownwardVelocityReward(StrictModel):
-    """Downward velocity: positive for a falling ball, as the specification's formula stands, though
-    its text calls the term a penalty; a negative weight makes it one."""
+    """Downward velocity: positive for a falling ball, according to the specification's formula. The
+    specification's text calls the term a penalty; a negative weight makes it one."""
 
     weight: Finite = 1.0
     """Weight of the term; its sign chooses between the specification's formula and its text."""
@@ -421,7 +423,7 @@ def joint_velocity(
 
 
 class SharedRewardConfig(StrictModel):
-    """The reward terms: each a weight and the constants of its formula."""
+    """The reward terms: each has a weight and the constants of its formula."""
 
     target_x: Finite = 0.58856
     """Target point of the ball, x, m."""

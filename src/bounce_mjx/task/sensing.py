@@ -1,4 +1,5 @@
-"""From the true state to the measured quantities: a late camera, noisy sensors, and their past."""
+"""From the true state to the measured quantities: a camera with latency, noisy sensors, and their
+history."""
 
 import math
 from typing import NamedTuple
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.task import noise
 from bounce_mjx.task.actuation import taken
-from bounce_mjx.task.observation import OF_BOUNCES, QUANTITIES, Kinematics, ObservationConfig
+from bounce_mjx.task.observation import BOUNCE_QUANTITIES, QUANTITIES, Kinematics, ObservationConfig
 from bounce_mjx.task.randomization import RandomizationConfig, World
 
 _BALL_STREAM, _JOINT_STREAM, _DROP_STREAM = 0, 1, 2
@@ -22,7 +23,7 @@ SENSOR_TERMS = frozenset(
 
 
 class Picture(NamedTuple):
-    """The last picture of the ball that has arrived."""
+    """The last picture of the ball that has arrived, and was not lost."""
 
     position: jax.Array
     """Measured position [3], m."""
@@ -31,7 +32,7 @@ class Picture(NamedTuple):
     age: jax.Array
     """Time since it was taken [], s."""
     number: jax.Array
-    """Number of pictures since the reset []; negative before the first."""
+    """Number of the last picture since the reset that was due []; negative before the first."""
 
 
 class Sensing(NamedTuple):
@@ -64,7 +65,7 @@ def start_sensing(
     truth: Kinematics,
     target_height: jax.Array,
 ) -> Sensing:
-    """The memory at a reset: the past is as the present, and all is as it is."""
+    """The memory at a reset: the history repeats the present state, measured without error."""
     dtype = truth.ball_position.dtype
     latest = (randomization.ball_latency or (0.0, 0.0))[1]
     if randomization.camera_rate is not None:
@@ -98,7 +99,7 @@ def start_sensing(
 
 
 def joint_angle_noise(world: World, counter: jax.Array, dtype: jnp.dtype) -> jax.Array | None:
-    """Noise [6] of the measured joint angles of a control step, rad; None without any."""
+    """Noise [6] of the measured joint angles of a control step, rad; None if there is no noise."""
     if "joint_angle_noise" not in world:
         return None
     return world["joint_angle_noise"] * noise.normal(counter, _JOINT_STREAM, (12,), dtype)[:6]
@@ -115,12 +116,13 @@ def take_picture(
 ) -> Picture:
     """The last picture that has arrived at a control step.
 
-    A camera takes pictures at its rate, in no relation to the control steps; between them the ball
-    moves straight. Each arrives after the latency, or not at all.
+    A camera takes pictures at its own rate, independent of the control steps; between two control
+    steps the ball is assumed to move in a straight line. Each picture arrives after the latency, or
+    not at all.
 
     Args:
-      sensing: with the ball of this control step.
-      phase: share of a picture interval that was over at the reset [].
+      sensing: the memory, including the ball of this control step.
+      phase: share of a picture interval that had passed at the reset [].
       step: control steps since the reset [].
     """
     dtype, last = sensing.balls.dtype, sensing.picture
@@ -128,7 +130,8 @@ def take_picture(
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
         interval = 1.0 / (world["camera_rate"] * control_dt)
-        # A picture that is due at this very instant has arrived, whatever the rounding.
+        # The 1e-4 ensures that a picture that is due at exactly this instant counts as arrived,
+        # despite rounding.
         number = jnp.floor((steps - latency) / interval - phase + 1e-4)
         age = steps - (number + phase) * interval
     else:
@@ -141,17 +144,19 @@ def take_picture(
     noises = noise.normal(counter, _BALL_STREAM, (6,), dtype)
     position, velocity = ball[:3], ball[3:]
     position = _disturbed(world, "ball_position", position, noises[:3])
-    arrived = number > last.number
+    due = number > last.number
+    arrived = due
     if "frame_drop" in world:
         lost = noise.uniform(counter, _DROP_STREAM, (), dtype) < world["frame_drop"]
-        arrived &= ~lost
+        arrived = due & ~lost
     held_age = last.age + control_dt
     if observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
         velocity = (position - last.position) / elapsed
     velocity = _disturbed(world, "ball_velocity", velocity, noises[3:])
     fresh = Picture(position, velocity, age * control_dt, number)
-    held = last._replace(age=held_age)
+    # A lost picture is not looked for again.
+    held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
     return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
 
 
@@ -187,11 +192,11 @@ def remember(
 ) -> Sensing:
     """The memory with the measurements of a control step.
 
-    A bounce starts when the ball is first measured near the paddle, and its values are those of the
-    ball's lowest measured point.
+    A bounce starts when the ball is first measured near the paddle. The values of a bounce are
+    taken at the ball's lowest measured point.
 
     Args:
-      measured: a value [size] of each quantity but those of bounces.
+      measured: a value [size] of each quantity except the quantities of bounces.
       near_height: height below which the ball counts as near the paddle [], m.
     """
     height = picture.position[2]
@@ -199,21 +204,21 @@ def remember(
     starts = is_low & ~sensing.is_low
     at_lowest = starts | (is_low & (height < sensing.lowest))
     flight_time = sensing.flight_time + control_dt
-    of_flight = {
+    flight_values = {
         "apex_error": (sensing.flight_apex - target_height)[None],
         "bounce_interval": flight_time[None],
     }
-    of_lowest = {
+    lowest_values = {
         "bounce_position": picture.position[:2],
         "bounce_joint_angles": measured["joint_angles"],
         "bounce_joint_velocities": measured["joint_velocities"],
     }
     seen = {}
     for name, past in sensing.seen.items():
-        if name in OF_BOUNCES:
-            newest = of_flight[name] if name in of_flight else of_lowest[name]
+        if name in BOUNCE_QUANTITIES:
+            newest = flight_values[name] if name in flight_values else lowest_values[name]
             shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
-            changes = starts if name in of_flight else at_lowest
+            changes = starts if name in flight_values else at_lowest
             newest = jnp.where(changes, newest, shifted[0])
             seen[name] = jnp.concatenate([newest[None], shifted[1:]])
         else:

@@ -1,4 +1,4 @@
-"""The state of one environment and the interface of an environment: brax's, by structure."""
+"""The state and the interface of one environment; both match brax's by structure."""
 
 import dataclasses
 from typing import Any, Protocol
@@ -22,7 +22,7 @@ class State:
     metrics: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Named numbers of the last step, each []."""
     info: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Data of wrappers, which the environment hands on unchanged."""
+    """Data of wrappers, which the environment passes on unchanged."""
 
     def replace(self, **changes: Any) -> "State":
         """A copy with other values of the named fields."""

@@ -31,12 +31,13 @@ class StepResult(NamedTuple):
     """Result of one step of B environments."""
 
     observation: jax.Array
-    """Observation for the next action [B, N]; after an end, the first of the new episode."""
+    """Observation for the next action [B, N]; after the end of an episode, the first observation of
+    the new one."""
     final_observation: jax.Array
-    """Observation after the step, before any reset [B, N]; at an end, the last of the old
-    episode."""
+    """Observation after the step, before any reset [B, N]; at the end of an episode, its last
+    observation."""
     reward: jax.Array
-    """[B]."""
+    """Reward of the step [B]."""
     terminated: jax.Array
     """Whether the task ended the episode [B], bool."""
     truncated: jax.Array
@@ -64,7 +65,7 @@ def first_states(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) ->
     """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`.
 
     Args:
-      ranges: of the environment's randomisation; None for its own.
+      ranges: ranges of the randomisation; None for the environment's own.
     """
     given = () if ranges is None else (ranges,)
     return jax.vmap(lambda key: env.reset(key, *given), out_axes=-1)(
@@ -80,12 +81,12 @@ def observe(state: VectorState) -> jax.Array:
 def step(
     env: Env, state: VectorState, action: jax.Array, key: jax.Array, episode_steps: int
 ) -> tuple[VectorState, StepResult]:
-    """Advances every environment and resets each ended one with a new draw.
+    """Advances every environment, and resets every ended episode with a new draw.
 
     Args:
       action: [B, A].
       key: consumed by the resets.
-      episode_steps: length of an episode at its time limit.
+      episode_steps: time limit of an episode in steps.
     """
     fresh = first_states(env, key, state.clock.shape[0])
     return step_with(env, state, action, fresh, episode_steps)
@@ -94,12 +95,13 @@ def step(
 def step_with(
     env: Env, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
 ) -> tuple[VectorState, StepResult]:
-    """`step` with resets drawn beforehand; on a GPU, one draw for many steps costs less.
+    """`step` with initial states that were drawn in advance; on a GPU, one draw for many steps
+    costs less.
 
     Args:
-      fresh: `first_states` that replace the states of ended episodes.
+      fresh: result of `first_states`, which replaces the states of ended episodes.
     """
-    # All of it in one function of one environment, which on a GPU becomes one kernel.
+    # The whole step is one function of one environment, so that it becomes one kernel on a GPU.
     step_one = in_one_kernel(functools.partial(_step_one, env, episode_steps))
     state, result = jax.vmap(step_one, in_axes=-1, out_axes=-1)(state, action.T, fresh)
     return state, result._replace(

@@ -1,4 +1,4 @@
-"""The common part of the commands that train: flags, start, results."""
+"""Shared by the commands that train: their flags, the start of the job, and the printed results."""
 
 import importlib
 import shlex
@@ -28,17 +28,17 @@ from bounce_mjx.training.trainer import Trainer
 
 
 class TrainingCommand(TrainConfig):
-    """The command line: the config's keys as flags, and where to start from."""
+    """The command line: the config's keys as flags, and the preset or run to start from."""
 
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
-    """Preset: a YAML file such as configs/seed.yaml. By default configs/default.yaml where there is
-    an accelerator, else configs/cpu.yaml."""
+    """Preset: a YAML file such as configs/seed.yaml. The default is configs/default.yaml on an
+    accelerator, and configs/cpu.yaml on a CPU."""
     resume: Path | None = None
-    """Folder of a run to go on with, in place, from its latest checkpoint. The other flags may then
+    """Folder of a run to continue, in place, from its latest checkpoint. The other flags may then
     change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
-    stop-when-solved, num-devices and log-dir, and mjcf where that file has moved."""
+    stop-when-solved, num-devices and log-dir, and mjcf if that file has moved."""
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
 
@@ -55,8 +55,8 @@ def read_command(
       defaults: defaults of flags that are not part of the config.
 
     Raises:
-      UserError: a flag or the preset is wrong, or the flags change a key of the resumed run that
-        cannot change.
+      UserError: a flag or the preset is wrong, or a flag changes a key of the resumed run that must
+        stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
     if config_path and resume:
@@ -84,7 +84,7 @@ def run_command(
     make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
     prog: str,
 ) -> None:
-    """Trains as the command says, and prints the results.
+    """Trains according to the command, and prints the results.
 
     Raises:
       UserError: see `train`.
@@ -101,7 +101,7 @@ def run_command(
         )
     except TrainingStopped as stopped:
         say(console, str(stopped))
-        # Without waiting for a compilation or an evaluation in another thread.
+        # Does not wait for a compilation or an evaluation in another thread.
         leave(0)
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
@@ -124,7 +124,7 @@ def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
 
 
 def leave_report(outcome: Outcome, console: Console) -> None:
-    """Draws the report. The training is safe by now, so a failure is one line."""
+    """Draws the report. The training is already saved, so a failure only prints one line."""
     started = time.perf_counter()
     try:
         report_module = importlib.import_module(REPORT_MODULE)
@@ -138,19 +138,20 @@ def leave_report(outcome: Outcome, console: Console) -> None:
 
 
 def config_of(command: TrainingCommand) -> TrainConfig:
-    """The run's part of a command line."""
+    """The run's config within a command line."""
     return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
 
 
 def path_flag(args: Sequence[str], flag: str) -> Path | None:
-    """The path that a flag gives, before the other flags are read."""
+    """The path in a flag that must be read before the others."""
     word = early_flag(args, flag)
     return None if word is None else Path(word)
 
 
 def early_flag(args: Sequence[str], flag: str) -> str | None:
-    """The value of a flag that must be read before the others, in every spelling of the parser:
-    with - or _ in the name, and with = or a space before the value. The last one counts."""
+    """The value of a flag that must be read before the others, in every spelling that the parser
+    accepts: with - or _ in the name, and with = or a space before the value. If the flag is
+    repeated, the last value counts."""
     value = None
     for i, word in enumerate(args):
         name, equals, given = word.partition("=")

@@ -17,7 +17,8 @@ if typing.TYPE_CHECKING:
 
 
 class Reporter:
-    """Shows a progress bar on a terminal or else a line per block, and logs to TensorBoard."""
+    """Shows a progress bar on a terminal, or a line per block elsewhere, and logs to
+    TensorBoard."""
 
     def __init__(
         self,
@@ -28,7 +29,7 @@ class Reporter:
     ):
         """
         Args:
-          logs: one per seed; none in a process that writes nothing.
+          logs: one log per seed; none in a process that writes nothing.
         """
         self._console = console
         self._logs = logs
@@ -68,11 +69,11 @@ class Reporter:
           metrics: each [seeds, iterations]; NaN is ignored.
         """
         means = {name: _finite_mean(values) for name, values in metrics.items()}
-        # A sum: a mean would hide one event in many iterations.
+        # A sum, because a mean would hide a single event in many iterations.
         non_finite = np.nansum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
-        for name, of_seeds in means.items():
-            for log, value in zip(self._logs, of_seeds, strict=False):
+        for name, seed_values in means.items():
+            for log, value in zip(self._logs, seed_values, strict=False):
                 if math.isfinite(value):
                     log.add_scalar(name, float(value), steps)
         for name, last in self._last.items():
@@ -85,7 +86,7 @@ class Reporter:
         )
         self._progress.update(self._task, completed=steps, figures=figures)
         if not self._console.is_terminal:
-            # The last block may go beyond the total.
+            # The last block may exceed the total.
             left = max(0, self._total_steps - steps) * len(non_finite) / rate
             self.say(f"{figures}  {seconds:.1f} s, {left:.0f} s left")
 
@@ -109,7 +110,7 @@ class Reporter:
         problem: str | None,
         meanwhile: str = "the training goes on, and saves at its next evaluation",
     ) -> None:
-        """Prints why the last save failed, and later that saving works again, once each."""
+        """Prints once why saving fails, and once when it works again."""
         sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
         if sentence != self._saving_problem:
             self.say(sentence or "the state is saved again")
@@ -121,8 +122,8 @@ class Reporter:
         """Reports an evaluation.
 
         Args:
-          reports: one per seed.
-          healthy: false for a seed that diverged.
+          reports: one report per seed.
+          healthy: False for a seed that diverged.
         """
         for log, report, sound in zip(self._logs, reports, healthy, strict=False):
             if not sound:
@@ -150,7 +151,7 @@ class Reporter:
 
 
 def say(console: Console, line: str) -> None:
-    """Prints a line as it is: rich would read square brackets in a path as markup."""
+    """Prints a line unchanged: rich would read square brackets in a path as markup."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 

@@ -1,7 +1,8 @@
 """Training on several devices: a mesh that divides the environments or the seeds.
 
-The program is the same on any number of devices: arrays of environments are sharded along their
-batch, all other arrays are replicated, and XLA adds the reductions of gradients and statistics.
+The program is the same on any number of devices: arrays over the environments are sharded along
+their batch axis, all other arrays are replicated, and XLA adds the reductions of gradients and
+statistics.
 """
 
 import jax
@@ -18,7 +19,7 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     """A mesh of the first `num_devices` devices.
 
     Args:
-      num_devices: None for one, and on several hosts for all.
+      num_devices: number of devices; None means one, or all devices if there are several hosts.
 
     Raises:
       UserError: there are fewer devices, or the environments (one seed) or the seeds (several)
@@ -61,7 +62,7 @@ def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> Trai
     seed each device holds some environments and everything else.
 
     Args:
-      state: the state or its shapes; with several seeds, they are the first axis.
+      state: the state or its shapes; with several seeds, the seeds are the first axis.
     """
     if num_seeds > 1:
         return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)

@@ -19,16 +19,17 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
 
-# Added to the seed of the selecting evaluations for the final one; no config can name that sum.
+# Added to the seed of the selecting evaluations to get the seed of the final one, which no config
+# can contain.
 _FINAL = 2**31
 
 
 class Evaluators:
     """The programs that evaluate the S policies of a training, compiled in the background.
 
-    A training selects its best policy by evaluations that all reset alike. The figures of the
-    selected policy are measured once more on fresh resets, as the best of many evaluations on the
-    same resets is too good.
+    A training selects its best policy by evaluations that all use the same resets. The figures of
+    the selected policy are then measured once more on fresh resets, because the best of many
+    evaluations on the same resets is biased upwards.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class Evaluators:
         mesh: Mesh,
         pool: concurrent.futures.Executor,
     ):
-        """Starts to compile."""
+        """Starts the compilation."""
         self._config, self._env = config, env
         axes = mesh.axis_names if config.num_seeds > 1 else ()
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
@@ -56,7 +57,8 @@ class Evaluators:
             program.result()
 
     def select(self, policy: Policy) -> list[Report]:
-        """A report of each policy; of the screening alone if none passes it."""
+        """A report of each policy; if no policy passes the screening, the reports of the
+        screening."""
         if self._screening is not None:
             screened = self._measure(self._screening, policy, self._config.eval_seed)
             if not any(report.passed for report in screened):
@@ -73,10 +75,11 @@ class Evaluators:
         if config.num_seeds == 1:
             evaluate = make_recording_evaluator(env, networks, episodes, RECORDED_EPISODES)
         else:
-            # Without recordings, which a batched loop would copy at every step.
+            # No recordings, because a batched loop would copy them at every step.
             evaluate_all = jax.vmap(make_evaluator(env, networks, episodes), in_axes=(0, None))
             evaluate = lambda policy, key: (evaluate_all(policy, key), None)  # noqa: E731
-        # Keys are made inside the program: outside, each operation takes a tenth of a second.
+        # Keys are made inside the program: outside it, each operation would take a tenth of a
+        # second.
         program = jax.jit(
             lambda policy, seed: evaluate(
                 policy, jax.random.split(jax.random.PRNGKey(seed))[stream]
@@ -103,7 +106,7 @@ class Evaluators:
 
 
 def policy_shapes(config: TrainConfig, env: BounceBall) -> Policy:
-    """Shapes of the policy of a training; of several seeds, with the seeds as the first axis."""
+    """Shapes of a training's policy; with several seeds, the seeds are the first axis."""
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     shapes = jax.eval_shape(
         lambda: Policy(

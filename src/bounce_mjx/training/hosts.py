@@ -1,7 +1,7 @@
-"""Training on several hosts: one process a host (or a device). Process 0 is the leader.
+"""Training on several hosts, with one process per host (or per device). Process 0 is the leader.
 
-Every process runs the same program on its part of the environments. The leader alone decides,
-reads and writes; the others receive its decisions (`exchange`) and send their parts of the state
+Every process runs the same program on its shard of the environments. Only the leader decides, reads
+and writes; the others receive its decisions (`exchange`) and send their shards of the state
 (`gather`).
 """
 
@@ -43,13 +43,13 @@ def join(
     process_id: int | None = None,
     timeout: float = DEFAULT_TIMEOUT,
 ) -> None:
-    """Joins the processes of one training; must come before any other use of JAX.
+    """Joins the processes of one training; it must be called before any other use of JAX.
 
     Without arguments, Slurm, Open MPI or Kubernetes supply them.
 
     Args:
-      timeout: seconds to wait for the other processes, and without a sign of life after which one
-        of them counts as dead.
+      timeout: seconds to wait for the other processes at the start; also the seconds without a sign
+        of life after which a process counts as dead.
 
     Raises:
       UserError: only some of the arguments are given, no launcher supplies the others, or the
@@ -72,7 +72,8 @@ def join(
 
     def initialize() -> None:
         try:
-            # JAX's own time limits end the process with a stack trace: later than ours.
+            # JAX's own time limits end the process with a stack trace, so they must be longer than
+            # ours.
             jax.distributed.initialize(
                 coordinator_address,
                 num_processes,
@@ -84,7 +85,7 @@ def join(
         except Exception as error:  # noqa: BLE001
             joined.set_exception(error)
 
-    # In a thread, as the call cannot be interrupted.
+    # In a thread, because the call cannot be interrupted.
     threading.Thread(target=initialize, daemon=True).start()
     try:
         joined.result(timeout)
@@ -98,20 +99,20 @@ def join(
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"the processes of this training cannot be joined ({reason}); start one process a host "
-            "with --coordinator-address HOST:PORT, --num-processes N and --process-id I"
+            f"the processes of this training cannot be joined ({reason}); start one process per "
+            "host with --coordinator-address HOST:PORT, --num-processes N and --process-id I"
         ) from error
-    # Only JAX knows the address that a launcher supplied.
+    # If a launcher supplied the address, only JAX knows it.
     address = coordinator_address or distributed.global_state.coordinator_address
     _host, _timeout = address.rpartition(":")[0].strip("[]"), timeout
 
 
 def connect(advice: Callable[[], str]) -> None:
-    """Connects the joined processes: from here on the death of one ends the others with a
-    sentence. Nothing happens in a training of one process.
+    """Connects the joined processes: from now on, the death of one ends the others with an error
+    message. In a training of one process this does nothing.
 
     Args:
-      advice: how to go on; the end of that sentence.
+      advice: the end of that message, which says how to continue.
 
     Raises:
       UserError: the processes cannot reach each other.
@@ -142,14 +143,14 @@ def connect(advice: Callable[[], str]) -> None:
 
 
 def disconnect() -> None:
-    """Marks the end of the common work: every process may end as it likes."""
+    """Marks the end of the common work: from now on every process may end at any time."""
     if _peers is not None:
         _peers.close()
 
 
 @contextlib.contextmanager
 def leave_at_once() -> Iterator[None]:
-    """Ends a process of several that fails, without JAX's wait for the others at the exit."""
+    """If one of several processes fails, ends it without JAX's wait for the others at exit."""
     try:
         yield
     except SystemExit as error:
@@ -159,38 +160,39 @@ def leave_at_once() -> Iterator[None]:
     except Exception:
         if _peers is None:
             raise
-        # The death of another process makes JAX's exchange fail here; `Peers` names it.
+        # The death of another process makes JAX's collective fail here; `Peers` reports which one
+        # died.
         time.sleep(3.0)
         traceback.print_exc()
         _exit(1)
 
 
 def is_leader() -> bool:
-    """Whether this process writes the run's folder and talks to the user."""
+    """Whether this process writes the run's folder and prints messages for the user."""
     return jax.process_index() == 0
 
 
 def any_of(flag: bool) -> bool:
-    """Whether the flag is set in any process. Every process must call this at the same point,
-    where it waits for the others as long as that takes."""
+    """Whether the flag is set in any process. Every process must call this at the same point; there
+    it waits for the others without a time limit."""
     return flag if _peers is None else any(_peers.exchange(flag))
 
 
 def text_from_leader(text: str | None) -> str:
-    """The leader's text, in every process; the others pass None."""
+    """Returns the leader's text in every process; the others pass None."""
     return text if _peers is None else _peers.exchange(text)[0]
 
 
 def gather(tree: Tree) -> Tree:
-    """A pytree of arrays that lie on devices of several hosts, as whole numpy arrays in every
-    process."""
+    """A pytree of arrays that are sharded over devices of several hosts, as whole NumPy arrays in
+    every process."""
     if jax.process_count() == 1:
         return jax.tree.map(np.asarray, tree)
     return multihost_utils.process_allgather(tree, tiled=True)
 
 
 def distribute(tree: Tree, shardings: Any) -> Tree:
-    """Whole arrays, the same in every process, as arrays on the devices."""
+    """Arrays that are whole and equal in every process, as arrays on the devices."""
 
     def put(x, sharding: Sharding) -> jax.Array:
         x = np.asarray(x)
@@ -200,12 +202,13 @@ def distribute(tree: Tree, shardings: Any) -> Tree:
 
 
 _native_log: str | None = None
-# A reference, as ctypes keeps none.
+# A reference to the callback, because ctypes keeps none.
 _on_abort = None
 
 
 def _divert_native_output() -> None:
-    """Sends the output of JAX's C++ to a file, and turns its abort into a sentence.
+    """Redirects the output of JAX's C++ code to a file, and turns its abort into a one-sentence
+    message.
 
     When process 0 dies, C++ prints pages and aborts in the same instant in which `Peers` notices.
     """
@@ -218,7 +221,7 @@ def _divert_native_output() -> None:
     atexit.register(_remove, _native_log)
 
     def abort(_: int) -> None:
-        # `Peers` knows more, and ends the process within this time if another one died.
+        # `Peers` has more information, and ends this process within this time if another one died.
         time.sleep(3.0)
         print(
             f"error: JAX aborted this process; {_native_log} has the reason",
@@ -228,7 +231,7 @@ def _divert_native_output() -> None:
         os._exit(1)
 
     _on_abort = ctypes.CFUNCTYPE(None, ctypes.c_int)(abort)
-    # Not by the module signal, whose handlers run in the main thread alone.
+    # Not with the module `signal`, whose handlers run only in the main thread.
     libc = ctypes.CDLL(None)
     libc.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
     libc.signal(signal.SIGABRT, ctypes.cast(_on_abort, ctypes.c_void_p))

@@ -1,4 +1,4 @@
-"""The job: trains until it is done or stopped, and evaluates and saves meanwhile.
+"""The training job: trains until it is finished or stopped, and evaluates and saves in between.
 
 It is the same for every algorithm (`trainer.Trainer`).
 """
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
 
 Tree = TypeVar("Tree")
 
-# Time between two attempts to save on a full disk once the training is over.
+# Time between two attempts to save to a full disk after the end of the training, s.
 RETRY_SECONDS = 2.0
 
-# Imported by name during the compilation, as its imports take half a second; so is orbax.
+# Imported by name during the compilation, because this import takes half a second; so does orbax's.
 REPORT_MODULE = "bounce_mjx.training.report"
 
 
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
     """The end of the training of one seed."""
 
     run: Path
-    """The run's folder; of several seeds, the seed's."""
+    """The run's folder; with several seeds, the seed's folder."""
     seed: int
     report: Report | None
     """Evaluation of the best checkpoint on fresh resets; None if the seed diverged before its first
@@ -71,13 +71,13 @@ class Outcome(NamedTuple):
     solved_steps: int | None
     """Environment steps at the first evaluation that met all five results."""
     fault: str | None
-    """The first quantity that was not finite, and when, if the training diverged."""
+    """If the training diverged, the first quantity that was not finite, and the iteration."""
     seconds: dict[str, float]
-    """Seconds by phase, of all seeds together."""
+    """Seconds by phase, for all seeds together."""
 
 
 class TrainingStopped(Exception):
-    """The user stopped the training; its text says how to go on."""
+    """The user stopped the training; the text says how to continue."""
 
 
 def train(
@@ -89,18 +89,18 @@ def train(
     resume: Path | None = None,
     report: bool = True,
 ) -> list[Outcome]:
-    """Trains by the config, and returns an outcome for each seed.
+    """Trains with a config, and returns an outcome for each seed.
 
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
       command: the user's command, to which `--resume` may be added.
-      resume: the run to go on with, in place.
-      report: import the modules of the report during the compilation.
+      resume: the run to continue, in place.
+      report: whether to import the modules of the report during the compilation.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
-        another process trains in the run's folder, the training diverged, or its end could not be
-        saved.
+        another process trains in the run's folder, the training diverged, or its final state could
+        not be saved.
       TrainingStopped: SIGINT or SIGTERM came; the state is saved.
     """
     with contextlib.ExitStack() as stack:
@@ -119,27 +119,27 @@ class _Member:
     """One seed of the training."""
 
     run: Path
-    """Folder of its best checkpoint and its log; with one seed, the run's folder itself."""
+    """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
     config: TrainConfig
-    """Its config as a training of one seed."""
+    """The config of this seed, as for a training of one seed."""
     progress: Progress
     best_policy: Policy | None = None
-    """The policy of its best checkpoint, as numpy arrays, if this process trained it."""
+    """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
     final: Report | None = None
-    """Evaluation of its best checkpoint on fresh resets, after the end of the training."""
+    """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
 
     @property
     def report(self) -> Report | None:
-        """The figures of its best checkpoint."""
+        """The figures of the best checkpoint."""
         return self.final or self.progress.best
 
 
 class _Job:
     """A training in progress.
 
-    With several seeds the run's folder has the latest state of all, and each seed has a folder of
-    its own in it, which is like the folder of a run of one seed. On several hosts every process
-    does the same, but the leader alone writes.
+    With several seeds the run's folder has the latest state of all seeds. Each seed has its own
+    folder in it, which looks like the folder of a run of one seed. On several hosts every process
+    does the same work, but only the leader writes.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class _Job:
         return f"go on with: {self.command} --resume {shlex.quote(str(self.run))}"
 
     def _advice(self) -> str:
-        """The advice after the death of a process."""
+        """The advice to the user after the death of a process."""
         try:
             latest = latest_checkpoint(self.run) if self.run else None
         except UserError:
@@ -232,16 +232,16 @@ class _Job:
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
         self.steps = latest.steps
-        of_seeds = [plain] if self.config.num_seeds == 1 else plain["seeds"]
+        seed_records = [plain] if self.config.num_seeds == 1 else plain["seeds"]
         self.members = [
-            _Member(folder, config, _resumed_progress(folder, one, latest))
-            for (folder, config), one in zip(self._folders_of_seeds(), of_seeds, strict=True)
+            _Member(folder, config, _resumed_progress(folder, record, latest))
+            for (folder, config), record in zip(self._folders_of_seeds(), seed_records, strict=True)
         ]
         if hosts.is_leader():
             _write_config(self.run, self.config)
 
     def compile(self, report: bool) -> None:
-        """Compiles the programs, and meanwhile opens logs and imports modules."""
+        """Compiles the programs; during the compilation it opens logs and imports modules."""
         with self.console.status("compiling"):
             compiling = self.pool.submit(self._compile, report)
             if not self.stop.wait_for(compiling):
@@ -253,18 +253,18 @@ class _Job:
                     f"stopped before anything was trained, so its folder {self.run} is removed"
                 )
             opening = compiling.result()
-            # A process that has its programs from the cache waits here for one that compiles them:
-            # the exchange between devices would give up after 30 s.
+            # A process that finds its programs in the cache waits here for a process that compiles
+            # them; otherwise the exchange between devices would time out after 30 s.
             hosts.any_of(False)
             self.trainer.start(self.state)
             self.state = None
         self.writers: list[CheckpointWriter] = []
         if hosts.is_leader():
-            of_members = [(member.run, member.config) for member in self.members]
+            seed_folders = [(member.run, member.config) for member in self.members]
             several = self.config.num_seeds > 1
             self.writers = [
                 CheckpointWriter(*arguments)
-                for arguments in ([(self.run, self.config)] if several else []) + of_members
+                for arguments in ([(self.run, self.config)] if several else []) + seed_folders
             ]
         for writer in self.writers:
             self.stack.callback(writer.close)
@@ -274,8 +274,8 @@ class _Job:
         self.clock.lap("compile")
 
     def _compile(self, report: bool) -> concurrent.futures.Future:
-        """Returns once the training can start, with the future of its logs. The longest program
-        goes first: Python traces one program at a time, while XLA compiles others."""
+        """Returns once the training can start, with the future of its logs. The longest program is
+        traced first: Python traces one program at a time while XLA compiles others."""
         compiling = self.trainer.compile(self.pool)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
         self.pool.submit(importlib.import_module, "orbax.checkpoint")
@@ -297,7 +297,8 @@ class _Job:
                 self.steps not in stored_checkpoints(member.run / CHECKPOINTS / "best")
             )
             if self.resumed and missing:
-                # The process was killed after saving the latest and before saving the best.
+                # The process was killed after saving the latest checkpoint and before saving the
+                # best one.
                 self._save(best=[i])
         while not self._stopping():
             if self._is_due():
@@ -360,7 +361,7 @@ class _Job:
         return (at_evaluation and not self._evaluated()) or (done and nothing)
 
     def _evaluate(self) -> bool:
-        """Evaluates and saves; False if a stop was requested meanwhile."""
+        """Evaluates and saves; returns False if a stop was requested meanwhile."""
         snapshot = self.trainer.snapshot()
         reports = self._wait_for_reports(self.evaluators.select, snapshot.policy)
         if reports is None:
@@ -386,7 +387,8 @@ class _Job:
             for member in self.members
             if member.progress.best is not None
         ]
-        # Another seed's policy takes the place of one that diverged before its first evaluation.
+        # A seed that diverged before its first evaluation has no best policy; another seed's policy
+        # takes its place in the batch.
         filled = iter(policies)
         policies = [
             policies[0] if member.progress.best is None else next(filled) for member in self.members
@@ -410,13 +412,13 @@ class _Job:
     def _wait_for_reports(
         self, evaluate: Callable[[Policy], list[Report]], policy: Policy
     ) -> list[Report] | None:
-        """A report of each seed; None if a stop was requested meanwhile."""
+        """Returns a report of each seed, or None if a stop was requested meanwhile."""
         if jax.process_count() > 1:
             # See `compile`.
             self.evaluators.wait()
             hosts.any_of(False)
         evaluating = self.pool.submit(evaluate, policy)
-        # On several hosts a process that went its own way would keep the others waiting.
+        # On several hosts, a process that stopped on its own would keep the others waiting.
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
             return None
         reports = evaluating.result()
@@ -441,19 +443,19 @@ class _Job:
         self.clock.lap("train")
 
     def _check_faults(self, faults: np.ndarray) -> None:
-        """Ends a training that diverged, as its state is worthless; of several seeds,
-        the others go on.
+        """Ends a training that diverged, because its state is useless; with several seeds, the
+        other seeds continue.
 
         Args:
           faults: the metric "fault" of a block [seeds, I].
         """
         before = (self.steps - self.block_steps) // self.config.ppo.batch_steps
-        for member, of_block in zip(self.members, faults, strict=True):
-            if member.progress.fault is not None or not of_block.any():
+        for member, block_faults in zip(self.members, faults, strict=True):
+            if member.progress.fault is not None or not block_faults.any():
                 continue
-            first = int(np.argmax(of_block != 0))
+            first = int(np.argmax(block_faults != 0))
             member.progress.fault = (
-                f"{self.trainer.checked[int(of_block[first]) - 1]} was the first that was not "
+                f"{self.trainer.checked[int(block_faults[first]) - 1]} was the first that was not "
                 f"finite, at iteration {before + first + 1}"
             )
             if self.config.num_seeds > 1:
@@ -475,10 +477,11 @@ class _Job:
         """Starts to save the latest state, and for the seeds in `best` their best checkpoint.
 
         Args:
-          snapshot: the latest state, if it is at hand.
+          snapshot: the latest state, if it is already available.
         """
         policy, state = snapshot or self.trainer.snapshot()
-        # A second signal may end the process: the log must hold every step of the checkpoint.
+        # A second signal may end the process at any time, so the log must already hold every step
+        # of the checkpoint.
         self.reporter.flush()
         several = self.config.num_seeds > 1
         library = {"library": self.trainer.library}
@@ -544,7 +547,7 @@ def library_of(checkpoint: Checkpoint) -> str:
 def _wait_until_saved(
     writers: Sequence[CheckpointWriter], reporter: Reporter, stop: StopRequest
 ) -> None:
-    """Keeps the process, and so the training's state, until the state is on the disk."""
+    """Keeps the process alive, and with it the training's state, until the state is on the disk."""
     stopping = stop.requested
     for writer in writers:
         while (problem := writer.problem()) is not None:
@@ -574,8 +577,8 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
         return progress
-    # The best checkpoint's own record counts: it may be older or newer than the latest
-    # checkpoint says, if the process was killed between the two saves.
+    # The best checkpoint's own record counts: if the process was killed between the two saves, it
+    # may be older or newer than the record in the latest checkpoint.
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = best_checkpoint(run)

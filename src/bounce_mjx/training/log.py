@@ -20,12 +20,12 @@ def open_log(
     """Opens a TensorBoard log in a run's folder.
 
     Args:
-      first_step: the step at which a resumed run goes on; TensorBoard drops all later points.
-      suffix: of the file's name; two logs opened in the same second need different ones.
+      first_step: the step from which a resumed run continues; TensorBoard drops all later points.
+      suffix: suffix of the file's name; two logs opened in the same second need different suffixes.
       config: the run's config, to be logged as text.
     """
-    # Here, as tensorboardX imports PyTorch where it is installed: the seconds that this takes pass
-    # during the compilation.
+    # Imported here because tensorboardX imports PyTorch if it is installed; that takes seconds,
+    # which overlap with the compilation.
     from tensorboardX import SummaryWriter
     from tensorboardX.record_writer import register_writer_factory
 

@@ -1,8 +1,8 @@
-"""The connection between the processes of one training, apart from JAX's own.
+"""The connection between the processes of one training, separate from JAX's own.
 
 Process 0 holds a socket to every other process. Three things go over them: values that all
 processes exchange, heartbeats, and the news that a process has died. JAX notices a death too, but
-late, without the process's number, and by aborting with pages of C++ stack.
+late and without the process's number, and then aborts with pages of C++ stack.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn, TextIO
 
-# A process that fails on its own prints its own reason within this time.
+# Within this time, a process that fails on its own prints its own reason.
 _GRACE_SECONDS = 1.0
 _CONNECT_SECONDS = 30.0
 # Exit status of a process that ends because another one died.
@@ -24,7 +24,7 @@ LOST_STATUS = 2
 
 
 class Address(NamedTuple):
-    """Where process 0 listens."""
+    """Network address on which process 0 listens."""
 
     port: int
     token: str
@@ -34,7 +34,8 @@ class Address(NamedTuple):
 class Peers:
     """The other processes of a training; process 0 is connected to all, the others to process 0.
 
-    While connected, the death of any process ends all the others, each with one sentence.
+    While they are connected, the death of any process ends all the others, and each prints one
+    sentence.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Peers:
           index: number of this process, from 0.
           count: number of processes.
           timeout: seconds without a sign of life after which a process counts as dead.
-          advice: how to go on, the end of the sentence about a death.
+          advice: the end of the message about a death, which says how to continue.
           end_process: ends this process with an exit status.
         """
         self._index, self._count, self._timeout = index, count, timeout
@@ -94,7 +95,7 @@ class Peers:
                     connection.close()
                     continue
                 self._sockets[index], self._names[index] = connection, name
-                # The reader is kept, as it may have read beyond the first line.
+                # The reader is kept because it may have read beyond the first line.
                 self._lines[index] = lines
         self._start()
 
@@ -126,13 +127,13 @@ class Peers:
         return self._received[0].get()
 
     def close(self) -> None:
-        """Says goodbye: from here on the others may end as they like."""
+        """Says goodbye: from now on the others may end at any time."""
         for i in self._sockets:
             self._send(i, {"bye": True})
         self._closed.set()
 
     def _leave(self, lost: int) -> NoReturn:
-        """Ends this process with a sentence, as another one died."""
+        """Ends this process with a message, because another one died."""
         with self._leaving:
             for i in self._sockets.keys() - {lost}:
                 self._send(i, {"lost": lost})
@@ -159,7 +160,7 @@ class Peers:
                 self._send(i, {})
 
     def _send(self, index: int, message: dict[str, Any]) -> None:
-        # A broken connection is the receiving thread's business.
+        # The receiving thread handles a broken connection.
         with self._sending, contextlib.suppress(OSError):
             self._sockets[index].sendall((json.dumps(message) + "\n").encode())
 

@@ -1,4 +1,4 @@
-"""The trainer in JAX: the compiled programs of `ppo.py`, on one device or several."""
+"""The trainer in JAX: the compiled programs of `ppo.py`, on one or several devices."""
 
 import concurrent.futures
 import functools

@@ -14,18 +14,18 @@ def report_training(run: Path, report: Report, steps: int) -> Path:
     TensorBoard log.
 
     Args:
-      report: of the best checkpoint; without a recording in a training of several seeds.
+      report: report of the best checkpoint; in a training of several seeds it has no recording.
       steps: environment steps at the best checkpoint.
 
     Returns:
-      The page.
+      The page's path.
 
     Raises:
       UserError: the page cannot be written.
     """
     recording = report.recording or record_checkpoint(find_checkpoint(run))
     page, evaluation = write_report(run, recording)
-    # A new file, as the log of the training is closed.
+    # A new file, because the log of the training is already closed.
     with open_log(run, suffix=".report") as log:
         log.add_image("evaluation", pixels(evaluation), steps, dataformats="HWC")
     return page

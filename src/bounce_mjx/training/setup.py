@@ -21,10 +21,10 @@ def set_up_jax() -> None:
 def set_up_gpu() -> None:
     """Makes JAX start sooner on a GPU; the user's environment variables have priority.
 
-    Memory is allocated as needed: JAX's default, three quarters at once, costs a second
-    (`XLA_PYTHON_CLIENT_PREALLOCATE=true`). Random numbers come from a kernel of JAX, where XLA
-    would compile one for a second; the numbers are the same
-    (`JAX_THREEFRY_GPU_KERNEL_LOWERING=false`).
+    Memory is allocated as needed: allocating three quarters at once, JAX's default, takes a second
+    (`XLA_PYTHON_CLIENT_PREALLOCATE=true` restores it). Random numbers come from a precompiled
+    kernel of JAX, because XLA would take a second to compile one; the numbers are the same
+    (`JAX_THREEFRY_GPU_KERNEL_LOWERING=false` restores XLA's).
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if "JAX_THREEFRY_GPU_KERNEL_LOWERING" not in os.environ:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request, which the training answers at its next safe point."""
+"""Ctrl-C and SIGTERM as a request to stop, which the training follows at its next safe point."""
 
 import concurrent.futures
 import os
@@ -7,7 +7,7 @@ import threading
 import time
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-# Launchers forward a Ctrl-C to a process that has already got it from the terminal.
+# Launchers forward a Ctrl-C to a process that has already received it from the terminal.
 _SAME_REQUEST_SECONDS = 0.5
 
 
@@ -35,7 +35,8 @@ class StopRequest:
             signal.signal(number, handler)
 
     def wait_for(self, future: concurrent.futures.Future) -> bool:
-        """Waits until the future is done; False as soon as a stop is requested."""
+        """Waits until the future is done, and returns True; returns False as soon as a stop is
+        requested."""
         while not self.requested:
             if concurrent.futures.wait([future], timeout=0.1).done:
                 return True

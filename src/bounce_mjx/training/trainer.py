@@ -16,11 +16,11 @@ JAX = "jax"
 
 
 class Snapshot(NamedTuple):
-    """A moment of a training as pytrees of numpy arrays."""
+    """The policy and the state of a training at one moment, as pytrees of NumPy arrays."""
 
     policy: Policy
     state: Any
-    """Everything that the training goes on from; numbers of up to 32 bits."""
+    """Everything that is needed to continue the training; numbers of at most 32 bits."""
 
 
 def iterations_per_block(config: TrainConfig) -> int:
@@ -31,31 +31,31 @@ def iterations_per_block(config: TrainConfig) -> int:
 class Trainer(Protocol):
     """S independent trainings of one algorithm, the seeds of a run.
 
-    With several seeds, every array of a state and of a policy has them as its first axis.
+    With several seeds, the first axis of every array in a state or a policy is the seed.
     """
 
     library: str
-    """Name of the implementation; a run goes on with the one that began it."""
+    """Name of the implementation; a run can be continued only by the implementation that began
+    it."""
     mesh: Mesh
-    """The devices."""
+    """The devices on which it trains."""
     checked: tuple[str, ...]
-    """The quantities that may not become infinite or NaN, in the order of their computation."""
+    """The quantities that must stay finite, in the order of their computation."""
 
     def state_template(self) -> Any:
         """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
-        """Starts to compile; the future is done once training can start."""
+        """Starts the compilation; the future is done when training can start."""
 
     def start(self, state: Any | None = None) -> None:
-        """Starts from the seeds, or from a state of `snapshot`."""
+        """Starts from the seeds, or from the state of a `snapshot`."""
 
     def run(self) -> Metrics:
         """Trains for a block of I iterations.
 
-        Returns:
-          Metrics, each [S, I]. "fault" is the number, from 1, of the first of `checked` that was
-          not finite in an iteration, else 0.
+        Returns: Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of
+          `checked` that was not finite in an iteration; 0 if all were finite.
         """
 
     def snapshot(self) -> Snapshot:

@@ -1,4 +1,4 @@
-"""The live page: the scene, controls and plots, which viser serves to any browser."""
+"""The live page: viser serves the scene, the controls and the plots to any browser."""
 
 import collections
 import html
@@ -19,7 +19,7 @@ from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, Simulation
 
-# Pictures and plots a second.
+# Pictures and plots per second.
 _PICTURE_RATE = 50.0
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
@@ -40,12 +40,12 @@ def run_browser(
 
     Args:
       num_shown: environments shown at first; the page's slider goes up to all of the simulation.
-      port: a free port.
+      port: a free port of this machine.
     """
     with open_server(host, port) as server:
         page = _Page(server, simulation, num_shown=num_shown, speed=speed, title=title)
         address = f"[{host}]" if ":" in host else host
-        # A host may look like markup.
+        # A host name may look like rich's markup.
         console.print(
             f"viewer: http://{address}:{server.get_port()}  (Ctrl-C ends it)",
             markup=False,
@@ -110,7 +110,7 @@ class _Page:
         self._server.flush()
 
     def _obey_controls(self) -> bool:
-        """Applies the controls' settings and requests; whether there was any change."""
+        """Applies the controls' settings and requests; returns whether anything changed."""
         before, now = self._settings, self._controls.read()
         self._settings = now
         if now.target_height != before.target_height:

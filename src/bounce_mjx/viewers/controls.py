@@ -1,7 +1,7 @@
 """The page's panel of controls.
 
-Whoever reaches the port can send any value for any control, whatever its slider offers. All values
-are therefore checked where they are read.
+Anyone who can reach the port can send any value for any control, whatever its slider offers. All
+values are therefore checked when they are read.
 """
 
 import html
@@ -30,7 +30,7 @@ class Settings(NamedTuple):
 
     paused: bool
     speed: float
-    """As a factor of real time."""
+    """Speed as a factor of real time."""
     num_shown: int
     """Number of environments in the scene."""
     target_height: float | None
@@ -89,7 +89,7 @@ class Controls:
                 self._requested_push = speed * np.array(direction)
 
     def read(self) -> Settings:
-        """The present settings."""
+        """The current settings."""
         initial = self._initial
         height = _number_within(self._height.value, self._height_range, self._height_range[0])
         shown = _number_within(self._num_shown.value, (1, self._max_shown), initial.num_shown)

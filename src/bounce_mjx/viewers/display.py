@@ -26,7 +26,7 @@ class Display:
         self.data = mujoco.MjData(self.model)
         self._config = env.config
         self._target = self.model.site(TARGET_SITE).id
-        # MuJoCo ignores a position that was zero in the file.
+        # MuJoCo ignores changes to a position that was zero in the file.
         self.model.site_sameframe[self._target] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
     def pose(self, qpos: np.ndarray, target_height: float) -> None:
@@ -90,7 +90,7 @@ def site_mesh(model: mujoco.MjModel, name: str) -> tuple[trimesh.Trimesh, np.nda
 
 
 def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """A geom's mesh in its own frame; None for a plane or a height field, which is no part of the
+    """A geom's mesh in its own frame; None for a plane or a height field, which is not part of the
     robot."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.mesh(model.geom_dataid[geom])
@@ -120,14 +120,15 @@ def _primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
 
 
 def _color(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """The geom's colour [4] by MuJoCo's rule: its own, or its material's if it has the default."""
+    """The geom's colour [4] by MuJoCo's rule: the geom's own colour, or the material's if the geom
+    has the default colour."""
     own, material = model.geom_rgba[geom], model.geom_matid[geom]
     is_default = np.allclose(own, (0.5, 0.5, 0.5, 1.0))
     return model.mat_rgba[material] if material >= 0 and is_default else own
 
 
 def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
-    # glTF has linear colour factors, MuJoCo has screen colours.
+    # glTF uses linear colour factors, MuJoCo uses sRGB colours.
     linear = np.append(rgba[:3] ** 2.2, rgba[3])
     return trimesh.visual.material.PBRMaterial(
         baseColorFactor=np.round(linear * 255.0).astype(np.uint8),

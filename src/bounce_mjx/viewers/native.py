@@ -31,7 +31,7 @@ _HELP = {
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, by the environment variables."""
+    """Whether a window can be opened, according to the environment variables."""
     if sys.platform == "linux":
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     # On a Mac, MuJoCo's viewer needs its own interpreter, mjpython.

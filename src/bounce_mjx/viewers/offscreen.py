@@ -16,7 +16,7 @@ _TRAIL_RADIUS = 0.004
 _TRAIL_RGB = (1.0, 0.45, 0.05)
 _MAX_GEOMS = 2000
 _BACKENDS = ("egl", "osmesa")
-# Runs in a separate process: a library that fails to load would stay half loaded in this one.
+# Runs in a separate process: a library that fails to load would remain partly loaded in this one.
 _PROBE = """
 import mujoco
 from mujoco.{backend} import GLContext
@@ -27,7 +27,7 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 
 def choose_backend() -> str:
-    """A working OpenGL library: the one that MUJOCO_GL names, or else EGL or OSMesa.
+    """A working OpenGL library: the one that MUJOCO_GL names; otherwise EGL or OSMesa.
 
     Raises:
       UserError: no library works.
@@ -51,7 +51,7 @@ def choose_backend() -> str:
 
 
 def works(backend: str) -> bool:
-    """Whether an OpenGL library can render here, by a test in a separate process."""
+    """Whether an OpenGL library can render on this machine, tested in a separate process."""
     probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
     return subprocess.run(probe, capture_output=True).returncode == 0
 
@@ -129,7 +129,7 @@ def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
 
 
 def _camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
-    """The model's overview camera, or else the default free camera of MuJoCo's viewer."""
+    """The model's overview camera; without one, the default free camera of MuJoCo's viewer."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA)

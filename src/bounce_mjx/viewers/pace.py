@@ -5,12 +5,12 @@ import time
 SPEED_RANGE = (0.1, 2.0)
 """Slowest and fastest speed of a viewer, as factors of real time."""
 
-# A program that falls behind by more than this slows down and does not catch up, s.
+# If the simulation falls behind by more than this, it slows down instead of catching up, s.
 _MAX_LAG = 0.1
 
 
 class Pace:
-    """Control steps that are due, by the clock."""
+    """Number of control steps that are due according to the clock."""
 
     def __init__(self, dt: float):
         self._dt = dt

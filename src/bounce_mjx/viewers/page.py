@@ -50,7 +50,7 @@ def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | 
 def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     """A viser server that prints nothing; port 0 takes any free port.
 
-    Closing it takes a second at most: a background thread waits for clients that do not answer.
+    Closing it takes at most a second: a background thread waits for clients that do not answer.
     """
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)

@@ -110,7 +110,7 @@ def show(
                 write_page(options.html, simulation, recording, options.fps)
         for path in (options.video, options.html):
             if path is not None:
-                # rich would take brackets in a path for its markup.
+                # rich would read brackets in a path as markup.
                 console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
         return
     with contextlib.suppress(KeyboardInterrupt):

@@ -25,17 +25,18 @@ class Frame(NamedTuple):
     paddle: np.ndarray
     """The paddle's centre [N, 3], m."""
     target_height: np.ndarray
-    """[N], m."""
+    """Target height [N], m."""
     n_bounces: np.ndarray
     """Consecutive bounces [N]."""
     reward_terms: np.ndarray
     """Weighted reward terms of the step [N, R], in the order of `rewards.TERM_NAMES`."""
     over: np.ndarray
-    """Whether the episode ended or timed out on this step [N]; the next frame starts a new one."""
+    """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
+    episode."""
 
 
 class Simulation:
-    """N environments under a controller; an environment is reset when its episode is over."""
+    """N environments under a controller; an environment is reset when its episode ends."""
 
     def __init__(self, env: BounceBall, controller: Controller, num_envs: int, seed: int):
         """Compiles the programs, which takes seconds, and resets all environments."""
@@ -53,7 +54,7 @@ class Simulation:
         self._step_program = self._step_program.lower(self._key, self._states, *steps).compile()
 
     def reset(self) -> Frame:
-        """Starts a new episode in every environment; its first frame."""
+        """Starts a new episode in every environment; returns the first frame."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key)
         self.frame = jax.device_get(frame)
@@ -108,7 +109,7 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
 
     Args:
       dt: time between the frames of the recording, s.
-      fps: frames per second wanted.
+      fps: desired frames per second.
 
     Returns:
       The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts: [F, N, ...].

@@ -34,7 +34,8 @@ _ENCODINGS = {
 
 
 class VideoWriter:
-    """Writes recordings as a video; its constructor checks all that can be checked beforehand."""
+    """Writes recordings as a video; the constructor checks everything that can be checked in
+    advance."""
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int | None):
         """Chooses the OpenGL library.

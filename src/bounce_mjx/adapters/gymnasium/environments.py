@@ -1,7 +1,7 @@
 """The classes behind `gymnasium.make` and `gymnasium.make_vec("bounce_mjx/BounceBall-v0")`.
 
-Arrays are NumPy's; `adapters/torch/gymnasium_env.py` has a vectorised environment with tensors that
-stay on JAX's device. Keyword arguments are the settings of `EnvConfig`.
+The arrays are NumPy arrays; `adapters/torch/gymnasium_env.py` has a vectorised environment with
+tensors that stay on JAX's device. Keyword arguments are the settings of `EnvConfig`.
 """
 
 import weakref
@@ -44,7 +44,8 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
 
         Raises:
-          UserError: a setting or the render mode is wrong, or there is no OpenGL to draw with.
+          UserError: a setting or the render mode is wrong, or there is no OpenGL library for
+            rendering.
         """
         _check_render_mode(render_mode)
         self.task = BounceBall(validate(EnvConfig, settings, ENV_ID))
@@ -148,7 +149,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self._state, self._key, result = self._step(
             self._state, np.asarray(actions, np.float32), self._key
         )
-        # Copies, as the caller may write into them.
+        # Copies, because the caller may write into them.
         result = jax.tree.map(np.array, result)
         info = dict(result.metrics) | {
             "final_obs": result.final_observation,
@@ -186,7 +187,7 @@ class Pictures:
     def __init__(self, task: BounceBall):
         renderer = Renderer(task, _WIDTH, _HEIGHT, choose_backend())
         self._render = renderer.render
-        # Also at exit, where OpenGL would be gone before the renderer.
+        # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self.close = weakref.finalize(self, renderer.close)
 
     def draw(self, state: BounceState) -> np.ndarray:

@@ -14,7 +14,7 @@ _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 def register_when_imported() -> None:
     """Makes `gymnasium.make(ENV_ID)` and `gymnasium.make_vec(ENV_ID)` work.
 
-    Gymnasium is optional and takes half a second to import, so it is not imported here: where it is
+    Gymnasium is optional and takes half a second to import, so it is not imported here. If it is
     not loaded yet, the registration follows its import.
     """
     if "gymnasium" in sys.modules:

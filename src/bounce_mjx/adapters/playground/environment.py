@@ -93,7 +93,7 @@ class PlaygroundBounceBall(MjxEnv):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The model in MJX, for reading; the environment steps another one."""
+        """The model in MJX, for reading only; the environment does not step it."""
         return self._mjx_model
 
     @functools.cached_property
@@ -107,7 +107,7 @@ class PlaygroundBounceBall(MjxEnv):
         super().__setattr__(name, value)
 
     def render(self, trajectory: list[State] | State, *args: Any, **kwargs: Any) -> Sequence[Any]:
-        """Playground's pictures of one state or of a list of states."""
+        """Renders one state or a list of states with Playground's renderer."""
         states = trajectory if isinstance(trajectory, list) else [trajectory]
         with_data = [state.replace(data=self._mj_data(state)) for state in states]
         drawable = with_data if isinstance(trajectory, list) else with_data[0]
@@ -121,7 +121,7 @@ class PlaygroundBounceBall(MjxEnv):
 
 
 def _to_playground(state: core.State) -> State:
-    """The field `data` holds a `BounceState`, not MJX's data."""
+    """Converts a state; its field `data` holds a `BounceState`, not MJX's data."""
     return State(
         data=state.pipeline_state,
         obs=state.obs,

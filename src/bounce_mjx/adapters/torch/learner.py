@@ -1,4 +1,5 @@
-"""The common part of the PyTorch learners: random numbers of their own, and their state as data."""
+"""Shared by the PyTorch learners: separate random numbers for each learner, and its state as
+data."""
 
 import abc
 from typing import Any, ClassVar
@@ -14,15 +15,16 @@ from bounce_mjx.learning.policy import Policy
 
 State = dict[str, Any]
 
-# The quantities that may not become infinite or NaN, in the order of their computation.
+# The quantities that must stay finite, in the order of their computation.
 CHECKED = ("reward", "loss/value", "loss/policy", "parameters")
 
 
 class Learner(abc.ABC):
     """A library's PPO on a batch of environments.
 
-    Between two calls of `learn`, its state is the networks, the statistics, Adam's moments, the
-    learning rate, the environments, what they showed last, and PyTorch's random state.
+    Between two calls of `learn`, its state consists of the networks, the statistics, Adam's
+    moments, the learning rate, the environments, their last observations, and PyTorch's random
+    state.
     """
 
     library: ClassVar[str]
@@ -42,13 +44,13 @@ class Learner(abc.ABC):
         _set_random_state(vector.device, outside)
 
     def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`, or until the parameters are not finite: from there on the
-        library would raise exceptions.
+        """Trains for `iterations`, or until the parameters are not finite, because the library
+        would then raise exceptions.
 
-        Returns:
-          The environment's metrics of each step [iterations, T], the losses [iterations], and
-          "fault" [iterations]: the number, from 1, of the first of `CHECKED` that was not finite,
-          else 0. All others are NaN in the iterations that were not run.
+        Returns: The environment's metrics of each step [iterations, T], the losses [iterations],
+          and "fault" [iterations]: the number, from 1, of the first quantity of `CHECKED` that was
+          not finite; 0 if all were finite. In iterations that were not run, all other metrics are
+          NaN.
         """
         outside = _random_state(self.vector.device)
         _set_random_state(self.vector.device, self._random)
@@ -75,7 +77,8 @@ class Learner(abc.ABC):
         return metrics | losses | {"fault": faults}
 
     def state(self) -> State:
-        """Everything that training goes on from, as nested dictionaries of numpy arrays."""
+        """Everything that is needed to continue the training, as nested dictionaries of NumPy
+        arrays."""
         return {
             "modules": {
                 name: {key: _to_array(tensor) for key, tensor in module.state_dict().items()}
@@ -93,7 +96,7 @@ class Learner(abc.ABC):
         }
 
     def restore(self, state: State) -> None:
-        """Goes on from a `state`."""
+        """Continues from a `state`."""
         for name, module in self._modules().items():
             current = module.state_dict()
             module.load_state_dict(
@@ -114,7 +117,7 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def policy(self) -> Policy:
-        """The policy as it acts now, without its noise."""
+        """The current policy, without action noise."""
 
     @abc.abstractmethod
     def _build(self) -> None:
@@ -122,7 +125,8 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def _iterate(self) -> tuple[torch.Tensor, dict[str, float]]:
-        """One iteration: the environment's metrics of each step [T, M], and the `losses`."""
+        """Runs one iteration; returns the environment's metrics of each step [T, M] and the
+        `losses`."""
 
     @abc.abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
@@ -130,11 +134,11 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def _set_learning_rate(self, rate: float) -> None:
-        """Sets the learning rate wherever the library keeps it."""
+        """Sets the learning rate in every place where the library stores it."""
 
     @abc.abstractmethod
     def _observed(self) -> dict[str, torch.Tensor]:
-        """The tensors that the next action depends on."""
+        """The tensors on which the next action depends."""
 
     @abc.abstractmethod
     def _observe(self, **observed: torch.Tensor) -> None:
@@ -148,7 +152,7 @@ class Learner(abc.ABC):
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
     def _moments(self, parameter: nn.Parameter) -> dict[str, torch.Tensor]:
-        """Adam's state of a parameter, which PyTorch makes at the first update."""
+        """Adam's state for a parameter, which PyTorch creates at the first update."""
         zeros = {
             "step": torch.zeros(()),
             "exp_avg": torch.zeros_like(parameter),
@@ -169,18 +173,18 @@ def _set_random_state(device: torch.device, states: dict[str, torch.Tensor]) -> 
 
 
 def _to_array(tensor: torch.Tensor) -> np.ndarray:
-    """A copy, as the training goes on in the tensor's memory."""
+    """A copy, because the training reuses the tensor's memory."""
     return _split_words(tensor.detach().cpu().numpy().copy())
 
 
 def _split_words(array: np.ndarray) -> np.ndarray:
-    """Numbers of 64 bits as pairs of words [..., 2], as JAX reads checkpoints in 32 bits."""
+    """64-bit numbers as pairs of words [..., 2], because JAX reads checkpoints in 32 bits."""
     array = np.asarray(array)
     return array[..., None].view(np.uint32) if array.dtype.itemsize == 8 else array
 
 
 def _to_tensor(array: jax.Array | np.ndarray, like: torch.Tensor) -> torch.Tensor:
-    """The tensor of `_to_array`, with the type and the device of another."""
+    """The inverse of `_to_array`: a tensor with the type and the device of `like`."""
     array = np.array(array)
     wanted = like.detach().cpu().numpy().dtype
     if wanted.itemsize == 8:

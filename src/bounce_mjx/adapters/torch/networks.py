@@ -1,7 +1,7 @@
 """The networks of `learning/networks.py` in PyTorch, and their conversion to a `Policy`.
 
-Layers, activation, initial weights and normalisation are the same, so that every command that
-takes a `Policy` takes one learned in PyTorch.
+Layers, activation, initial weights and normalisation are the same, so that every command that takes
+a `Policy` also takes a policy that was trained in PyTorch.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from bounce_mjx.robot.model import JOINT_NAMES
 
 
 class Normalizer(nn.Module):
-    """`learning.statistics` as a module: running statistics and the normalisation by them.
+    """`learning.statistics` as a module: running statistics, and normalisation with them.
 
     rsl_rl uses it as its observation normaliser (`update`), skrl as its preprocessor (`train`).
     """
@@ -69,7 +69,7 @@ def make_mlp(config: PPOConfig, num_inputs: int, num_outputs: int) -> nn.Sequent
 
 def init_weights(mlp: nn.Sequential, output_gain: float) -> None:
     """Sets orthogonal weights as in `learning/networks.py`: gain sqrt(2), and `output_gain` in the
-    last layer, where the policy's mean has 0.01."""
+    last layer (0.01 for the policy's mean)."""
     linears = linears_of(mlp)
     for linear in linears:
         gain = output_gain if linear is linears[-1] else 2**0.5
@@ -85,15 +85,15 @@ def linears_of(mlp: nn.Module) -> list[nn.Linear]:
 def to_policy(
     config: PPOConfig, normalizer: Normalizer, linears: Sequence[nn.Linear], log_std: torch.Tensor
 ) -> Policy:
-    """The `Policy` with these networks' normalisation and mean.
+    """The `Policy` with the normalisation and the mean network of a PyTorch policy.
 
     Args:
-      normalizer: of the observation [N].
-      linears: hidden layers and output layer of the mean.
+      normalizer: normaliser of the observation [N].
+      linears: hidden layers and output layer of the mean network.
       log_std: logarithm of the standard deviation [6].
 
     Raises:
-      UserError: the layers differ from those of the config.
+      UserError: the layers differ from the config's layers.
     """
     layers = [
         {"kernel": _array(linear.weight).T, "bias": _array(linear.bias)} for linear in linears
@@ -118,5 +118,5 @@ def to_policy(
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
-    """A copy, as the training goes on in the tensor's memory."""
+    """A copy, because the training reuses the tensor's memory."""
     return tensor.detach().cpu().numpy().copy()

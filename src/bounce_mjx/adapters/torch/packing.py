@@ -1,8 +1,9 @@
 """Many arrays in one block of memory.
 
 Each array passed from one call of a program to the next costs a microsecond or more of Python, and
-each array passed from JAX to PyTorch tens of microseconds on CUDA. So a step takes and returns its
-state as one block and returns its results as another, of which PyTorch's tensors are views.
+each array passed from JAX to PyTorch tens of microseconds on CUDA. Therefore a step takes and
+returns its state as one block, and returns its results as another block, of which PyTorch's tensors
+are views.
 """
 
 import math
@@ -16,7 +17,7 @@ _TORCH_TYPES = {"float32": torch.float32, "int32": torch.int32, "bool": torch.bo
 
 
 class _Part(NamedTuple):
-    """Place of one array in the block."""
+    """Position of one array in the block."""
 
     shape: tuple[int, ...]
     dtype: jnp.dtype
@@ -27,9 +28,8 @@ class _Part(NamedTuple):
 
 
 class Layout:
-    """The places of a pytree's arrays in a block of words, int32 [W].
-
-    Numbers of four bytes take a word each, bools a byte; every array starts at a new word.
+    """The positions of a pytree's arrays in a block of words, int32 [W]. A four-byte number takes a
+    word, a bool takes a byte; every array starts at a new word.
     """
 
     def __init__(self, shapes: Any):

@@ -14,7 +14,7 @@ hyperparameters.
 | min, max and final_max_learning_rate, decay_steps | 1e-5 to 1e-2, no decay: fixed in rsl_rl   |
 | max_grad_norm           | for the actor and the critic separately (here together)             |
 | KL                      | exact for two Gaussians (here Schulman's estimate)                  |
-| minibatches             | shuffled once an iteration (here once an epoch)                     |
+| minibatches             | shuffled once per iteration (here once per epoch)                   |
 | value at a time-out     | of the state before it (here of the last state)                     |
 """
 
@@ -94,8 +94,8 @@ class RslRlVecEnv(VecEnv):
         return self._observations, result.reward, result.done, extras
 
     def terminal_observations(self) -> TensorDict:
-        """Observations after the last step, before any reset: at an end, the last of the old
-        episode."""
+        """Observations after the last step, before any reset; at the end of an episode, its last
+        observation."""
         return self._groups(self._result.final_observation, self._result.final_critic_metrics)
 
     def step_metrics(self) -> torch.Tensor:
@@ -103,7 +103,7 @@ class RslRlVecEnv(VecEnv):
         return self._result.metrics
 
     def _groups(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> TensorDict:
-        # Built on its device, as a conversion would wait for it.
+        # Built on the device, because a conversion would wait for it.
         return TensorDict(
             {"policy": observation, "critic": critic_metrics},
             batch_size=[self.num_envs],
@@ -111,7 +111,7 @@ class RslRlVecEnv(VecEnv):
         )
 
 
-# Sums over the episodes that ended on a step; their mean over steps has no meaning.
+# Sums over the episodes that ended on a step; a mean of them over steps is not meaningful.
 _SUMS = frozenset({"ended", "return", "length", "bounces", "apex_error", "bounced", "non_finite"})
 
 
@@ -126,8 +126,8 @@ class Network(MLPModel):
 
 
 class RslRlLearner(Learner):
-    """rsl_rl's PPO with its own storage, in the loop of its runner without the runner's log, which
-    would wait for the device at every step."""
+    """rsl_rl's PPO and storage in the same loop as rsl_rl's runner, but without the runner's log,
+    which would wait for the device at every step."""
 
     library = "rsl_rl"
     losses = ("loss/policy", "loss/value", "policy/entropy", "policy/learning_rate")
@@ -137,7 +137,7 @@ class RslRlLearner(Learner):
         self.env.episode_length_buf = torch.randint_like(
             self.env.episode_length_buf, self.env.max_episode_length
         )
-        # rsl_rl prints its networks.
+        # Otherwise rsl_rl prints its networks.
         with contextlib.redirect_stdout(io.StringIO()):
             self.algorithm = PPO.construct_algorithm(
                 self.env.get_observations(),
@@ -191,7 +191,7 @@ class RslRlLearner(Learner):
 
 
 def algorithm_config(config: PPOConfig) -> dict[str, Any]:
-    """The config as rsl_rl's runners and algorithms take it."""
+    """The config in the form that rsl_rl's runners and algorithms expect."""
     network = {
         "class_name": Network,
         "hidden_dims": list(config.hidden_layers),
@@ -200,7 +200,7 @@ def algorithm_config(config: PPOConfig) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.rollout_length,
         "save_interval": 1_000_000_000,
-        # The environment lets nothing non-finite out, and the check waits for the device.
+        # The environment never returns non-finite values, and this check would wait for the device.
         "check_for_nan": False,
         "multi_gpu": None,
         "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]},

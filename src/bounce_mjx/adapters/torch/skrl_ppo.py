@@ -6,9 +6,9 @@
 | entropy_cost, value_cost, reward_scale, max_grad_norm, init_noise_std, hidden_layers,           |
 | critic_metrics, initial weights | the same                                                    |
 | normalisation           | the same formula; the first epoch updates the statistics            |
-| value at a time-out     | of the last state: the same, as the learner passes it on            |
+| value at a time-out     | of the last state: the same, because the learner passes it on       |
 | learning_rate, its limits, decay_steps | the same                                             |
-| target_kl               | steers once an epoch by 1.5 (here once a minibatch by 1.1)          |
+| target_kl               | adapts once per epoch by 1.5 (here once per minibatch by 1.1)       |
 | advantages              | normalised over the whole rollout (here in each minibatch)          |
 """
 
@@ -97,8 +97,8 @@ class SkrlEnv(Wrapper):
         return self._states
 
     def terminal_observations(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Observations and states after the last step, before any reset: at an end, the last ones
-        of the old episode."""
+        """Observations and states after the last step, before any reset; at the end of an episode,
+        its last ones."""
         result = self._result
         states = torch.cat([result.final_observation, result.final_critic_metrics], dim=-1)
         return result.final_observation, states
@@ -107,12 +107,12 @@ class SkrlEnv(Wrapper):
         """Does nothing: skrl calls it at every step."""
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Does nothing: the environment holds no resources."""
 
 
 class SkrlLearner(Learner):
-    """skrl's PPO in the loop of its trainers. It gets the terminal observations at an end, and so
-    bootstraps time-outs from them."""
+    """skrl's PPO in the same loop as skrl's trainers. At the end of an episode it gets the terminal
+    observation, so that it bootstraps a time-out from that observation."""
 
     library = "skrl"
     losses = ("loss/policy", "loss/value", "policy/action_std", "policy/learning_rate")
@@ -179,7 +179,8 @@ class SkrlLearner(Learner):
         self._observations, self._states = observations, states
 
     def _step(self) -> torch.Tensor:
-        """One step of every environment, with an update at the end of a rollout; its metrics."""
+        """Runs one step of every environment, and an update at the end of a rollout; returns the
+        step's metrics."""
         clock = {"timestep": 0, "timesteps": 0}
         self.agent.pre_interaction(**clock)
         with torch.no_grad():
@@ -205,7 +206,7 @@ class SkrlLearner(Learner):
 
 
 def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
-    """The config as skrl's agent takes it."""
+    """The config in the form that skrl's agent expects."""
     adaptive = config.target_kl > 0.0
     return PPO_CFG(
         rollouts=config.rollout_length,

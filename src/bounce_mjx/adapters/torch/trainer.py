@@ -1,4 +1,4 @@
-"""PyTorch's PPO implementations as trainers of the job: one learner a seed."""
+"""PyTorch's PPO implementations as trainers for the job, with one learner per seed."""
 
 import concurrent.futures
 import importlib
@@ -22,7 +22,7 @@ _LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
 
 
 class TorchTrainer:
-    """A library's PPO, its seeds one after another; see `training.trainer.Trainer`."""
+    """A library's PPO, which trains the seeds one after another; see `training.trainer.Trainer`."""
 
     checked = CHECKED
 
@@ -98,8 +98,8 @@ def make_vector_env(config: PPOConfig, env: BounceBall, seed: int) -> TorchVecto
 
 
 def summarize(metrics: Metrics) -> Metrics:
-    """Metrics of each iteration [I] from those of a learner: the environment's [I, T], as the
-    trainer in JAX reports them, and the learner's own [I]."""
+    """Metrics of each iteration [I] from a learner's metrics. The environment's metrics [I, T] are
+    summarised as in the JAX trainer; the learner's own [I] are kept."""
     own = {name: values for name, values in metrics.items() if values.ndim == 1}
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}
     return own | {

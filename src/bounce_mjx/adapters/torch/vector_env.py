@@ -1,8 +1,8 @@
 """Batched environments for PyTorch: `task/vector.py` with tensors.
 
 Tensors and arrays share their memory through DLPack, on the CPU and on CUDA. The host never waits
-for the device, as DLPack makes each library's stream wait for the other's. The state is donated to
-the next step, so a step returns no view of it.
+for the device, because DLPack makes each library's stream wait for the other's. The state is
+donated to the next step, so a step returns no view of it.
 """
 
 import copy
@@ -24,7 +24,7 @@ from bounce_mjx.task.env import BounceBall
 class StepResult:
     """Result of one step of B environments, as tensors that share memory with JAX's array.
 
-    All tensors are views of one block of memory, made at their first use.
+    All tensors are views of one block of memory; each view is made when it is first used.
     """
 
     def __init__(self, block: jax.Array, layout: Layout):
@@ -33,7 +33,8 @@ class StepResult:
 
     @functools.cached_property
     def observation(self) -> torch.Tensor:
-        """Observation for the next action [B, N]; after an end, the first of the new episode."""
+        """Observation for the next action [B, N]; after the end of an episode, the first
+        observation of the new one."""
         return self._layout.view(self._block, "observation")
 
     @functools.cached_property
@@ -43,8 +44,8 @@ class StepResult:
 
     @functools.cached_property
     def final_observation(self) -> torch.Tensor:
-        """Observation after the step, before any reset [B, N]; at an end, the last of the old
-        episode."""
+        """Observation after the step, before any reset [B, N]; at the end of an episode, its last
+        observation."""
         return self._layout.view(self._block, "final_observation")
 
     @functools.cached_property
@@ -54,7 +55,7 @@ class StepResult:
 
     @functools.cached_property
     def reward(self) -> torch.Tensor:
-        """Scaled [B]."""
+        """Scaled reward [B]."""
         return self._layout.view(self._block, "reward")
 
     @functools.cached_property
@@ -95,7 +96,7 @@ class TorchVectorEnv:
 
         Args:
           env: the task; None for the default one.
-          seed: of all resets.
+          seed: seed of all resets.
           critic_metrics: names of the metrics that are additional inputs of the value network;
             a pattern such as world/* names many.
           reward_scale: factor of the rewards.
@@ -165,10 +166,10 @@ class TorchVectorEnv:
         return StepResult(result, self._result_layout)
 
     def sibling(self, seed: int) -> "TorchVectorEnv":
-        """As many other environments on the same compiled programs.
+        """The same number of other environments, which share the compiled programs.
 
         Args:
-          seed: of their resets.
+          seed: seed of the resets.
         """
         other = copy.copy(self)
         other._key, other._block = jax.random.PRNGKey(seed), None
@@ -176,7 +177,8 @@ class TorchVectorEnv:
 
     @property
     def state(self) -> np.ndarray:
-        """Everything that the next step needs, one block [W], int32; a copy, which may be set."""
+        """Everything that the next step needs, as one block [W], int32. Reading it gives a copy; it
+        can be assigned."""
         if self._block is None:
             self.reset()
         return np.array(self._block)
@@ -191,7 +193,7 @@ class TorchVectorEnv:
         different values to spread the time-outs of episodes that began together."""
         if self._block is None:
             self.reset()
-        # A copy, as the next step takes the memory of the state.
+        # A copy, because the next step reuses the state's memory.
         carried = self._carried_layout.unpack(self._block)
         return torch.from_dlpack(jnp.copy(carried.vector.clock))
 
@@ -244,13 +246,13 @@ class TorchVectorEnv:
         return _Carried(_slim(state), key), arrays, step_metrics(result, groups=1)
 
     def _critic_metrics(self, metrics: dict[str, jax.Array]) -> jax.Array:
-        """[B, K]."""
+        """The critic metrics [B, K]."""
         columns = [metrics[name] for name in self.critic_metrics]
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((self.num_envs, 0))
 
 
 class _Carried(NamedTuple):
-    """Inputs of the next step besides the action."""
+    """Inputs of the next step in addition to the action."""
 
     vector: vector.VectorState
     key: jax.Array
@@ -276,7 +278,7 @@ def _slim(state: vector.VectorState) -> vector.VectorState:
 
 
 def _whole(slim: vector.VectorState, template: Any) -> vector.VectorState:
-    """A slim state with zeros in the missing fields, which the compiler drops."""
+    """A slim state with zeros in the missing fields; the compiler removes these zeros."""
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template.env)
     filled = slim.env.replace(
         obs=zeros.obs, reward=zeros.reward, done=zeros.done, metrics=zeros.metrics

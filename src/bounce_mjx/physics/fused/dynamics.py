@@ -6,7 +6,7 @@ loops; on a GPU all physics steps of a control step are one kernel (`gpu/element
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,17 @@ from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.fused import chain, friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
-from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, dot, matmul, matvec, scale, vadd
+from bounce_mjx.physics.fused.scalars import (
+    Scalar,
+    Vec3,
+    add,
+    dot,
+    matmul,
+    matvec,
+    scale,
+    stored,
+    vadd,
+)
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 
@@ -184,15 +194,17 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
     """One physics step: mj_step of this kind of model."""
-    pose = chain.forward_kinematics(model.links, motion.q)
-    bias = chain.bias_force(model.links, pose, motion.v, model.gravity)
-    inertia = chain.mass_matrix(model.links, pose)
-    applied = [
-        servo_torque(servo, target, q, v) - link.damping * v - b
-        for link, servo, target, q, v, b in zip(
-            model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
-        )
-    ]
+    keep = stored if motion.turning is not None else lambda values: values
+    pose = keep(chain.forward_kinematics(model.links, motion.q))
+    bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
+    inertia = keep(chain.mass_matrix(model.links, pose))
+    applied, servo_damping = [], []
+    for link, servo, target, q, v, b in zip(
+        model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
+    ):
+        torque, derivative = servo_torque(servo, target, q, v)
+        applied.append(torque - link.damping * v - b)
+        servo_damping.append(derivative)
     contact_torque, ball_acceleration, spin_acceleration = contact_response(
         model, motion, pose, inertia, applied
     )
@@ -200,17 +212,24 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         model,
         motion,
         inertia,
+        servo_damping,
         [add(a, c) for a, c in zip(applied, contact_torque, strict=True)],
         ball_acceleration,
         spin_acceleration,
     )
 
 
-def servo_torque(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> Scalar:
-    """Torque (N m) of MuJoCo's affine actuator for the servo target (rad)."""
+def servo_torque(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+    """Torque (N m) of MuJoCo's affine actuator for the servo target (rad), and its derivative with
+    respect to the velocity, which a torque at its limit has not."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    return servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+    torque = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+    if servo.torque_range is None:
+        return torque, servo.damping
+    least, most = servo.torque_range
+    free = (torque > least) & (torque < most)
+    return jnp.clip(torque, least, most), jnp.where(free, servo.damping, 0.0)
 
 
 def contact_response(
@@ -230,7 +249,7 @@ def contact_response(
     )
     ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     if motion.turning is not None:
-        factor = chain.cholesky(inertia)
+        factor = stored(chain.cholesky(inertia))
         response = friction.contact_response(
             model,
             pose,
@@ -270,6 +289,7 @@ def integrate(
     model: FusedModel,
     motion: Motion,
     inertia: chain.SquareMatrix,
+    servo_damping: Sequence[Scalar],
     torque: list[Scalar],
     ball_acceleration: Vec3,
     spin_acceleration: Vec3 | None,
@@ -278,9 +298,11 @@ def integrate(
     torques of servos and joint damping (documentation, "Computation", numerical integration)."""
     dt = model.dt
     implicit = [list(row) for row in inertia]
-    for i, (link, servo) in enumerate(zip(model.links, model.servos, strict=True)):
-        implicit[i][i] = add(implicit[i][i], dt * (link.damping - servo.damping))
+    for i, (link, derivative) in enumerate(zip(model.links, servo_damping, strict=True)):
+        implicit[i][i] = add(implicit[i][i], dt * (link.damping - derivative))
     factor = chain.cholesky(implicit)
+    if motion.turning is not None:
+        factor = stored(factor)
     acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
     v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))

@@ -14,6 +14,7 @@ from bounce_mjx.physics.fused.scalars import (
     Scalar,
     Vec3,
     mul,
+    neg,
     quaternion_matrix,
     scale,
 )
@@ -36,6 +37,7 @@ class Servo:
     gear: float
     """Length of the actuator per joint angle."""
     ctrl_range: tuple[float, float] | None
+    torque_range: tuple[Scalar, Scalar] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +125,13 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
     links = zip(
         model.links, p.link_mass or none, p.armature or none, p.damping or none, strict=True
     )
-    servos = zip(model.servos, p.servo_gain or none, p.servo_damping or none, strict=True)
+    servos = zip(
+        model.servos,
+        p.servo_gain or none,
+        p.servo_damping or none,
+        p.force_limit or none,
+        strict=True,
+    )
     rotation = p.paddle_rotation
     return dataclasses.replace(
         model,
@@ -154,12 +162,17 @@ def _link_in_world(
     )
 
 
-def _servo_in_world(servo: Servo, gain: Scalar | None, damping: Scalar | None) -> Servo:
+def _servo_in_world(
+    servo: Servo, gain: Scalar | None, damping: Scalar | None, force_limit: Scalar | None
+) -> Servo:
     if gain is not None:
         gain = mul(gain, servo.gear)
         servo = dataclasses.replace(servo, gain=gain, stiffness=mul(gain, -servo.gear))
     if damping is not None:
         servo = dataclasses.replace(servo, damping=mul(damping, -(servo.gear**2)))
+    if force_limit is not None:
+        limit = mul(force_limit, abs(servo.gear))
+        servo = dataclasses.replace(servo, torque_range=(neg(limit), limit))
     return servo
 
 
@@ -205,6 +218,8 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
     gear = float(mj_model.actuator_gear[actuator, 0])
     bias, stiffness, damping = (float(b) for b in mj_model.actuator_biasprm[actuator, :3])
     limited = bool(mj_model.actuator_ctrllimited[actuator])
+    force_limited = bool(mj_model.actuator_forcelimited[actuator])
+    torques = np.sort(gear * mj_model.actuator_forcerange[actuator])
     return Servo(
         gain=gear * float(mj_model.actuator_gainprm[actuator, 0]),
         bias=gear * bias,
@@ -212,6 +227,7 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
         damping=gear**2 * damping,
         gear=gear,
         ctrl_range=_floats(mj_model.actuator_ctrlrange[actuator]) if limited else None,
+        torque_range=_floats(torques) if force_limited else None,
     )
 
 

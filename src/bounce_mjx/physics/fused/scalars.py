@@ -205,7 +205,8 @@ def stored(values: Tree) -> Tree:
     """
     leaves, tree = jax.tree.flatten(values)
     with set_xla_metadata(inlineable="false"):
-        return tree.unflatten(_times_one(*leaves))
+        computed = iter(_times_one(*(x for x in leaves if not is_constant(x))))
+    return tree.unflatten(x if is_constant(x) else next(computed) for x in leaves)
 
 
 # JAX returns the argument of a function that does nothing with it.

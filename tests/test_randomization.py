@@ -1,0 +1,677 @@
+"""Randomised worlds: their draws, late actions, late and noisy sensors, pushes and targets."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.c_episodes import episode_models
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
+from bounce_mjx.task import noise
+from bounce_mjx.task.actuation import delayed, start_actuation
+from bounce_mjx.task.randomization import (
+    TERMS,
+    RandomizationConfig,
+    draw_world,
+    physics_parameters,
+)
+from test_physics import difference
+
+# Terms that leave the frictionless physics of the fused engine.
+_OTHER_PHYSICS = {"contact_friction", "torque_limit", "joint_frictionloss"}
+
+
+# Draws
+
+
+RANGES = {
+    name: (max(term.limits[0], 0.8), min(term.limits[1], 0.9)) for name, term in TERMS.items()
+}
+RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
+
+
+def test_draws_are_uniform_in_their_ranges() -> None:
+    config = RandomizationConfig(**RANGES)
+    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
+    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"))
+    worlds = jax.jit(jax.vmap(draw))(keys)
+    assert tuple(worlds) == tuple(sorted(TERMS)) and set(config.terms) == set(TERMS)
+    shares = []
+    for name, values in worlds.items():
+        low, high = RANGES[name]
+        assert values.shape == (2000, *TERMS[name].shape)
+        shares += list((np.asarray(values, float).reshape(2000, -1).T - low) / (high - low))
+    shares = np.array(shares)
+    assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
+    # Of all entries of all terms; each draw of them is independent of the others.
+    p_values = [stats.kstest(entry, "uniform").pvalue for entry in shares]
+    assert min(p_values) > 1e-3 / len(shares)
+    correlation = np.corrcoef(shares) - np.eye(len(shares))
+    assert np.abs(correlation).max() < 6 / np.sqrt(2000)
+
+
+def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
+    """JAX sorts the keys of a dictionary that it traces."""
+    ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
+    draw = functools.partial(draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"))
+    expected = draw(ranges)
+    for world in (jax.jit(draw)(ranges), draw(dict(reversed(ranges.items())))):
+        assert world.keys() == expected.keys()
+        for name, value in expected.items():
+            np.testing.assert_allclose(world[name], value, rtol=1e-6)
+
+
+def test_ranges_grow_from_the_nominal_values() -> None:
+    config = RandomizationConfig(
+        restitution=(0.75, 0.95), action_latency=(0.0, 0.04), camera_rate=(60, 120)
+    )
+
+    def ends(progress: float) -> dict:
+        return {name: [float(e) for e in r] for name, r in config.ranges(progress).items()}
+
+    assert ends(0.0)["restitution"] == pytest.approx([0.85, 0.85])
+    assert ends(0.5)["restitution"] == pytest.approx([0.80, 0.90])
+    assert ends(1.0)["restitution"] == pytest.approx([0.75, 0.95])
+    assert ends(0.25)["action_latency"] == pytest.approx([0.0, 0.01])
+    # No camera at all is no rate from which to grow.
+    assert ends(0.0)["camera_rate"] == ends(1.0)["camera_rate"] == [60.0, 120.0]
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range; give the lower end first"),
+        ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
+        ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
+        ({"drag": (0.0, 0.1)}, "unknown key drag; did you mean air_drag?"),
+    ],
+)
+def test_bad_range(values: dict, words: str) -> None:
+    with pytest.raises(UserError) as error:
+        validate(RandomizationConfig, values, "here")
+    assert words in str(error.value)
+
+
+def test_off_is_the_program_without_randomisation() -> None:
+    """Whatever the settings of a warm-up; and a term that is on is in the program."""
+
+    def program(**settings) -> tuple[str, int]:
+        env = BounceBall(EnvConfig(randomization=settings))
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        jaxpr = jax.make_jaxpr(env.step)(state, jnp.zeros(6))
+        return str(jaxpr), len(jaxpr.in_avals)
+
+    off, inputs = program()
+    assert "shift_right_logical" not in off
+    assert program(warmup_steps=1000, share=0.5) == (off, inputs)
+    on, more = program(ball_position_noise=(0.0, 0.01))
+    assert "shift_right_logical" in on and more > inputs
+
+
+@pytest.mark.parametrize("restitution", [0.72, 0.8, 0.9, 0.96])
+def test_drops_bounce_as_asked(mj_model, restitution: float) -> None:
+    """On MuJoCo's C engine: speed after by speed before the impact on the held paddle, without
+    gravity, at several phases of the time step."""
+    parameters = physics_parameters({"restitution": jnp.asarray(restitution)}, mj_model)
+    model = edited_model(mj_model, jax.tree.map(np.asarray, parameters))
+    model.opt.gravity[:] = 0.0
+    data = mujoco.MjData(model)
+    data.qpos[:6] = data.ctrl[:6] = EnvConfig().default_joint_angles
+    mujoco.mj_forward(model, data)
+    paddle, ball = data.geom("blocker"), model.geom("ball").size[0]
+    home, normal = paddle.xpos.copy(), paddle.xmat.reshape(3, 3)[:, 2].copy()
+    gap = model.geom("blocker").size[2] + ball
+    measured = []
+    for speed in (1.0, 2.0, 3.0, 4.0):
+        for phase in np.linspace(0.0, 1.0, 8, endpoint=False):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:6] = data.ctrl[:6] = EnvConfig().default_joint_angles
+            data.qpos[6:9] = home + (gap + 1e-3 * (1.0 + phase * speed)) * normal
+            data.qvel[6:9] = -speed * normal
+            mujoco.mj_step(model, data, nstep=60)
+            assert np.dot(data.qpos[6:9] - home, normal) > gap, "it has left the paddle"
+            measured.append(np.dot(data.qvel[6:9], normal) / speed)
+    assert np.mean(measured) == pytest.approx(restitution, abs=0.015)
+
+
+# Actions
+
+
+def simulated_targets(asked: np.ndarray, delay: int, lag: float, n: int) -> np.ndarray:
+    """Servo targets of each physics step, brute force: targets [T] of control steps of n physics
+    steps arrive `delay` physics steps late, through a filter with the time constant `lag` in
+    physics steps."""
+    inputs = np.concatenate([np.full(delay, asked[0]), np.repeat(asked[1:], n)])
+    outputs, y = [], asked[0]
+    for x in inputs[: n * (len(asked) - 1)]:
+        y = x + (y - x) * np.exp(-1.0 / lag) if lag else x
+        outputs.append(y)
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.4, 7.3])
+@pytest.mark.usefixtures("float64")
+def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float) -> None:
+    """Delays of any number of physics steps, up to three control steps."""
+    n, dt = 10, 0.01
+    config = RandomizationConfig(action_latency=(0.0, 0.031), servo_lag=(0.0, 0.01))
+    asked = np.random.default_rng(0).uniform(-1, 1, 20)
+
+    @jax.jit
+    @jax.vmap
+    def run(latency):
+        world = {"action_latency": latency, "servo_lag": jnp.asarray(lag * dt / n)}
+
+        def step(memory, target):
+            control, memory = delayed(world, memory, target[None], dt, n)
+            return memory, servo_targets(control, n)[:, 0]
+
+        memory = start_actuation(config, dt, jnp.asarray(asked[:1]))
+        return jax.lax.scan(step, memory, jnp.asarray(asked[1:]))[1].ravel()
+
+    delays = np.arange(32)
+    for delay, ours in zip(delays, run(jnp.asarray(delays * dt / n)), strict=True):
+        np.testing.assert_allclose(ours, simulated_targets(asked, delay, lag, n), atol=1e-12)
+
+
+def test_a_latency_is_rounded_to_a_physics_step() -> None:
+    config = RandomizationConfig(action_latency=(0.0, 0.03))
+    memory = start_actuation(config, 0.01, jnp.zeros(1))
+    for latency, switch in ((0.0124, 2.0), (0.0126, 3.0), (0.0199, 10.0), (0.02, 0.0)):
+        control, _ = delayed(
+            {"action_latency": jnp.asarray(latency)}, memory, jnp.ones(1), 0.01, 10
+        )
+        assert control.switch == switch
+
+
+class Run(NamedTuple):
+    """A free run of the fused engine in many worlds: arrays [T + 1 or T, ..., N]."""
+
+    env: BounceBall
+    starts: object
+    actions: np.ndarray
+    physics: PhysicsState
+    control: Control
+    target_height: np.ndarray
+    target_age: np.ndarray
+
+
+WORLDS, CONTROL_STEPS = 64, 200
+
+
+@pytest.fixture(scope="module")
+def free_run() -> Run:
+    """64 worlds, all terms of the physics, the actuation and the task drawn; low balls, so that
+    they bounce, and small actions, so that they go on bouncing."""
+    terms = {
+        "restitution": (0.7, 0.95), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
+        "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
+        "servo_lag": (0.0, 0.02), "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
+        "link_mass": (0.7, 1.3), "paddle_offset": (-0.01, 0.01), "paddle_tilt": (-0.02, 0.02),
+        "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035), "push_speed": (0.02, 0.05),
+        "push_interval": (0.3, 0.6), "target_height": (0.3, 0.8), "target_interval": (0.4, 0.7),
+        "ball_start": (-0.02, 0.02), "joint_start": (-0.02, 0.02),
+    }  # fmt: skip
+    with jax.enable_x64(True):
+        config = EnvConfig(randomization=terms, joint_angle_noise=0.0, ball_init_pos=(0.59, 0, 0.2))
+        env = BounceBall(config)
+        keys = jax.random.split(jax.random.PRNGKey(3), WORLDS)
+        actions = np.random.default_rng(1).uniform(-0.15, 0.15, (CONTROL_STEPS, 6, WORLDS))
+
+        @jax.jit
+        def run(keys, actions):
+            starts = jax.vmap(env.reset, out_axes=-1)(keys)
+
+            def step(state, action):
+                before, control = env.begin_step(state, action)
+                pipeline = before.pipeline_state
+                physics = env.engine.step(pipeline.parameters, pipeline.physics, control, 10)
+                after = env.finish_step(before, action, physics)
+                pipeline = after.pipeline_state
+                seen = (physics, control, pipeline.task.target_height, pipeline.memory.target_age)
+                return after, seen
+
+            def steps(state, action):
+                return jax.vmap(step, in_axes=-1, out_axes=-1)(state, action)
+
+            return starts, jax.lax.scan(steps, starts, actions)[1]
+
+        starts, seen = jax.device_get(run(keys, actions))
+    return Run(env, starts, actions, *seen)
+
+
+def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]:
+    """World w on MuJoCo's C engine [T, ...] and its steps with a contact; latency, lag, drag and
+    push are simulated here. The ball starts higher by `shift`."""
+    start = free_run.starts.pipeline_state
+    world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
+    of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
+    (model,) = episode_models(free_run.env, of_world)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
+    data.qpos[8] += shift
+    low, high = model.jnt_range[:6].T
+    ball = model.body("ball_link")
+    delay, lag = round(float(world["action_latency"]) / 1e-3), float(world["servo_lag"]) / 1e-3
+    asked, filtered = [data.qpos[:6].copy()], data.qpos[:6].copy()
+    after, contacts = [], 0
+    for t in range(CONTROL_STEPS):
+        asked.append(np.clip(data.qpos[:6] + 0.02 * free_run.actions[t, :, w], low, high))
+        # The drag is of the velocity before the push, and constant in a control step.
+        velocity = data.qvel[6:9].copy()
+        drag = world["air_drag"] * ball.mass[0] * np.linalg.norm(velocity) * velocity
+        data.xfrc_applied[ball.id, :3] = -drag
+        data.qvel[6:9] += free_run.control.ball_push[t, :, w]
+        for i in range(10):
+            arrived = asked[max(0, (10 * t + i - delay) // 10 + 1)]
+            filtered = arrived + (filtered - arrived) * np.exp(-1.0 / max(lag, 1e-3))
+            data.ctrl[:] = filtered
+            mujoco.mj_step(model, data)
+            contacts += data.ncon
+        after.append((data.qpos.copy(), data.qvel.copy()))
+    return PhysicsState(*(np.array(x) for x in zip(*after, strict=True))), contacts
+
+
+@pytest.mark.usefixtures("float64")
+def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property) -> None:
+    """Each engine runs freely. Contacts multiply a difference, in a few worlds a millionfold; there
+    the engines are as close as two runs of C whose balls start a picometre apart."""
+    errors, apart, contacts = np.zeros((3, WORLDS)), np.zeros((3, WORLDS)), 0
+    for w in range(WORLDS):
+        ours = PhysicsState(*(x[..., w] for x in free_run.physics[:2]))
+        reference, touching = c_run(free_run, w)
+        shifted, _ = c_run(free_run, w, shift=1e-12)
+        contacts += touching
+        for i, steps in enumerate((slice(0, 50), slice(0, 100), slice(0, 200))):
+            until = [PhysicsState(*(x[steps] for x in s[:2])) for s in (reference, ours, shifted)]
+            errors[i, w] = max(difference(until[1], until[0]))
+            apart[i, w] = max(difference(until[2], until[0]))
+    record_property("largest_difference", errors.max())
+    print(f"{contacts} contact steps, differences after 500, 1000, 2000 steps {errors.max(axis=1)}")
+    assert contacts > 20 * WORLDS
+    assert errors[0].max() < 1e-9
+    assert np.all((errors < 1e-9) | (errors < apart))
+    assert np.mean(errors[2] < 1e-9) > 0.85
+
+
+def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
+    world, pushes = free_run.starts.pipeline_state.world, free_run.control.ball_push
+    size = np.linalg.norm(pushes, axis=1)
+    assert np.all(pushes[:, 2] == 0.0)
+    angles, first = [], []
+    for w in range(WORLDS):
+        times = np.flatnonzero(size[:, w])
+        np.testing.assert_allclose(size[times, w], world["push_speed"][w])
+        interval = float(world["push_interval"][w]) / 0.01
+        # They recur exactly, but for the control step in which they fall.
+        grid = times[0] + interval * np.arange(len(times))
+        assert np.abs(times - grid).max() <= 1.0 + 1e-6
+        assert len(times) >= int(CONTROL_STEPS / interval) - 1
+        angles += list(np.arctan2(pushes[times, 1, w], pushes[times, 0, w]))
+        first.append(times[0] / interval)
+    assert stats.kstest((np.array(angles) + np.pi) / (2 * np.pi), "uniform").pvalue > 1e-3
+    # A reset falls anywhere into an interval.
+    assert stats.kstest(first, "uniform").pvalue > 1e-3
+
+
+def test_targets_change_at_their_interval(free_run: Run) -> None:
+    world = free_run.starts.pipeline_state.world
+    start = free_run.starts.pipeline_state.task.target_height
+    np.testing.assert_array_equal(start, world["target_height"])
+    heights = np.concatenate([start[None], free_run.target_height])
+    assert 0.3 <= heights.min() < 0.35 and 0.75 < heights.max() <= 0.8
+    for w in range(WORLDS):
+        changed = np.flatnonzero(np.diff(heights[:, w]))
+        interval = float(world["target_interval"][w]) / 0.01
+        grid = changed[0] + interval * np.arange(len(changed))
+        assert np.abs(changed - grid).max() <= 1.0 + 1e-6
+        assert len(changed) >= int(CONTROL_STEPS / interval) - 1
+        # The age after the step in which it changed is one step.
+        since = np.arange(CONTROL_STEPS) - changed[:, None]
+        age = 1 + np.where(since >= 0, since, np.arange(CONTROL_STEPS)).min(axis=0)
+        np.testing.assert_allclose(free_run.target_age[:, w], 0.01 * age, atol=1e-9)
+
+
+# Sensors
+
+
+PARTS = {
+    "joint_angles": 3, "ball_position": 4, "ball_quaternion": 0, "joint_velocities": 2,
+    "ball_velocity": 2, "ball_angular_velocity": 0, "paddle_position": 1, "target_height": 1,
+    "action": 3, "ball_age": 1, "apex_error": 3, "bounce_position": 3, "bounce_interval": 3,
+    "bounce_joint_angles": 2, "bounce_joint_velocities": 2,
+}  # fmt: skip
+SENSORS = {
+    "ball_latency": (0.0, 0.03), "camera_rate": (50.0, 250.0), "frame_drop": (0.0, 0.9),
+    "ball_position_noise": (0.0, 1.0), "ball_position_bias": (-1.0, 1.0),
+    "ball_velocity_noise": (0.0, 1.0), "ball_velocity_bias": (-1.0, 1.0),
+    "joint_angle_noise": (0.0, 1.0), "encoder_bias": (-1.0, 1.0),
+    "joint_velocity_noise": (0.0, 1.0), "joint_velocity_bias": (-1.0, 1.0),
+}  # fmt: skip
+PERFECT = {name: (0.0, 0.0) for name in SENSORS} | {"camera_rate": (50.0, 250.0)}
+EPISODES, STEPS, DT = 32, 150, 0.01
+
+
+def trajectory() -> tuple[np.ndarray, np.ndarray]:
+    """A ball that bounces on the home paddle, and an arm that sways: qpos and qvel [T + 1]."""
+    time = DT * np.arange(STEPS + 1)
+    qpos, qvel = np.zeros((STEPS + 1, 13)), np.zeros((STEPS + 1, 12))
+    qpos[:, 9] = 1.0
+    phases = np.arange(6)
+    home = np.array(EnvConfig().default_joint_angles)
+    qpos[:, :6] = home + 0.01 * np.sin(3.0 * time[:, None] + phases)
+    qvel[:, :6] = 0.03 * np.cos(3.0 * time[:, None] + phases)
+    z, vz = 0.35, 0.0
+    for t in range(STEPS + 1):
+        qpos[t, 6:9] = 0.59 + 0.02 * np.sin(5 * time[t]), 0.01 * np.cos(4 * time[t]), z
+        qvel[t, 6:9] = 0.1 * np.cos(5 * time[t]), -0.04 * np.sin(4 * time[t]), vz
+        z, vz = z + vz * DT, vz - 9.81 * DT
+        if z < 0.075 and vz < 0.0:
+            vz = 2.2 + 0.3 * np.sin(t)
+    return qpos, qvel
+
+
+class Watch(NamedTuple):
+    """What the sensors made of the trajectory: [N, T, ...]."""
+
+    world: dict
+    phase: np.ndarray
+    parts: dict
+    """Values of each part [N, T, n, size], the newest first."""
+    actions: np.ndarray
+
+
+@functools.cache
+def watching(camera: bool, velocity: str):
+    """A compiled (ranges, keys) -> what an environment with these sensors sees."""
+    sensors = {name: r for name, r in SENSORS.items() if camera or name != "camera_rate"}
+    observation = PARTS | {"velocity": velocity}
+    env = BounceBall(EnvConfig(randomization=sensors, observation=observation))
+    qpos, qvel = trajectory()
+    actions = np.random.default_rng(4).uniform(-1, 1, (STEPS, 6))
+
+    @jax.jit
+    def watch(ranges, keys):
+        def of_one(key, ranges):
+            start = env.reset(key, ranges)
+            physics = PhysicsState(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
+            pipeline = start.pipeline_state._replace(physics=physics)
+            # The first memory has the ball of the trajectory too.
+            memory = env._first_memory(pipeline, env.kinematics(pipeline), key)
+            start = start.replace(pipeline_state=pipeline._replace(memory=memory))
+
+            def step(state, inputs):
+                action, physics = inputs
+                state, _ = env.begin_step(state, action)
+                state = env.finish_step(state, action, physics)
+                return state, state.obs
+
+            physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
+            _, obs = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
+            return start.pipeline_state.world, memory.phases[0], obs
+
+        return jax.vmap(of_one)(keys, ranges)
+
+    def run(**changed: tuple[float, float]) -> Watch:
+        ranges = {name: PERFECT[name] for name in sensors} | changed
+        ranges = {n: tuple(jnp.full(EPISODES, e) for e in r) for n, r in ranges.items()}
+        keys = jax.random.split(jax.random.PRNGKey(0), EPISODES)
+        world, phase, obs = jax.device_get(watch(ranges, keys))
+        parts = {
+            part.name: obs[..., env.layout[part.name]].reshape(
+                EPISODES, STEPS, PARTS[part.name], -1
+            )
+            for part in env.layout.parts
+        }
+        return Watch(world, phase, parts, actions)
+
+    return run
+
+
+@pytest.fixture
+def watch(float64):
+    return watching(camera=True, velocity="measured")
+
+
+def pictures(world: dict, phase: float, w: int):
+    """Measured position, velocity and age of each control step, simulated frame by frame: the
+    camera takes picture n at (n + phase) / rate; it arrives after the latency."""
+    qpos, qvel = trajectory()
+    time = DT * np.arange(STEPS + 1)
+    rate, latency = float(world["camera_rate"][w]), float(world["ball_latency"][w])
+    taken = (np.arange(2000) + phase) / rate
+    taken = taken[taken < time[-1]]
+
+    def at(instants: np.ndarray, of: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(instants, time, column) for column in of.T], axis=1)
+
+    positions, velocities = at(taken, qpos[:, 6:9]), at(taken, qvel[:, 6:9])
+    for now in time[1:]:
+        arrived = np.flatnonzero(taken + latency <= now + 1e-4 / rate)
+        if len(arrived):
+            n = arrived[-1]
+            yield n, positions[n], velocities[n], now - taken[n]
+        else:
+            yield -1, qpos[0, 6:9], qvel[0, 6:9], now
+
+
+def test_camera_is_that_of_a_simulation(watch) -> None:
+    """Rates of 50 to 250 Hz and latencies of 0 to 30 ms, any phase, no noise."""
+    seen = watch(ball_latency=(0.0, 0.03))
+    for w in range(EPISODES):
+        expected = list(pictures(seen.world, seen.phase[w], w))
+        _, position, velocity, age = (np.array(x) for x in zip(*expected, strict=True))
+        np.testing.assert_allclose(seen.parts["ball_position"][w, :, 0], position, atol=2e-5)
+        np.testing.assert_allclose(seen.parts["ball_velocity"][w, :, 0], velocity, atol=2e-3)
+        np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], age, atol=2e-6)
+    held = np.diff(seen.parts["ball_position"][:, :, 0], axis=1) == 0.0
+    rate = np.asarray(seen.world["camera_rate"])
+    assert np.all(held.all(axis=2).any(axis=1)[rate < 90]), "a slow camera holds its picture"
+
+
+def test_lost_pictures_do_not_come_later(watch) -> None:
+    """At 60 Hz, a control step has one new picture or none; of the new ones, a share is lost."""
+    seen = watch(frame_drop=(0.3, 0.3), camera_rate=(60.0, 60.0))
+    new, lost = 0, 0
+    for w in range(EPISODES):
+        expected = list(pictures(seen.world, seen.phase[w], w))
+        position, age = seen.parts["ball_position"][w, :, 0], seen.parts["ball_age"][w, :, 0, 0]
+        last = trajectory()[0][0, 6:9]
+        for t, now in enumerate(expected):
+            due = now[0] > (expected[t - 1][0] if t else -1)
+            is_new = due and np.abs(position[t] - now[1]).max() < 2e-5
+            last = now[1] if is_new else last
+            np.testing.assert_allclose(position[t], last, atol=2e-5)
+            # At first the ball is at rest, and looks the same in all pictures.
+            if t >= 10:
+                new, lost = new + due, lost + (due and not is_new)
+                assert not is_new or age[t] == pytest.approx(now[3], abs=2e-6)
+    share = lost / new
+    assert abs(share - 0.3) < 4 * np.sqrt(0.21 / new)
+
+
+def test_noise_has_its_size_and_is_held_with_the_picture(watch) -> None:
+    sizes = {
+        "ball_position": 0.02, "ball_velocity": 0.3, "joint_angle": 0.01, "joint_velocity": 0.2,
+    }  # fmt: skip
+    noisy = {f"{name}_noise": (size, size) for name, size in sizes.items()}
+    seen, clean = watch(**noisy, camera_rate=(50.0, 50.0)), watch(camera_rate=(50.0, 50.0))
+    for name, part in (
+        ("ball_position", "ball_position"),
+        ("ball_velocity", "ball_velocity"),
+        ("joint_angle", "joint_angles"),
+        ("joint_velocity", "joint_velocities"),
+    ):
+        error = (seen.parts[part] - clean.parts[part])[:, 5:, 0]
+        if "ball" in name:
+            held = np.all(clean.parts["ball_age"][:, 6:] > clean.parts["ball_age"][:, 5:-1], axis=2)
+            held = held[..., 0]
+            assert 0.4 < held.mean() < 0.6
+            np.testing.assert_allclose(error[:, 1:][held], error[:, :-1][held], atol=1e-12)
+            error = error[:, 1:][~held]
+        error = error.reshape(-1, error.shape[-1]) / sizes[name]
+        assert stats.kstest(error.ravel(), "norm").pvalue > 1e-4
+        correlation = np.corrcoef(error.T) - np.eye(error.shape[1])
+        assert np.abs(correlation).max() < 6 / np.sqrt(len(error))
+    # The paddle is where the wrong angles say.
+    assert np.abs(seen.parts["paddle_position"] - clean.parts["paddle_position"]).max() > 1e-3
+
+
+def test_biases_are_constant_in_an_episode(watch) -> None:
+    names = {
+        "ball_position_bias": "ball_position", "ball_velocity_bias": "ball_velocity",
+        "encoder_bias": "joint_angles", "joint_velocity_bias": "joint_velocities",
+    }  # fmt: skip
+    seen = watch(**dict.fromkeys(names, (-0.05, 0.05)), camera_rate=(100.0, 100.0))
+    clean = watch(camera_rate=(100.0, 100.0))
+    for bias, part in names.items():
+        error = seen.parts[part][:, 5:, 0] - clean.parts[part][:, 5:, 0]
+        expected = np.broadcast_to(seen.world[bias][:, None], error.shape)
+        np.testing.assert_allclose(error, expected, atol=1e-9)
+        assert np.unique(expected[:, 0].round(9)).size == expected[:, 0].size
+
+
+def test_histories_have_the_newest_first(watch) -> None:
+    seen = watch(ball_position_noise=(0.01, 0.01), joint_angle_noise=(0.01, 0.01))
+    for name in ("joint_angles", "ball_position", "joint_velocities", "ball_velocity", "action"):
+        values = seen.parts[name]
+        for i in range(1, PARTS[name]):
+            np.testing.assert_array_equal(values[:, i:, i], values[:, :-i, 0])
+    np.testing.assert_allclose(seen.parts["action"][0, :, 0], seen.actions, atol=1e-7)
+    qpos, qvel = trajectory()
+    np.testing.assert_allclose(seen.parts["joint_velocities"][0, :, 0], qvel[1:, :6], atol=1e-9)
+
+
+def test_bounces_are_those_of_the_measurements(watch) -> None:
+    """Against a pass over the measured heights with whole segments at hand."""
+    seen = watch(ball_position_noise=(0.002, 0.002), camera_rate=(120.0, 120.0))
+    for w in range(4):
+        part = {name: values[w] for name, values in seen.parts.items()}
+        ball, target = part["ball_position"][:, 0], part["target_height"][0, 0, 0]
+        low = ball[:, 2] < part["paddle_position"][:, 0, 2] + EnvConfig().bounce_max_distance
+        starts = [t for t in range(STEPS) if low[t] and not (t and low[t - 1])]
+        assert len(starts) >= 3
+        for t in range(starts[0], STEPS):
+            begun = [s for s in starts if s <= t][::-1]
+            for i, s in enumerate(begun[:3]):
+                end = s
+                while end + 1 <= t and low[end + 1]:
+                    end += 1
+                lowest = s + int(np.argmin(ball[s : end + 1, 2]))
+                np.testing.assert_array_equal(part["bounce_position"][t, i], ball[lowest, :2])
+                if i < 2:
+                    angles = part["joint_angles"][lowest, 0]
+                    np.testing.assert_array_equal(part["bounce_joint_angles"][t, i], angles)
+                    speeds = part["joint_velocities"][lowest, 0]
+                    np.testing.assert_array_equal(part["bounce_joint_velocities"][t, i], speeds)
+                before = [r for r in starts if r < s]
+                # Times since the reset count from 0, those of the rows from one step.
+                interval = DT * (s - before[-1] if before else s + 1)
+                assert part["bounce_interval"][t, i, 0] == pytest.approx(interval, abs=1e-9)
+                flown = np.flatnonzero(low[:s])
+                flight = ball[flown[-1] if len(flown) else 0 : s, 2]
+                apex = max(flight.max(), trajectory()[0][0, 8] if not len(flown) else 0.0)
+                assert part["apex_error"][t, i, 0] == pytest.approx(apex - target, abs=1e-9)
+
+
+@pytest.mark.usefixtures("float64")
+def test_latency_without_a_camera_and_velocity_by_differences() -> None:
+    """A picture at every control step; its velocity is that between it and the one before."""
+    run = watching(camera=False, velocity="differences")
+    seen = run(ball_latency=(0.0, 0.03))
+    qpos, _ = trajectory()
+    time = DT * np.arange(STEPS + 1)
+    for w, latency in enumerate(np.asarray(seen.world["ball_latency"])):
+        then = np.maximum(time[1:] - latency, 0.0)
+        expected = np.stack([np.interp(then, time, x) for x in qpos[:, 6:9].T], axis=1)
+        position = seen.parts["ball_position"][w, :, 0]
+        np.testing.assert_allclose(position, expected, atol=1e-9)
+        np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], latency, atol=1e-9)
+        velocity = seen.parts["ball_velocity"][w, :, 0]
+        np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)
+
+
+def test_results_are_of_the_truth() -> None:
+    """A policy that ignores its observation has the same results, however absurd the sensors."""
+    sensors = {
+        "ball_position_noise": (0.0, 5.0), "ball_velocity_noise": (0.0, 50.0),
+        "ball_position_bias": (0.0, 3.0), "ball_latency": (0.0, 0.05),
+    }  # fmt: skip
+    env = BounceBall(
+        EnvConfig(randomization=sensors, episode_seconds=2.5, ball_init_pos=(0.59, 0, 0.3))
+    )
+    networks = make_networks(PPOConfig(hidden_layers=(4,)), env.observation_size, 6)
+    params = networks.policy_network.init(jax.random.PRNGKey(0))
+    deaf = Policy(init_normalizer(env.observation_size), jax.tree.map(jnp.zeros_like, params))
+    ranges = {
+        name: (jnp.array([0.0, high]), jnp.array([0.0, high]))
+        for name, (_, high) in sensors.items()
+    }
+    ranges["ball_position_bias"] = tuple(jnp.array([[0.0] * 3, [3.0] * 3]) for _ in range(2))
+    statistics = make_evaluator(env, networks, 16)(deaf, jax.random.PRNGKey(2), ranges)
+    assert np.any(statistics.max_bounces > 0)
+    for name, values in statistics._asdict().items():
+        clean, absurd = np.asarray(values).reshape(2, 8)
+        np.testing.assert_array_equal(clean, absurd, err_msg=name)
+
+
+# Random numbers
+
+
+COUNT = 20_000
+
+
+@pytest.fixture(scope="module")
+def counters() -> np.ndarray:
+    """Counters of consecutive control steps of one environment."""
+
+    def step(counter, _):
+        return noise.next_counter(counter), counter
+
+    return jax.lax.scan(step, jnp.int32(12345), None, length=COUNT)[1]
+
+
+@pytest.mark.parametrize("kind", ["uniform", "norm"])
+def test_random_numbers_have_their_distribution(counters, kind: str) -> None:
+    generate = {"uniform": noise.uniform, "norm": noise.normal}[kind]
+    streams = [
+        np.asarray(jax.vmap(lambda c, s=s: generate(c, s, (5,), jnp.dtype("float32")))(counters))
+        for s in (0, 1, 4)
+    ]
+    columns = np.concatenate(streams, axis=1).T.astype(float)
+    assert np.all(np.isfinite(columns))
+    for column in columns:
+        assert stats.kstest(column, kind).pvalue > 1e-4
+        # Nor do neighbouring control steps know of each other.
+        for lag in (1, 2, 3):
+            assert abs(np.corrcoef(column[:-lag], column[lag:])[0, 1]) < 5 / np.sqrt(COUNT)
+    correlation = np.corrcoef(columns) - np.eye(len(columns))
+    assert np.abs(correlation).max() < 5 / np.sqrt(COUNT)
+
+
+def test_neighbouring_counters_give_unrelated_numbers() -> None:
+    """Environments whose first counters are close, and the pairs of numbers of one counter."""
+    numbers = jax.vmap(lambda c: noise.uniform(c, 0, (4,), jnp.dtype("float32")))(
+        jnp.arange(COUNT, dtype=jnp.int32)
+    )
+    numbers = np.asarray(numbers, float)
+    assert abs(np.corrcoef(numbers[:-1, 0], numbers[1:, 0])[0, 1]) < 5 / np.sqrt(COUNT)
+    # On a grid of 8 x 8, each cell has its share.
+    cells, *_ = np.histogram2d(numbers[:, 0], numbers[:, 1], bins=8, range=((0, 1), (0, 1)))
+    assert stats.chisquare(cells.ravel()).pvalue > 1e-4
+
+
+def test_the_counter_visits_many_values(counters) -> None:
+    assert len(np.unique(np.asarray(counters))) == COUNT

@@ -1,0 +1,452 @@
+"""The robustness report: its suite, the episodes behind it, and the ways to show it."""
+
+import io
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from matplotlib.patches import Rectangle
+from rich.console import Console
+
+from bounce_mjx import EnvConfig
+from bounce_mjx.commands import robustness as robustness_command
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import robustness
+from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport, measure_conditions
+from bounce_mjx.evaluation.statistics import empty_statistics
+from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.reports.page import write_report
+from bounce_mjx.reports.robustness import load_robustness, robustness_figure, robustness_table
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.task.randomization import TERMS, RandomizationConfig
+
+RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
+
+
+def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = None):
+    """The conditions of a suite file, without the nominal one."""
+    path = tmp_path / "suite.yaml"
+    path.write_text(yaml.safe_dump({"perturbations": list(perturbations)}), encoding="utf-8")
+    nominal, *others = load_suite(path, trained or EnvConfig())
+    assert (nominal.perturbation.name, nominal.ranges, nominal.trained) == ("nominal", {}, True)
+    return others
+
+
+# The suite
+
+
+def test_the_shipped_suite_has_every_term() -> None:
+    conditions = load_suite(resource_path("configs/robustness.yaml"), EnvConfig())
+    assert len(conditions) >= 100
+    assert {term for condition in conditions for term in condition.ranges} == TERMS.keys()
+
+    def values(term: str) -> set[float]:
+        """The values of the conditions that perturb this term alone."""
+        alone = [c.ranges[term] for c in conditions if c.ranges.keys() == {term}]
+        return {round(float(np.ravel(high)[i]), 6) for _, high in alone for i in range(high.size)}
+
+    assert values("action_latency") >= {0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04}
+    assert values("restitution") >= {0.7, 0.72, 0.96}
+    assert values("contact_friction") >= {0.1, 0.3, 0.6}
+    assert values("gravity_tilt") >= {round(s * np.radians(3.0), 6) for s in (-1, 1)}
+    assert values("ball_velocity_noise") >= {0.1}
+    assert values("target_height") >= {0.3, 0.8}
+
+
+def test_strengths_have_a_unit_and_values_a_shape(tmp_path: Path) -> None:
+    tilt, start, real = suite(
+        tmp_path,
+        dict(name="tilt", unit="deg", strengths=[2], terms={"paddle_tilt": ["-strength", 0.5]}),
+        dict(
+            name="start",
+            unit="cm",
+            strengths=[5],
+            terms={"ball_start": {"from": ["-strength", 0, 0], "to": "strength"}, "air_drag": 0.1},
+        ),
+        dict(name="real", terms={"servo_gain": 0.9, "target_height": {"from": 0.3, "to": 0.8}}),
+    )
+    np.testing.assert_allclose(tilt.ranges["paddle_tilt"], [[-np.pi / 90, 0.5]] * 2)
+    np.testing.assert_allclose(start.ranges["ball_start"], [[-0.05, 0, 0], [0.05] * 3])
+    np.testing.assert_allclose(start.ranges["air_drag"], [0.1, 0.1])
+    assert (start.strength, real.strength) == (5.0, None)
+    np.testing.assert_allclose(real.ranges["servo_gain"], np.full((2, 6), 0.9))
+    assert real.target_heights == (0.3, 0.8)
+    assert tilt.target_heights == EnvConfig().target_height_range
+
+
+def test_settings_change_the_task_and_drop_the_training_world(tmp_path: Path) -> None:
+    trained = EnvConfig(randomization={"ball_mass": (0.8, 1.2)}, action_scale=0.03)
+    (slow,) = suite(
+        tmp_path,
+        dict(
+            name="slow",
+            unit="ms",
+            strengths=[20],
+            settings={"control_dt": "strength", "observation.velocity": "differences"},
+        ),
+        trained=trained,
+    )
+    assert (slow.env.control_dt, slow.env.observation.velocity) == (0.02, "differences")
+    assert (slow.env.action_scale, slow.env.randomization.terms) == (0.03, ())
+    assert not slow.trained
+
+
+def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
+    trained = EnvConfig(
+        randomization={"action_latency": (0.0, 0.02), "gravity_tilt": (-0.02, 0.02)},
+    )
+    late, tilt, both, everything = (
+        dict(name="late", unit="ms", strengths=[0, 20, 21], terms={"action_latency": "strength"}),
+        dict(name="tilt", strengths=[-0.02, -0.03], terms={"gravity_tilt": [0, "strength"]}),
+        dict(name="both", terms={"action_latency": 0.01, "air_drag": 0.1}),
+        dict(name="all", trained_ranges=True),
+    )
+    conditions = suite(tmp_path, late, tilt, both, everything, trained=trained)
+    assert [c.trained for c in conditions] == [True, True, False, True, False, False, True]
+    np.testing.assert_allclose(conditions[-1].ranges["gravity_tilt"], [[-0.02] * 2, [0.02] * 2])
+    assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt"}
+    # Without any randomisation, only what leaves the world as it is.
+    conditions = suite(tmp_path, late, tilt, both, everything)
+    assert [c.trained for c in conditions] == [True, *[False] * 5]
+
+
+LATE = dict(name="late", strengths=[0.01], terms={"action_latency": "strength"})
+MISTAKES = {
+    "unknown term": (
+        [LATE | {"terms": {"action_latencies": "strength"}}],
+        "unknown term action_latencies; did you mean action_latency?",
+    ),
+    "unknown key": ([LATE | {"strength": 1}], "unknown key"),
+    "no strengths": ([LATE | {"strengths": []}], "it has no strengths"),
+    "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "strengths are alike"),
+    "nothing": ([dict(name="late")], "it changes nothing"),
+    "unknown unit": ([LATE | {"unit": "furlongs"}], "the unit 'furlongs' is unknown"),
+    "no name": ([LATE | {"name": ""}], "the name is empty"),
+    "same name": ([LATE, LATE], "'late': the name is taken"),
+    "reserved name": ([LATE | {"name": "nominal"}], "the name is taken"),
+    "no number": ([LATE | {"terms": {"action_latency": "x"}, "strengths": []}], "is 'x', but must"),
+    "not finite": ([LATE | {"terms": {"air_drag": float("nan")}, "strengths": []}], "is nan, but"),
+    "length": (
+        [LATE | {"terms": {"paddle_tilt": ["strength", 0, 0]}}],
+        "paddle_tilt has 3 values, but must have 2",
+    ),
+    "ends": (
+        [LATE | {"terms": {"air_drag": {"low": 0, "to": "strength"}}}],
+        "air_drag has other keys than from and to",
+    ),
+    "order": (
+        [LATE | {"terms": {"paddle_tilt": {"from": "strength", "to": 0}}}],
+        "paddle_tilt is from a value to a lower one",
+    ),
+    "limit": (
+        [LATE | {"terms": {"restitution": "strength"}}],
+        "'late' at 0.01: randomization: restitution (0.01, 0.01) leaves 0.6 to 0.98",
+    ),
+    "setting": (
+        [dict(name="slow", settings={"control_step": 0.02})],
+        "unknown key control_step; did you mean control_dt?",
+    ),
+    "size": (
+        [dict(name="blind", settings={"observation.ball_position": 0})],
+        "it changes the quantities of the observation",
+    ),
+    "randomisation": (
+        [dict(name="late", settings={"randomization.action_latency": [0, 1]})],
+        "randomization.action_latency is not a setting to perturb",
+    ),
+    "no list": (3, "perturbations is 3, but must be a list"),
+    "empty": ([], "perturbations is [], but must have at least 1 item"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_in_a_suite_is_one_sentence(name: str, tmp_path: Path, capsys) -> None:
+    perturbations, words = MISTAKES[name]
+    path = tmp_path / "suite.yaml"
+    path.write_text(yaml.safe_dump({"perturbations": perturbations}), encoding="utf-8")
+    with pytest.raises(SystemExit) as exit_info:
+        robustness_command.main(["--suite", str(path), "--out", str(tmp_path)])
+    assert exit_info.value.code == 2
+    error = capsys.readouterr().err
+    assert "suite.yaml" in error and error.count("\n") == 1 and words in error, error
+
+
+def test_a_suite_that_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="the suite .* cannot be read"):
+        load_suite(tmp_path / "none.yaml", EnvConfig())
+    (tmp_path / "list.yaml").write_text("[1, 2]", encoding="utf-8")
+    with pytest.raises(UserError, match="holds a list, .*write it like configs/robustness.yaml"):
+        load_suite(tmp_path / "list.yaml", EnvConfig())
+
+
+# The episodes
+
+
+@pytest.fixture(scope="module")
+def shipped() -> tuple[Policy, PPOConfig, EnvConfig]:
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    # Long enough for a bounce that is settled.
+    return (
+        load_policy(checkpoint, config),
+        config.ppo,
+        config.env.model_copy(update={"episode_seconds": 3.0}),
+    )
+
+
+def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
+    """The nominal one, one that the shipped policy masters, and one that it does not."""
+    drag = dict(name="drag", strengths=[0.1], terms={"air_drag": "strength"})
+    tilt = dict(name="tilt", unit="deg", strengths=[3], terms={"paddle_tilt": [0, "strength"]})
+    path = tmp_path / "suite.yaml"
+    path.write_text(yaml.safe_dump({"perturbations": [drag, tilt]}), encoding="utf-8")
+    return load_suite(path, env)
+
+
+def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
+    policy, ppo, env = shipped
+    conditions = three_conditions(tmp_path, env)
+    fused, engine = measure_conditions(policy, ppo, conditions, episodes=4, physics="fused")
+    c, engine_c = measure_conditions(policy, ppo, conditions, episodes=4, physics="mujoco")
+    assert (engine, engine_c) == ("fused", "mujoco")
+    for ours, reference in zip(fused, c, strict=True):
+        assert ours.failed == reference.failed
+        assert ours.values["stable"] == reference.values["stable"]
+        assert ours.mean_length_s == pytest.approx(reference.mean_length_s, abs=0.03)
+        assert ours.values["upward speed"] == pytest.approx(
+            reference.values["upward speed"], abs=0.02
+        )
+    nominal, drag, tilt = fused
+    assert nominal.passed and drag.passed and "stable" in tilt.failed
+    # The worlds are not one and the same.
+    assert drag.values["upward speed"] < nominal.values["upward speed"] - 0.005
+
+
+def test_a_policy_that_ignores_the_ball_fails(shipped, tmp_path: Path) -> None:
+    policy, ppo, env = shipped
+    conditions = three_conditions(tmp_path, env)
+    layout = env.observation.layout
+    of_ball = np.r_[layout["ball_position"], layout["ball_velocity"]]
+
+    def blinded(path: tuple, array: jax.Array) -> jax.Array:
+        first = "hidden_0" in jax.tree_util.keystr(path) and array.ndim == 2
+        return array.at[of_ball].set(0.0) if first else array
+
+    blind = policy._replace(params=jax.tree_util.tree_map_with_path(blinded, policy.params))
+    kernel = blind.params["params"]["MLP_0"]["hidden_0"]["kernel"]
+    assert np.all(kernel[of_ball] == 0.0) and np.any(kernel != 0.0)
+    outcomes, _ = measure_conditions(blind, ppo, conditions, episodes=4, physics="fused")
+    assert all("stable" in outcome.failed for outcome in outcomes)
+
+
+def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeypatch) -> None:
+    """In whatever program and call it is simulated: with statistics that tell of the ranges."""
+    conditions = suite(
+        tmp_path,
+        LATE | dict(unit="ms", strengths=[0, 5, 10, 15, 20]),
+        dict(name="camera", unit="Hz", strengths=[60, 120], terms={"camera_rate": "strength"}),
+        dict(name="target", strengths=[0.8], terms={"target_height": "strength"}),
+        dict(name="slow", strengths=[0.02], settings={"control_dt": "strength"}),
+    )  # fmt: skip
+    calls = []
+
+    def make_evaluator(env, networks, count):
+        terms = env.config.randomization.terms
+
+        def evaluate(policy, key, ranges):
+            calls.append((terms, count))
+            statistics = empty_statistics(count)
+            given = {name: np.repeat(low, 4) for name, (low, _) in (ranges or {}).items()}
+            late = given.get("action_latency", np.zeros(count))
+            rate = given.get("camera_rate", np.zeros(count))
+            # 100 steps of a second: a sum of speeds is a number of a condition.
+            return statistics._replace(
+                steps=100.0 + 1000.0 * late + rate,
+                rising_steps=np.ones(count),
+                rising_speed=given.get("target_height", np.full(count, 0.5)) + late,
+            )
+
+        return evaluate
+
+    monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
+    monkeypatch.setattr(robustness, "_CPU_BATCH", 14)
+    done = []
+    outcomes, _ = measure_conditions(
+        None, PPOConfig(), conditions, episodes=4, progress=done.append
+    )
+    assert [(o.perturbation, o.strength) for o in outcomes] == [
+        *[("late", s) for s in (0, 5, 10, 15, 20)],
+        ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02),
+    ]  # fmt: skip
+    lengths = [1.0, 1.05, 1.1, 1.15, 1.2, 1.6, 2.2, 1.0, 2.0]
+    np.testing.assert_allclose([o.mean_length_s for o in outcomes], lengths, rtol=1e-6)
+    # The neutral target is the task's own; at 0.8 m the speed is not judged.
+    speeds = [0.4, 0.405, 0.41, 0.415, 0.42, 0.5, 0.5, 0.8, 0.5]
+    np.testing.assert_allclose([o.values["upward speed"] for o in outcomes], speeds, rtol=1e-6)
+    assert done == sorted(done) and done[-1] == 9
+    plain = ("action_latency", "target_height")
+    assert calls == [(plain, 12)] * 2 + [(("camera_rate",), 8), ((), 4)]
+
+
+def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
+    env = EnvConfig(target_height_range=(0.3, 0.5))
+    for name, term in TERMS.items():
+        bounds = neutral_range(name, env)
+        if term.nominal is not None:
+            np.testing.assert_array_equal(bounds, np.full((2, *term.shape), term.nominal))
+    np.testing.assert_array_equal(neutral_range("target_height", env), [0.3, 0.5])
+    assert neutral_range("camera_rate", env) is None
+
+
+# Its shape
+
+
+def outcome(name: str, strength: float | None = None, **changes) -> Outcome:
+    values = dict(zip(RESULTS, (100.0, 99.0, 98.0, 1.4, 100.0), strict=True))
+    given = dict(
+        perturbation=name, group="g", unit="ms", strength=strength, trained=False,
+        values=values, failed=[], mean_length_s=20.0,
+    )  # fmt: skip
+    return Outcome(**(given | changes))
+
+
+@pytest.fixture
+def report() -> RobustnessReport:
+    bad = dict(zip(RESULTS, (50.0, None, None, 1.8, 25.0), strict=True))
+    failed = ["consecutive bounces", "height", "stable"]
+    return RobustnessReport(
+        checkpoint="c", steps=1, suite="s", physics="fused", episodes=4, seed=0,
+        outcomes=[
+            outcome("nominal", group="nominal", trained=True),
+            outcome("late", 0.0, trained=True),
+            outcome("late", 5.0, trained=True),
+            outcome("late", 10.0, values=bad, failed=failed),
+            outcome("other", 1.0, group="h"),
+        ],
+    )  # fmt: skip
+
+
+def test_table_tells_every_figure(report: RobustnessReport) -> None:
+    stream = io.StringIO()
+    Console(file=stream, width=80).print(robustness_table(report))
+    lines = stream.getvalue().splitlines()
+    assert "4 of 5 conditions meet all judged results" in lines[0]
+    (row,) = [line.split() for line in lines if "10 ms" in line]
+    assert row == ["10", "ms", "25.0*", "50.0*", "none", "none*", "1.80", "FAIL"]
+    (row,) = [line.split() for line in lines if "1 ms" in line]
+    assert row == ["other", "1", "ms", "100.0", "100.0", "99.0", "98.0", "1.40", "pass"]
+
+
+def test_shipped_suite_fits_80_columns() -> None:
+    names = [
+        (c.perturbation.name, c.perturbation.unit, c.strength)
+        for c in load_suite(resource_path("configs/robustness.yaml"), EnvConfig())
+    ]
+    outcomes = [
+        outcome(name, strength, unit=unit, failed=list(RESULTS)) for name, unit, strength in names
+    ]
+    report = RobustnessReport(
+        checkpoint="", steps=0, suite="", physics="", episodes=1, seed=0, outcomes=outcomes
+    )
+    stream = io.StringIO()
+    Console(file=stream, width=80).print(robustness_table(report))
+    rows = [line for line in stream.getvalue().splitlines() if line.endswith("FAIL ")]
+    assert len(rows) == len(outcomes)
+    assert len(stream.getvalue().splitlines()) <= len(rows) + 7, "a name is broken into two lines"
+
+
+def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None:
+    figure = robustness_figure(report)
+    axes = figure.axes[:2]
+    patches = [patch for ax in axes for patch in ax.patches if isinstance(patch, Rectangle)]
+    cells = [patch for patch in patches if patch.get_fill()]
+    assert len(cells) == 5
+    stable, unstable = cells[0].get_facecolor(), cells[3].get_facecolor()
+    assert stable[2] > stable[0] and unstable[0] > unstable[2], "blue is stable, red is not"
+    # Around the nominal world, and around both latencies that were trained.
+    frames = [patch.get_width() for patch in patches if not patch.get_fill()]
+    np.testing.assert_allclose(frames, [0.94, 1.94])
+    words = [text.get_text() for ax in axes for text in ax.texts]
+    assert words.count("\u2713") == 4 and "BHS" in words
+    assert {"late, ms", "other, ms", "g", "h"} <= set(words)
+
+
+# The command
+
+
+@pytest.fixture
+def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
+    """The command has this report's outcomes without simulating."""
+    monkeypatch.setattr(
+        robustness_command, "measure_conditions", lambda *_, **__: (report.outcomes, "fused")
+    )
+    return report
+
+
+def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_info:
+        robustness_command.main(["--episodes", "4", "--seed", "3"])
+    assert exit_info.value.code == 1
+    out = tmp_path / "robustness"
+    assert {p.name for p in out.iterdir()} == {f"robustness.{s}" for s in ("json", "png", "svg")}
+    written = load_robustness(out)
+    assert written.outcomes == measured.outcomes
+    assert (written.physics, written.episodes, written.seed) == ("fused", 4, 3)
+    assert "4 of 5 conditions" in capsys.readouterr().out
+
+    measured.outcomes[:] = [o for o in measured.outcomes if o.passed]
+    with pytest.raises(SystemExit) as exit_info:
+        robustness_command.main(["--out", str(tmp_path / "other")])
+    assert exit_info.value.code == 0
+    assert json.loads((tmp_path / "other" / "robustness.json").read_text())["outcomes"]
+
+
+def test_command_does_not_begin_what_it_cannot_write(tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit) as exit_info:
+        robustness_command.main(["--out", str(tmp_path / "file")])
+    assert exit_info.value.code == 2
+    assert "choose another folder with --out" in capsys.readouterr().err
+
+
+def test_report_page_shows_the_picture(
+    report: RobustnessReport, tmp_path: Path, monkeypatch
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(pretrained_checkpoint().run, run)
+    monkeypatch.setattr("bounce_mjx.reports.page.group_runs", lambda runs: [])
+    monkeypatch.setattr(
+        "bounce_mjx.reports.page.evaluation_figure", lambda *_: robustness_figure(report)
+    )
+    monkeypatch.setattr(
+        "bounce_mjx.reports.page.curves_figure", lambda _: robustness_figure(report)
+    )
+    monkeypatch.setattr(
+        "bounce_mjx.reports.page.rewards_figure", lambda _: robustness_figure(report)
+    )
+    page, _ = write_report(run, None)
+    assert "Perturbed worlds" not in page.read_text(encoding="utf-8")
+    (run / "robustness.json").write_text(report.model_dump_json(), encoding="utf-8")
+    page, _ = write_report(run, None)
+    assert "Perturbed worlds" in page.read_text(encoding="utf-8")
+    (run / "robustness.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(UserError, match="robustness.json cannot be read .*delete it"):
+        write_report(run, None)
+
+
+def test_trained_share_is_not_of_the_suite() -> None:
+    """A condition draws its terms in every episode, however rarely the training drew them."""
+    trained = EnvConfig(randomization=RandomizationConfig(air_drag=(0.0, 0.2), share=0.3))
+    conditions = load_suite(resource_path("configs/robustness.yaml"), trained)
+    config = robustness._spanning_config(conditions[:3], "config")
+    assert config.randomization.share == 1.0
