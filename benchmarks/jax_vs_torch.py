@@ -44,8 +44,7 @@ from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.command import path_flag

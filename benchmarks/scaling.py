@@ -23,7 +23,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import make_trainer, population
-from bounce_mjx.runs.presets import read_preset
+from bounce_mjx.runs.config import read_preset
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
 from bounce_mjx.training.setup import compiler_options, set_up_gpu
 

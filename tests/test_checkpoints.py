@@ -68,7 +68,7 @@ def step_of(run: Path) -> Path:
 
 def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
     """As `eval` loads the policy, and `--resume` the whole state."""
-    checkpoint = find_checkpoint(run, run)
+    checkpoint = find_checkpoint(run)
     policy = load_policy(checkpoint, load_run_config(run))
     template = jax.eval_shape(lambda: state)
     return policy, load_training_state(checkpoint, template)[0]
@@ -96,7 +96,7 @@ def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -
     writer = CheckpointWriter(run, CONFIG)
     writer.save(["best"], 64, policy_of(state, OBSERVATION.size))
     writer.close()
-    checkpoint = find_checkpoint(run, run)
+    checkpoint = find_checkpoint(run)
     assert_identical(load_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
     with pytest.raises(UserError, match="holds no training state to go on from"):
         load_training_state(checkpoint, state)
@@ -110,7 +110,7 @@ def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingStat
         writer.save(["latest"], steps, policy_of(changed, OBSERVATION.size), changed, {})
     writer.close()
     assert [p.name for p in (run / "checkpoints/latest").iterdir()] == ["128"]
-    assert load_training_state(find_checkpoint(run, run), state)[0].iteration == 128
+    assert load_training_state(find_checkpoint(run), state)[0].iteration == 128
 
 
 # Damage

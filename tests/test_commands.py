@@ -463,7 +463,7 @@ def test_eval_on_mujoco_agrees(trained: Path, tmp_path: Path) -> None:
 
 
 def test_policy_is_read_as_orbax_reads_it(trained: Path) -> None:
-    checkpoint = find_checkpoint(trained / "checkpoints/latest", trained)
+    checkpoint = find_checkpoint(trained / "checkpoints/latest")
     ours = load_policy(checkpoint, load_run_config(trained))
     with ocp.StandardCheckpointer() as checkpointer:
         theirs = checkpointer.restore(checkpoint.folder.absolute() / "policy")

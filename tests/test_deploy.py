@@ -126,7 +126,7 @@ def observations(runs: dict[str, Path]):
     """A function (name) -> 1,000 observations, the actions of JAX, and the parts' inputs."""
 
     def draw(name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        checkpoint = find_checkpoint(runs[name], runs[name])
+        checkpoint = find_checkpoint(runs[name])
         config = load_run_config(checkpoint.run)
         policy = reading.load_policy(checkpoint, config)
         layout = config.env.observation.layout
@@ -151,7 +151,7 @@ def observations(runs: dict[str, Path]):
 @pytest.mark.parametrize("name", [*ENVS, "pretrained"])
 def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
     expected, inputs = observations(name)
-    model = export_onnx(find_checkpoint(runs[name], runs[name]))
+    model = export_onnx(find_checkpoint(runs[name]))
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     (actions,) = session.run(["action"], inputs)
     np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-5)
@@ -162,7 +162,7 @@ def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None
 @pytest.mark.parametrize("name", ["all histories", "pretrained"])
 def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
     expected, inputs = observations(name)
-    artefact = jax.export.deserialize(export_jax(find_checkpoint(runs[name], runs[name])))
+    artefact = jax.export.deserialize(export_jax(find_checkpoint(runs[name])))
     assert set(artefact.platforms) == {"cpu", "cuda"}
     for count in (1, 1000):
         some = {part: values[:count] for part, values in inputs.items()}
@@ -170,7 +170,7 @@ def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations)
 
 
 def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) -> None:
-    model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"], runs["sensors"])))
+    model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"])))
     metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
     config = load_run_config(runs["sensors"])
     assert {p.name: p.history for p in metadata.observation} == {

@@ -1,5 +1,6 @@
 """The five results: counting, judging, and both engines."""
 
+import dataclasses
 import functools
 import io
 import json
@@ -336,7 +337,7 @@ def test_readme_shows_the_table_as_it_is_printed(env):
     table = re.search(r"(?m)^    result +measured.+\n(?:    \S.+\n)+", shown)[0]
     values = [float(re.search(r" (\S+) (?:>=|0.1 to)", row)[1]) for row in table.split("\n")[1:-1]]
     report = judge(env, statistics())
-    results = [r._replace(value=v) for r, v in zip(report.results, values, strict=True)]
+    results = [dataclasses.replace(r, value=v) for r, v in zip(report.results, values, strict=True)]
     rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()[1:]
     assert "".join(f"    {row.rstrip()}\n" for row in rows) == table
 
@@ -344,7 +345,8 @@ def test_readme_shows_the_table_as_it_is_printed(env):
 def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
     report = judge(env, statistics())
     changed = {"bound": "0.1 to 1.5 (targets 0.4 only)", "passed": None}
-    results = [r._replace(**changed) if i == SPEED else r for i, r in enumerate(report.results)]
+    results = list(report.results)
+    results[SPEED] = dataclasses.replace(results[SPEED], **changed)
     rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
     assert rows[2 + SPEED].split()[-4:] == ["0.1", "to", "1.5", "-"]
     assert rows[-1].strip() == "upward speed: not judged (targets 0.4 only)"

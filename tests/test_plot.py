@@ -1,6 +1,7 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
+import dataclasses
 import io
 import json
 import re
@@ -21,7 +22,6 @@ from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.recording import Recording
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
@@ -261,10 +261,10 @@ def check_report(run: Path) -> str:
         xml.etree.ElementTree.fromstring(base64.b64decode(data))
     assert "<script" not in page and "@import" not in page
     results = load_results(run)
-    for result in results["results"]:
-        assert f">{result['name']}</td>" in page
-        assert f">{as_shown(result['value'])}</td>" in page
-    for phase, seconds in results["seconds"].items():
+    for result in results.best.results:
+        assert f">{result.name}</td>" in page
+        assert f">{as_shown(result.value)}</td>" in page
+    for phase, seconds in results.seconds.items():
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     assert len(re.findall(r">128</td>|>256</td>", page)) == 2
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
@@ -280,15 +280,15 @@ def as_shown(value: float | None) -> str:
 def test_training_leaves_a_report(trained: Path) -> None:
     """The run's episodes of 0.5 s end before the height is measured."""
     page = check_report(trained)
-    height = load_results(trained)["results"][2]
-    assert (height["value"], height["passed"]) == (None, False)
+    height = load_results(trained).best.results[2]
+    assert (height.value, height.passed) == (None, False)
     assert "none" in re.search(r"<td[^>]*>height</td>.*", page)[0]
     assert "|apex error| none, " in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
     assert not {"results/height", "results/mean_apex_error_m"} & set(log)
-    met = sum(r["passed"] is not False for r in load_results(trained)["results"])
+    met = sum(r.passed is not False for r in load_results(trained).best.results)
     assert f"<h1>{met} of 5 results met</h1>" in page
 
 
@@ -338,28 +338,28 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     tables = log.Tensors("results/text_summary")
     assert [event.step for event in tables] == [128, 256]
     results = load_results(trained)
-    best = next(event for event in tables if event.step == results["best_steps"])
+    best = next(event for event in tables if event.step == results.best_steps)
     # results.json measures the best policy once more, on fresh resets.
-    (evaluation,) = [e for e in results["evaluations"] if e["steps"] == results["best_steps"]]
+    (evaluation,) = [e for e in results.evaluations if e.steps == results.best_steps]
     rows = best.tensor_proto.string_val[0].decode().splitlines()
     assert {row.count("|") for row in rows} == {6}
     assert [row.split(" | ")[0].strip("| ") for row in rows[2:]] == [
-        result["name"] for result in results["results"]
+        result.name for result in results.best.results
     ]
     assert [row.split(" | ")[2] for row in rows[2:]] == [
-        as_shown(evaluation[result["name"]]) for result in results["results"]
+        as_shown(evaluation.model_extra[result.name]) for result in results.best.results
     ]
 
     assert tags["images"] == ["evaluation"]
     (picture,) = log.Images("evaluation")
-    assert picture.step == results["best_steps"]
+    assert picture.step == results.best_steps
     pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     assert pixels.shape == (picture.height, picture.width, 3)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
 
 
 def test_a_result_that_is_not_judged_is_marked(trained: Path) -> None:
-    report = Report.from_dict(load_results(trained))
-    speed = report.results[3]._replace(passed=None)
-    text = results_markdown(report._replace(results=(*report.results[:3], speed)))
+    report = load_results(trained).best
+    speed = dataclasses.replace(report.results[3], passed=None)
+    text = results_markdown(dataclasses.replace(report, results=(*report.results[:3], speed)))
     assert text.splitlines()[-1].endswith("| not judged |")

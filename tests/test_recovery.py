@@ -145,7 +145,7 @@ def test_checkpoint_holds_the_whole_training_state(straight: Path) -> None:
     assert {"key", "iteration", "learning_rate"} <= names
     record = read_record(checkpoint)
     assert record.steps == STEPS
-    assert record.config == load_run_config(straight).model_dump(mode="json")
+    assert record.config == load_run_config(straight)
     assert record.progress["evaluations"] == evaluations(straight)
 
 
@@ -173,19 +173,23 @@ def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight
     assert_same_training(run, straight)
 
 
-@pytest.mark.parametrize("moment", ["before the manifest", "before the renaming"])
+@pytest.mark.parametrize("moment", ["while it is written", "between the renamings", "at the end"])
 def test_a_checkpoint_counts_until_the_next_is_complete(
     run: Path, straight: Path, moment: str
 ) -> None:
     # As after a crash while a checkpoint was being replaced by another one of the same steps.
     latest = latest_checkpoint(run).folder
-    partial = latest.with_name(latest.name + ".partial")
+    partial, old = (latest.with_name(latest.name + end) for end in (".partial", ".discarded"))
     shutil.copytree(latest, partial)
-    if moment == "before the manifest":
+    if moment == "while it is written":
         (partial / "manifest.json").unlink()
     else:
-        latest.rename(latest.with_name(latest.name + ".discarded"))
-        assert latest_checkpoint(run).folder == partial
+        latest.rename(old)
+        assert latest_checkpoint(run).folder == old
+    if moment == "at the end":
+        partial.rename(latest)
+        (old / "manifest.json").unlink()
+        assert latest_checkpoint(run).folder == latest
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
     assert [p.name for p in latest.parent.iterdir()] == [str(STEPS)]

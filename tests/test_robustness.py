@@ -215,9 +215,9 @@ def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
 def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
     policy, ppo, env = shipped
     conditions = three_conditions(tmp_path, env)
-    fused, engine = measure_conditions(policy, ppo, conditions, episodes=4, physics="fused")
-    c, engine_c = measure_conditions(policy, ppo, conditions, episodes=4, physics="mujoco")
-    assert (engine, engine_c) == ("fused", "mujoco")
+    fused = measure_conditions(policy, ppo, conditions, episodes=4, physics="fused")
+    c = measure_conditions(policy, ppo, conditions, episodes=4, physics="mujoco")
+    assert [o.physics for o in (*fused, *c)] == ["fused"] * 3 + ["mujoco"] * 3
     for ours, reference in zip(fused, c, strict=True):
         assert ours.failed == reference.failed
         assert ours.values["stable"] == reference.values["stable"]
@@ -244,7 +244,7 @@ def test_a_policy_that_ignores_the_ball_fails(shipped, tmp_path: Path) -> None:
     blind = policy._replace(params=jax.tree_util.tree_map_with_path(blinded, policy.params))
     kernel = blind.params["params"]["MLP_0"]["hidden_0"]["kernel"]
     assert np.all(kernel[of_ball] == 0.0) and np.any(kernel != 0.0)
-    outcomes, _ = measure_conditions(blind, ppo, conditions, episodes=4, physics="fused")
+    outcomes = measure_conditions(blind, ppo, conditions, episodes=4, physics="fused")
     assert all("stable" in outcome.failed for outcome in outcomes)
 
 
@@ -256,6 +256,7 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         dict(name="camera", unit="Hz", strengths=[60, 120], terms={"camera_rate": "strength"}),
         dict(name="target", strengths=[0.8], terms={"target_height": "strength"}),
         dict(name="slow", strengths=[0.02], settings={"control_dt": "strength"}),
+        dict(name="dry", strengths=[5], terms={"joint_frictionloss": "strength"}),
     )  # fmt: skip
     calls = []
 
@@ -278,23 +279,27 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         return evaluate
 
     monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
+    monkeypatch.setattr(robustness, "make_mujoco_evaluator", make_evaluator)
     monkeypatch.setattr(robustness, "_CPU_BATCH", 14)
     done = []
-    outcomes, _ = measure_conditions(
-        None, PPOConfig(), conditions, episodes=4, progress=done.append
-    )
+    outcomes = measure_conditions(None, PPOConfig(), conditions, episodes=4, progress=done.append)
     assert [(o.perturbation, o.strength) for o in outcomes] == [
         *[("late", s) for s in (0, 5, 10, 15, 20)],
-        ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02),
+        ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02), ("dry", 5),
     ]  # fmt: skip
-    lengths = [1.0, 1.05, 1.1, 1.15, 1.2, 1.6, 2.2, 1.0, 2.0]
+    assert [o.physics for o in outcomes] == ["fused"] * 9 + ["mujoco"]
+    lengths = [1.0, 1.05, 1.1, 1.15, 1.2, 1.6, 2.2, 1.0, 2.0, 1.0]
     np.testing.assert_allclose([o.mean_length_s for o in outcomes], lengths, rtol=1e-6)
     # The neutral target is the task's own; at 0.8 m the speed is not judged.
-    speeds = [0.4, 0.405, 0.41, 0.415, 0.42, 0.5, 0.5, 0.8, 0.5]
+    speeds = [0.4, 0.405, 0.41, 0.415, 0.42, 0.5, 0.5, 0.8, 0.5, 0.5]
     np.testing.assert_allclose([o.values["upward speed"] for o in outcomes], speeds, rtol=1e-6)
-    assert done == sorted(done) and done[-1] == 9
+    assert done == sorted(done) and done[-1] == 10
     plain = ("action_latency", "target_height")
-    assert calls == [(plain, 12)] * 2 + [(("camera_rate",), 8), ((), 4)]
+    assert calls == [(plain, 12)] * 2 + [
+        (("camera_rate",), 8),
+        ((), 4),
+        (("joint_frictionloss",), 4),
+    ]
 
 
 def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
@@ -313,7 +318,7 @@ def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
 def outcome(name: str, strength: float | None = None, **changes) -> Outcome:
     values = dict(zip(RESULTS, (100.0, 99.0, 98.0, 1.4, 100.0), strict=True))
     given = dict(
-        perturbation=name, group="g", unit="ms", strength=strength, trained=False,
+        perturbation=name, group="g", unit="ms", strength=strength, trained=False, physics="fused",
         values=values, failed=[], mean_length_s=20.0,
     )  # fmt: skip
     return Outcome(**(given | changes))
@@ -324,13 +329,13 @@ def report() -> RobustnessReport:
     bad = dict(zip(RESULTS, (50.0, None, None, 1.8, 25.0), strict=True))
     failed = ["consecutive bounces", "height", "stable"]
     return RobustnessReport(
-        checkpoint="c", steps=1, suite="s", physics="fused", episodes=4, seed=0,
+        checkpoint="c", steps=1, suite="s", episodes=4, seed=0,
         outcomes=[
             outcome("nominal", group="nominal", trained=True),
             outcome("late", 0.0, trained=True),
             outcome("late", 5.0, trained=True),
             outcome("late", 10.0, values=bad, failed=failed),
-            outcome("other", 1.0, group="h"),
+            outcome("other", 1.0, group="h", physics="mujoco"),
         ],
     )  # fmt: skip
 
@@ -355,7 +360,7 @@ def test_shipped_suite_fits_80_columns() -> None:
         outcome(name, strength, unit=unit, failed=list(RESULTS)) for name, unit, strength in names
     ]
     report = RobustnessReport(
-        checkpoint="", steps=0, suite="", physics="", episodes=1, seed=0, outcomes=outcomes
+        checkpoint="", steps=0, suite="", episodes=1, seed=0, outcomes=outcomes
     )
     stream = io.StringIO()
     Console(file=stream, width=80).print(robustness_table(report))
@@ -376,6 +381,8 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
     frames = [patch.get_width() for patch in patches if not patch.get_fill()]
     np.testing.assert_allclose(frames, [0.94, 1.94])
     words = [text.get_text() for ax in axes for text in ax.texts]
+    below = figure.texts[1].get_text()
+    assert below.endswith("on the fused engine; other on MuJoCo's C engine")
     assert words.count("\u2713") == 4 and "BHS" in words
     assert {"late, ms", "other, ms", "g", "h"} <= set(words)
 
@@ -386,9 +393,7 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
 @pytest.fixture
 def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
     """The command has this report's outcomes without simulating."""
-    monkeypatch.setattr(
-        robustness_command, "measure_conditions", lambda *_, **__: (report.outcomes, "fused")
-    )
+    monkeypatch.setattr(robustness_command, "measure_conditions", lambda *_, **__: report.outcomes)
     return report
 
 
@@ -401,7 +406,7 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
     assert {p.name for p in out.iterdir()} == {f"robustness.{s}" for s in ("json", "png", "svg")}
     written = load_robustness(out)
     assert written.outcomes == measured.outcomes
-    assert (written.physics, written.episodes, written.seed) == ("fused", 4, 3)
+    assert (written.episodes, written.seed) == (4, 3)
     assert "4 of 5 conditions" in capsys.readouterr().out
 
     measured.outcomes[:] = [o for o in measured.outcomes if o.passed]

@@ -40,7 +40,7 @@ def report_of(values: list[float | None]) -> Report:
 
 
 def results_of(progress: Progress) -> dict:
-    return progress.results(64, {"train": 1.0}, "cpu")
+    return progress.results(progress.best, trained_steps=64, seconds={"train": 1.0}, device="cpu")
 
 
 @pytest.fixture
@@ -133,11 +133,11 @@ def test_some_aliases_are_taken(tmp_path: Path) -> None:
 def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progress) -> None:
     (tmp_path / "results.json").write_text(to_json(results_of(progress)))
     results = load_results(tmp_path)
-    assert results["evaluations"] == [
+    assert [evaluation.model_dump() for evaluation in results.evaluations] == [
         {"steps": 64, "passed": False, "screening": False}
         | dict(zip(NAMES, [1.0, 2.0, None, 4.0, 5.0], strict=True))
     ]
-    assert Report.from_dict(results) == progress.best
+    assert results.best == progress.best
     assert Progress.model_validate(json.loads(to_json(progress.model_dump()))) == progress
 
 

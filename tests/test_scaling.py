@@ -31,6 +31,7 @@ from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
     latest_checkpoint,
+    newest_run,
     runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts, setup
@@ -169,8 +170,8 @@ def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyP
         met = sum(result["passed"] is not False for result in results["results"])
         scores.append((met, results["details"]["mean_return"]))
     best = folders[scores.index(max(scores))]
-    assert find_checkpoint(seeds, seeds.parent) == best_checkpoint(best)
-    assert find_checkpoint(None, seeds.parent) == best_checkpoint(best)
+    assert find_checkpoint(seeds) == best_checkpoint(best)
+    assert find_checkpoint(newest_run(seeds.parent)) == best_checkpoint(best)
 
 
 def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):

@@ -89,7 +89,7 @@ def test_run_folder_has_the_same_files_as_in_jax(run):
     assert results["trained_steps"] == 256
     assert len(results["results"]) == 5
     assert load_config(run / "config.yaml").env.target_height_range == (0.3, 0.8)
-    assert find_checkpoint(run / "checkpoints" / "latest", run).steps == 256
+    assert find_checkpoint(run / "checkpoints" / "latest").steps == 256
     assert list(run.glob("events.out.tfevents.*"))
     assert not [p for p in run.rglob("*") if p.suffix in (".pt", ".pth", ".pkl", ".pickle")]
 
@@ -111,7 +111,7 @@ main([{str(run)!r}, "--episodes", "4", "--seed", "{seed}", "--json", {str(out)!r
 
 def test_best_policy_is_the_evaluated_policy(run):
     config = load_config(run / "config.yaml")
-    checkpoint = find_checkpoint(run, run)
+    checkpoint = find_checkpoint(run)
     results = json.loads((run / "results.json").read_text(encoding="utf-8"))
     assert checkpoint.steps == results["best_steps"]
     env = BounceBall(config.env)

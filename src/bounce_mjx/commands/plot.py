@@ -46,7 +46,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         runs = command.runs or (newest_run(command.log_dir),)
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
-        checkpoints = [find_checkpoint(seed, command.log_dir) for seed in seeds]
+        checkpoints = [find_checkpoint(seed) for seed in seeds]
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:

@@ -18,7 +18,6 @@ from bounce_mjx.evaluation.robustness import (
     Outcome,
     Physics,
     RobustnessReport,
-    computed,
     measure_conditions,
 )
 from bounce_mjx.evaluation.suite import load_suite
@@ -47,7 +46,8 @@ class RobustnessCommand(StrictModel):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     physics: Physics = "config"
-    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    """Engine: mujoco is MuJoCo's C engine, which always simulates dry friction; config is the
+    engine of the training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
     for a policy that comes with the package."""
@@ -75,15 +75,13 @@ def main(args: Sequence[str] | None = None) -> None:
         shipped = checkpoint.run in map(resource_path, SHIPPED.values())
         out = command.out or (Path("robustness") if shipped else checkpoint.run)
         _make_folder(out)
-        outcomes, engine = run_interruptible(_measure, command, config, policy, suite, console)
         report = RobustnessReport(
             checkpoint=str(checkpoint.folder),
             steps=checkpoint.steps,
             suite=str(suite),
-            physics=engine,
             episodes=command.episodes,
             seed=command.seed,
-            outcomes=outcomes,
+            outcomes=run_interruptible(_measure, command, config, policy, suite, console),
         )
         console.print(robustness_table(report))
         _write(out, report)
@@ -92,14 +90,9 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _measure(
     command: RobustnessCommand, config: TrainConfig, policy: Policy, suite: Path, console: Console
-) -> tuple[list[Outcome], str]:
+) -> list[Outcome]:
     """Measures all conditions and shows a progress bar."""
-    all_conditions = load_suite(suite, config.env)
-    conditions = computed(all_conditions, command.physics)
-    if skipped := {c.perturbation.name for c in all_conditions} - {
-        c.perturbation.name for c in conditions
-    }:
-        console.print(f"skipped, as the physics lacks them: {', '.join(sorted(skipped))}")
+    conditions = load_suite(suite, config.env)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("conditions", total=len(conditions))

@@ -59,7 +59,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
     """
     if out.exists() and not (out / CONFIG_FILE).is_file():
         raise UserError(f"--out {out} is not a folder that this command made; give another")
-    checkpoint = find_checkpoint(run, run)
+    checkpoint = find_checkpoint(run)
     trained_with = load_run_config(checkpoint.run)
     if trained_with.env.mjcf is not None:
         raise UserError(
@@ -75,12 +75,13 @@ def ship(run: Path, out: Path, console: Console) -> None:
     if not report.passed:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")
 
+    made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": TrainConfig().log_dir})
     results = {
         "command": f"python train_jax.py --config {PRETRAINED}/{CONFIG_FILE}",
         "seed": config.seed,
-        "device": (load_results(checkpoint.run) or {}).get("device", "unknown"),
+        "device": "unknown" if made_by is None else made_by.device,
         "best_steps": checkpoint.steps,
         "evaluation": {
             "command": f"bounce-mjx eval {PRETRAINED}",

@@ -52,4 +52,4 @@ def _exported(run: Path) -> bytes:
             f"the run {run} must be exported, for which {error.name} is missing; use bounce-mjx "
             "export on the machine of the training, and give the .onnx file"
         ) from error
-    return export_onnx(find_checkpoint(run, run))
+    return export_onnx(find_checkpoint(run))

@@ -1,8 +1,11 @@
 """The five expected results: their bounds, and the report that compares an evaluation with them."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import Annotated, Any
 
 import jax
+import pydantic
+from pydantic import Field, InstanceOf
 
 from bounce_mjx.evaluation.recording import Recording
 from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, MAX_X_ERROR, Statistics
@@ -26,29 +29,42 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 """Target heights at which the upward speed is judged, m."""
 
 
-class Result(NamedTuple):
+Figure = Annotated[float, Field(allow_inf_nan=False)] | None
+"""A stored measurement; None where there was nothing to measure, such as the height without a
+bounce."""
+
+
+def _complete(details: dict[str, Figure]) -> dict[str, Figure]:
+    for name in ("episodes", "mean_consecutive_bounces", "mean_return", "mean_length_s"):
+        if details.get(name) is None:
+            raise ValueError(f"{name} is missing")
+    return {"mean_apex_error_m": None} | details
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
     """One expected result, as measured."""
 
     name: str
     measured: str
     """Description of the measured quantity, with its unit."""
-    value: float | None
-    """None where there was nothing to measure, such as the height without a bounce."""
+    value: Figure
     bound: str
     """The bound in words."""
     passed: bool | None
     """Whether the value meets the bound; None where the bound does not apply."""
 
 
-class Report(NamedTuple):
-    """An evaluation of a policy over many episodes."""
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """An evaluation of a policy over many episodes. Only a stored one is validated."""
 
-    results: tuple[Result, ...]
-    details: dict[str, float | None]
+    results: Annotated[tuple[Result, ...], Field(min_length=1)]
+    details: Annotated[dict[str, Figure], pydantic.AfterValidator(_complete)]
     """Further figures: episodes, mean_consecutive_bounces, mean_apex_error_m, mean_return and
-    mean_length_s; None where there was nothing to measure."""
-    recording: Recording | None = None
-    """The first episodes, if they were recorded; not part of `to_dict`."""
+    mean_length_s."""
+    recording: Annotated[InstanceOf[Recording] | None, Field(exclude=True)] = None
+    """The first episodes, if they were recorded; not stored."""
     screening: bool = False
     """Whether these are the few episodes of a screening, which did not pass."""
 
@@ -66,16 +82,15 @@ class Report(NamedTuple):
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> "Report":
-        """The inverse of `to_dict`."""
-        results = tuple(Result(**result) for result in plain["results"])
-        return cls(results, plain["details"], screening=bool(plain.get("screening", False)))
+        """The inverse of `to_dict`; a pydantic.ValidationError for anything else."""
+        return pydantic.TypeAdapter(cls).validate_python(plain)
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain data for JSON, with null for a missing figure."""
         return {
             "passed": self.passed,
             "screening": self.screening,
-            "results": [result._asdict() for result in self.results],
+            "results": [dataclasses.asdict(result) for result in self.results],
             "details": self.details,
         }
 

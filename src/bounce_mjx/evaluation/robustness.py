@@ -42,6 +42,8 @@ class Outcome(pydantic.BaseModel):
     strength: float | None
     trained: bool
     """Whether the ranges of the policy's training contain the condition."""
+    physics: str
+    """Engine: fused, mjx or mujoco."""
     values: dict[str, float | None]
     """The five results by name; None where there was nothing to measure."""
     failed: list[str]
@@ -62,7 +64,6 @@ class RobustnessReport(pydantic.BaseModel):
     steps: int
     """Environment steps of the policy's training."""
     suite: str
-    physics: str
     episodes: int
     """Episodes of each condition."""
     seed: int
@@ -72,6 +73,14 @@ class RobustnessReport(pydantic.BaseModel):
     def passed(self) -> bool:
         """Whether all conditions meet all judged results."""
         return all(outcome.passed for outcome in self.outcomes)
+
+    @property
+    def engines(self) -> dict[str, set[str]]:
+        """The perturbations that each engine simulated."""
+        return {
+            engine: {o.perturbation for o in self.outcomes if o.physics == engine}
+            for engine in {outcome.physics for outcome in self.outcomes}
+        }
 
     @property
     def met(self) -> int:
@@ -88,20 +97,18 @@ def measure_conditions(
     seed: int = DEFAULT_SEED,
     physics: Physics = "config",
     progress: Callable[[int], None] = lambda done: None,
-) -> tuple[list[Outcome], str]:
+) -> list[Outcome]:
     """Measures the five results of a policy without its noise, in the order of the conditions.
 
     Conditions of the same structure are simulated by one compiled program, which takes their ranges
-    as inputs. The episodes of all conditions start from the same keys.
+    as inputs. The episodes of all conditions start from the same keys. Conditions of dry friction
+    are simulated on MuJoCo's C engine, as no other computes it.
 
     Args:
       ppo_config: of the policy's training; it gives the networks.
       episodes: of each condition.
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
       progress: called with the number of conditions that are done.
-
-    Returns:
-      The outcomes, and the name of the engine: fused, mjx or mujoco.
 
     Raises:
       UserError: the engine does not support the model.
@@ -111,14 +118,14 @@ def measure_conditions(
         key = json.dumps(condition.env.model_dump(mode="json"))
         programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
     outcomes: list[Outcome | None] = [None] * len(conditions)
-    done, engine = 0, physics
-    for indices in programs.values():
+    done = 0
+    for (_, separate), indices in programs.items():
         members = [conditions[index] for index in indices]
         env = BounceBall(_spanning_config(members, physics))
-        engine = physics if physics == "mujoco" else env.engine.name
+        on_c = physics == "mujoco" or "joint_frictionloss" in separate
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
-        size = _batch_size(len(members), episodes, physics)
-        make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
+        size = _batch_size(len(members), episodes, on_c)
+        make = make_mujoco_evaluator if on_c else make_evaluator
         evaluate = make(env, networks, size * episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
@@ -135,20 +142,14 @@ def measure_conditions(
                     unit=condition.perturbation.unit,
                     strength=condition.strength,
                     trained=condition.trained,
+                    physics="mujoco" if on_c else env.engine.name,
                     values={result.name: result.value for result in report.results},
                     failed=[r.name for r in report.results if r.passed is False],
                     mean_length_s=report.details["mean_length_s"],
                 )
             done += len(batch)
             progress(done)
-    return outcomes, engine
-
-
-def computed(conditions: Sequence[Condition], physics: Physics) -> list[Condition]:
-    """The conditions whose terms the physics computes."""
-    if physics == "mujoco":
-        return list(conditions)
-    return [condition for condition in conditions if "joint_frictionloss" not in condition.ranges]
+    return outcomes
 
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:
@@ -184,11 +185,11 @@ def _stacked_ranges(env: BounceBall, conditions: Sequence[Condition]) -> Ranges 
     } or None
 
 
-def _batch_size(conditions: int, episodes: int, physics: Physics) -> int:
+def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:
     """Conditions in one call, about as many in each."""
     accelerated = jax.default_backend() != "cpu"
     batch = _GPU_BATCH if accelerated else _CPU_BATCH
-    if physics == "mujoco":
+    if on_c:
         batch = _MUJOCO_BATCH
     calls = -(-conditions // max(1, batch // episodes))
     return -(-conditions // calls)

@@ -66,7 +66,7 @@ def read_curves(run: Path) -> RunCurves:
             f"{run} holds no TensorBoard scalars; train longer, or give another run's folder"
         )
     results = load_results(run)
-    return RunCurves(run, curves, results["solved_steps"] if results else None)
+    return RunCurves(run, curves, results.solved_steps if results else None)
 
 
 def group_runs(runs: Sequence[Path]) -> list[Group]:

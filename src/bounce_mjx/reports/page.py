@@ -7,7 +7,6 @@ import base64
 import html
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 from matplotlib.figure import Figure
@@ -29,7 +28,7 @@ from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, verdict
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
-from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.env import BounceBall
 
@@ -82,21 +81,21 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     return page, evaluation
 
 
-def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict[str, Figure]):
-    report = Report.from_dict(results)
+def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
+    report = results.best
     met = sum(result.passed is not False for result in report.results)
     pictures = "".join(
         f'<h2>{title}</h2>\n<img alt="{title}" src="{_embed(figure)}">\n'
         for title, figure in figures.items()
     )
-    seconds = results["seconds"]
+    seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [f"{e['steps']:,}", *[figure_text(e[name]) for name in names], _outcome(e)]
-        for e in results["evaluations"]
+        [f"{e.steps:,}", *[figure_text(e.model_extra[name]) for name in names], _outcome(e)]
+        for e in results.evaluations
     ]
-    resets = "fresh resets" if results["fresh_resets"] else "the resets of the selection"
+    resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -108,8 +107,8 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 <body>
 <h1>{met} of {len(report.results)} results met</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
-{html.escape(results["device"])}. The best of {len(evaluations)} evaluations, after
-{results["best_steps"]:,} of {results["trained_steps"]:,} environment steps, on {resets}:
+{html.escape(results.device)}. The best of {len(evaluations)} evaluations, after
+{results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
 {_results(report)}
 {pictures}
@@ -123,10 +122,10 @@ def _page(run: Path, config: TrainConfig, results: dict[str, Any], figures: dict
 """
 
 
-def _outcome(evaluation: dict[str, Any]) -> str:
-    if evaluation["passed"]:
+def _outcome(evaluation: Evaluation) -> str:
+    if evaluation.passed:
         return "pass"
-    return "screening" if evaluation["screening"] else "-"
+    return "screening" if evaluation.screening else "-"
 
 
 def _results(report: Report) -> str:

@@ -106,9 +106,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     with style():
         figure = Figure(figsize=(_WIDTH, height))
         title = f"{report.met} of {len(report.outcomes)} conditions meet all judged results"
-        below = (
-            f"{report.episodes} episodes in each condition, on the physics engine {report.physics}"
-        )
+        below = f"{report.episodes} episodes in each condition, {_engines_text(report)}"
         figure.text(0.02, 1 - 0.25 / height, title, va="center", fontsize=11, fontweight="bold")
         figure.text(0.02, 1 - 0.48 / height, below, va="center", fontsize=8.5)
         cells = max(len(row) for column in columns for _, rows in column for row in rows)
@@ -127,6 +125,18 @@ def robustness_figure(report: RobustnessReport) -> Figure:
             _draw_column(axes, column)
         _draw_legend(figure, height, any(outcome.trained for outcome in report.outcomes[1:]))
     return figure
+
+
+def _engines_text(report: RobustnessReport) -> str:
+    """The engine of most conditions, and what the others simulated."""
+    names = {"fused": "the fused engine", "mjx": "MJX", "mujoco": "MuJoCo's C engine"}
+    engines = report.engines
+    most = max(engines, key=lambda engine: len(engines[engine]))
+    others = (
+        f"; {', '.join(sorted(engines[other]))} on {names[other]}"
+        for other in sorted(engines.keys() - {most})
+    )
+    return f"on {names[most]}{''.join(others)}"
 
 
 def _figures(outcome: Outcome) -> Iterable[str]:

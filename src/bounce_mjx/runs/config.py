@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import jax
+
 from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.resources import resource_path
 from bounce_mjx.task.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
@@ -61,3 +64,15 @@ def load_config(path: Path) -> TrainConfig:
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
     return validate(TrainConfig, values, str(path))
+
+
+def read_preset(path: Path | None) -> TrainConfig:
+    """The config of a preset in configs/; without a path, of the preset for this machine.
+
+    Raises:
+      UserError: the file is missing or wrong.
+    """
+    if path is None:
+        preset = "cpu" if jax.default_backend() == "cpu" else "default"
+        path = resource_path(f"configs/{preset}.yaml")
+    return load_config(path)

@@ -28,10 +28,9 @@ from rich.console import Console
 
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
-from bounce_mjx.runs.files import MANIFEST_FILE, PARTIAL, write_atomically
+from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 
 CheckpointName = Literal["latest", "best"]
@@ -39,6 +38,7 @@ PRETRAINED = "pretrained"
 SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
 """Names of the policies that come with the package, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
+REPLACED = ".discarded"
 
 
 class Checkpoint(NamedTuple):
@@ -119,23 +119,20 @@ def newest_run(log_dir: Path) -> Path:
     return max(found)
 
 
-def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
+def find_checkpoint(path: Path) -> Checkpoint:
     """Finds a checkpoint.
 
     Args:
       path: a run's folder (its best checkpoint, or else its latest), a folder of checkpoints in
-        it, or a checkpoint itself; None for the newest run in `log_dir`.
+        it, or a checkpoint itself.
     """
-    path = newest_run(log_dir) if path is None else path
-    run, absolute = find_run(path), Path(os.path.abspath(path))
-    if absolute.parent.parent.name == CHECKPOINTS:
-        for steps, folder in stored_checkpoints(absolute.parent).items():
-            if folder == absolute:
-                return Checkpoint(run, folder, steps)
-    if absolute == Path(os.path.abspath(run)):
+    run, place = find_run(path), Path(os.path.abspath(path))
+    if place == Path(os.path.abspath(run)):
         run = _best_seed(run)
-        absolute = Path(os.path.abspath(run))
-    for folder in (absolute, absolute / CHECKPOINTS / "best", absolute / CHECKPOINTS / "latest"):
+        place = Path(os.path.abspath(run))
+    elif place in (siblings := stored_checkpoints(place.parent)).values():
+        return Checkpoint(run, place, next(n for n, p in siblings.items() if p == place))
+    for folder in (place, place / CHECKPOINTS / "best", place / CHECKPOINTS / "latest"):
         if stored := stored_checkpoints(folder):
             return Checkpoint(run, stored[max(stored)], max(stored))
     raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
@@ -143,17 +140,12 @@ def find_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """The newest state of a run, from which its training is resumed."""
-    return find_checkpoint(run / CHECKPOINTS / "latest", run)
+    return find_checkpoint(run / CHECKPOINTS / "latest")
 
 
 def best_checkpoint(run: Path) -> Checkpoint:
     """The state of a run with the best evaluation."""
-    return find_checkpoint(run / CHECKPOINTS / "best", run)
-
-
-def has_checkpoint(run: Path, name: CheckpointName, steps: int) -> bool:
-    """Whether a run holds that checkpoint."""
-    return steps in stored_checkpoints(run / CHECKPOINTS / name)
+    return find_checkpoint(run / CHECKPOINTS / "best")
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -178,7 +170,7 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     if str(path) in SHIPPED and not path.is_dir():
         return pretrained_checkpoint(str(path))
     if path is not None:
-        return find_checkpoint(path, log_dir)
+        return find_checkpoint(path)
     try:
         run = newest_run(log_dir)
     except UserError:
@@ -187,24 +179,21 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint()
     console.out(f"using the newest run: {run}", highlight=False)
-    return find_checkpoint(run, log_dir)
+    return find_checkpoint(run)
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
     """The checkpoints in a folder by their steps."""
-    found = {}
-    # In this order, a checkpoint under its own name takes precedence.
-    for path in sorted(folder.glob("*"), reverse=True):
-        name = path.name.removesuffix(PARTIAL)
-        # The manifest is written last: a process may be killed between that and the renaming.
-        complete = name == path.name or (path / MANIFEST_FILE).is_file()
-        if name.isascii() and name.isdecimal() and path.is_dir() and complete:
-            found[int(name)] = path
-    return found
+    # One that is being replaced counts until the next has its place.
+    for suffix in ("", REPLACED):
+        paths = [p for p in folder.glob("*") if p.suffix == suffix and p.is_dir()]
+        if found := {int(p.stem): p for p in paths if p.stem.isdecimal()}:
+            return found
+    return {}
 
 
 def _best_seed(run: Path) -> Path:
     """The folder of a run's best seed; the run itself if it has one seed."""
     results = {seed: load_results(seed) for seed in runs_of_seeds(run) if seed != run}
-    scores = {seed: Report.from_dict(plain).score for seed, plain in results.items() if plain}
+    scores = {seed: found.best.score for seed, found in results.items() if found}
     return max(scores, key=scores.get, default=run)

@@ -13,7 +13,6 @@ import pydantic
 import tensorstore
 
 from bounce_mjx.config.files import differing_keys
-from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.ppo import TrainingState
@@ -37,7 +36,7 @@ class Record(pydantic.BaseModel):
     """run.json."""
 
     steps: int
-    config: dict[str, Any]
+    config: TrainConfig
     progress: dict[str, Any]
 
 
@@ -80,8 +79,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
             raise ValueError(f"it was written after {record.steps} steps")
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
-    config = validate(TrainConfig, record.config, str(checkpoint.folder / RECORD_FILE))
-    differing = differing_keys(load_run_config(checkpoint.run), config) - RESUMABLE_KEYS
+    differing = differing_keys(load_run_config(checkpoint.run), record.config) - RESUMABLE_KEYS
     if differing:
         raise UserError(
             f"the checkpoint {checkpoint.folder} is of another config than "
@@ -114,7 +112,7 @@ def _open_array(folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct) -> tensor
     files = {"driver": "file", "path": f"{os.path.abspath(folder)}/"}
     metadata = {
         "shape": leaf.shape,
-        "chunks": [max(1, length) for length in leaf.shape],
+        "chunks": leaf.shape,
         "dtype": leaf.dtype.str,
         "compressor": {"id": "zstd", "level": 1},
     }

@@ -1,12 +1,12 @@
-"""Checkpoints are written under another name and brought to the disk, the manifest last; only then
-the older ones are removed. A process that is killed leaves one or the other whole."""
+"""Checkpoints are written under another name and brought to the disk; only then they take the place
+of the older ones. A process that is killed leaves one or the other whole."""
 
 import concurrent.futures
-import logging
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,9 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
-from bounce_mjx.runs.folders import CHECKPOINTS, CheckpointName, stored_checkpoints
+from bounce_mjx.runs.folders import CHECKPOINTS, REPLACED, CheckpointName, stored_checkpoints
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import RECORD_FILE
-
-_DISCARDED = ".discarded"
 
 
 class CheckpointWriter:
@@ -34,8 +32,9 @@ class CheckpointWriter:
     def __init__(self, run: Path, config: TrainConfig):
         self._run = run
         self._config = config.model_dump(mode="json")
-        self._pending: dict[CheckpointName, tuple[int, dict[str, Any], str]] = {}
-        self._results: str | None = None
+        # By name, the oldest first: no checkpoint on the disk names a best one that is not there
+        # yet, unless it holds that state itself.
+        self._pending: dict[str, Callable[[], None]] = {}
         self._pool = concurrent.futures.ThreadPoolExecutor(1)
         self._writing: concurrent.futures.Future | None = None
         self._problem: str | None = None
@@ -52,7 +51,7 @@ class CheckpointWriter:
         """Starts to save; waits only for the save before.
 
         Args:
-          names: the checkpoints to write.
+          names: the checkpoints to write, "latest" before "best".
           steps: environment steps trained.
           training: None for a checkpoint that cannot be resumed.
           progress: the evaluations up to this checkpoint, plain data.
@@ -61,11 +60,16 @@ class CheckpointWriter:
         items = {"policy": policy} | ({} if training is None else {"training": training})
         # A copy, as the training reuses the memory of its state while the writer still writes.
         items = jax.tree.map(np.array, items)
-        record = {"steps": steps, "config": self._config, "progress": progress or {}}
+        record = to_json({"steps": steps, "config": self._config, "progress": progress or {}})
         self.problem()
-        self._pending |= dict.fromkeys(names, (steps, items, to_json(record)))
+        new = {}
+        for name in names:
+            folder = self._run / CHECKPOINTS / name / str(steps)
+            new[name] = partial(_write_checkpoint, folder, items, record)
         if results is not None:
-            self._results = to_json(results)
+            path = self._run / RESULTS_FILE
+            new[RESULTS_FILE] = partial(write_atomically, path, to_json(results))
+        self._pending = {k: v for k, v in self._pending.items() if k not in new} | new
         self.retry()
 
     def retry(self) -> None:
@@ -91,17 +95,9 @@ class CheckpointWriter:
         self._pool.shutdown()
 
     def _write(self) -> None:
-        # The older first, so that no checkpoint on the disk names a best one that is not there
-        # yet, unless it holds that state itself.
-        order = sorted(self._pending, key=lambda name: (self._pending[name][0], name == "best"))
-        for name in order:
-            steps, items, record = self._pending[name]
-            folder = self._run / CHECKPOINTS / name / str(steps)
-            _write_checkpoint(folder, items, record)
+        for name, write in list(self._pending.items()):
+            write()
             del self._pending[name]
-        if self._results is not None:
-            write_atomically(self._run / RESULTS_FILE, self._results)
-            self._results = None
 
 
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
@@ -114,64 +110,51 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
     Raises:
       OSError: it could not be written; nothing of it is left, and the others are as they were.
     """
-    partial = folder.with_name(folder.name + PARTIAL)
+    unfinished = folder.with_name(folder.name + PARTIAL)
     _remove_leftovers(folder.parent)
-    others = stored_checkpoints(folder.parent).values()
     try:
-        partial.mkdir(parents=True)
-        _check_room(partial, sum(leaf.nbytes for leaf in jax.tree.leaves(items)))
-        _save_arrays(partial, items)
-        (partial / RECORD_FILE).write_text(record, encoding="utf-8")
-        for path in partial.rglob("*"):
+        unfinished.mkdir(parents=True)
+        _check_room(unfinished, sum(leaf.nbytes for leaf in jax.tree.leaves(items)))
+        for name, tree in items.items():
+            _save_arrays(unfinished / name, tree)
+        (unfinished / RECORD_FILE).write_text(record, encoding="utf-8")
+        for path in unfinished.rglob("*"):
             sync(path)
-        seal(partial)
-        for path in (partial, folder.parent):
-            sync(path)
+        seal(unfinished)
+        sync(unfinished)
     except Exception as error:
-        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
         # tensorstore reports a full disk as a ValueError.
         number = re.search(r"os_error_code='(\d+)'", str(error))
         if number is None:
             raise
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
-    # From here on the checkpoint counts, so the others may go.
-    for other in others:
-        # Renamed first, so that it is at no moment there in part.
-        shutil.rmtree(other.rename(other.with_name(other.name + _DISCARDED)))
-    partial.rename(folder)
+    for steps, other in stored_checkpoints(folder.parent).items():
+        other.rename(folder.with_name(f"{steps}{REPLACED}"))
+    unfinished.rename(folder)
     sync(folder.parent)
+    _remove_leftovers(folder.parent)
 
 
-def _save_arrays(folder: Path, items: dict[str, Any]) -> None:
-    """Writes each item with orbax, on this host alone."""
+def _save_arrays(folder: Path, tree: Any) -> None:
+    """Writes a pytree with orbax, on this host alone."""
     # It takes a third of a second to import, and only writing needs it.
     import orbax.checkpoint as ocp
 
-    only_here = ocp.options.MultiprocessingOptions(
-        primary_host=jax.process_index(), active_processes={jax.process_index()}
-    )
-    checkpointer = ocp.Checkpointer(
-        ocp.PyTreeCheckpointHandler(multiprocessing_options=only_here),
-        multiprocessing_options=only_here,
-    )
-    # It warns of the folder below, once a save.
-    logging.getLogger("absl").setLevel(logging.ERROR)
-    for name, tree in items.items():
-        path = Path(os.path.abspath(folder / name))
-        checkpointer.save(path, args=ocp.args.PyTreeSave(tree))
-        # orbax looks for its own files by a pattern, and finds none in a path with brackets.
-        if not (path / "manifest.ocdbt").exists():
-            for file in (path / f"ocdbt.process_{jax.process_index()}").iterdir():
-                file.rename(path / file.name)
+    host = jax.process_index()
+    only_here = ocp.options.MultiprocessingOptions(primary_host=host, active_processes={host})
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=only_here)
+    folder = Path(os.path.abspath(folder))
+    folder.mkdir()
+    handler.save(folder, args=ocp.args.PyTreeSave(tree))
+    handler.finalize(folder)
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Removes the incomplete checkpoints that a killed process left in a folder."""
-    complete = stored_checkpoints(folder).values()
+    """Removes the checkpoints in a folder that do not count."""
+    counting = stored_checkpoints(folder).values()
     for path in folder.glob("*"):
-        if path.name.endswith(PARTIAL) and path in complete:
-            path.rename(path.with_name(path.name.removesuffix(PARTIAL)))
-        elif path.name.endswith((PARTIAL, _DISCARDED)):
+        if path.suffix in (PARTIAL, REPLACED) and path not in counting:
             shutil.rmtree(path, ignore_errors=True)
 
 

@@ -16,9 +16,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import leave
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
 from bounce_mjx.runs.folders import find_run
-from bounce_mjx.runs.presets import read_preset
 from bounce_mjx.runs.reading import RESUMABLE_KEYS
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall

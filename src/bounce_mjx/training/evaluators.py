@@ -1,6 +1,7 @@
 """The compiled evaluations of a training's policies."""
 
 import concurrent.futures
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -61,7 +62,7 @@ class Evaluators:
         if self._screening is not None:
             screened = self._measure(self._screening, policy, self._config.eval_seed)
             if not any(report.passed for report in screened):
-                return [report._replace(screening=True) for report in screened]
+                return [dataclasses.replace(report, screening=True) for report in screened]
         return self._measure(self._full, policy, self._config.eval_seed)
 
     def final(self, policy: Policy) -> list[Report]:
@@ -96,7 +97,7 @@ class Evaluators:
         on_devices = hosts.distribute(policy, shardings)
         statistics, recording = program.result()(on_devices, np.uint32(seed))
         if self._config.num_seeds == 1:
-            return [judge(self._env, statistics)._replace(recording=recording)]
+            return [dataclasses.replace(judge(self._env, statistics), recording=recording)]
         statistics = jax.device_get(statistics)
         return [
             judge(self._env, jax.tree.map(lambda x, i=i: x[i], statistics))

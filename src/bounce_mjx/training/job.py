@@ -23,14 +23,15 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
+    CHECKPOINTS,
     Checkpoint,
     best_checkpoint,
     create_run,
     find_run,
-    has_checkpoint,
     latest_checkpoint,
     save_config,
     seed_folders,
+    stored_checkpoints,
 )
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
@@ -292,8 +293,8 @@ class _Job:
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
         for i, member in enumerate(self.members):
-            missing = member.progress.best_steps == self.steps > 0 and not has_checkpoint(
-                member.run, "best", self.steps
+            missing = member.progress.best_steps == self.steps > 0 and (
+                self.steps not in stored_checkpoints(member.run / CHECKPOINTS / "best")
             )
             if self.resumed and missing:
                 # The process was killed after saving the latest checkpoint and before saving the
@@ -507,16 +508,16 @@ class _Job:
 
     def _results(self, member: _Member) -> dict[str, Any] | None:
         """The content of the seed's results.json; None before its first evaluation."""
-        results = member.progress.results(self.steps, self.clock.seconds, self.device)
-        if results is None:
+        if member.report is None:
             return None
-        figures = {} if member.final is None else member.final.to_dict()
-        return {
-            "library": self.trainer.library,
-            "fresh_resets": member.final is not None,
-            **results,
-            **figures,
-        }
+        return member.progress.results(
+            member.report,
+            fresh_resets=member.final is not None,
+            trained_steps=self.steps,
+            seconds=self.clock.seconds,
+            device=self.device,
+            library=self.trainer.library,
+        )
 
 
 def check_library(checkpoint: Checkpoint, library: str) -> None:

@@ -23,7 +23,7 @@ def report_training(run: Path, report: Report, steps: int) -> Path:
     Raises:
       UserError: the page cannot be written.
     """
-    recording = report.recording or record_checkpoint(find_checkpoint(run, run))
+    recording = report.recording or record_checkpoint(find_checkpoint(run))
     page, evaluation = write_report(run, recording)
     # A new file, because the log of the training is already closed.
     with open_log(run, suffix=".report") as log:
