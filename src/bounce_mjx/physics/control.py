@@ -9,18 +9,18 @@ Scalar = float | jax.Array
 
 
 class Control(NamedTuple):
-    """Servo targets and disturbances over N physics steps; None where there is none.
+    """Servo targets and disturbances over N physics steps; None leaves a disturbance out.
 
-    Every engine simulates it alike: `servo_targets` gives the `ctrl` of each physics step, the push
-    changes the ball's velocity before the first one, and the force acts during all.
+    All engines apply it the same way: `servo_targets` gives the `ctrl` of each physics step, the
+    push changes the ball's velocity before the first step, and the force acts during every step.
     """
 
     ctrl: Any
     """Servo targets [nu]."""
     previous: Any = None
-    """Servo targets [nu] before the physics step `switch`."""
+    """Servo targets [nu] until the physics step `switch`."""
     switch: Any = None
-    """Number [] of physics steps under `previous`, a whole number."""
+    """Number [] of physics steps with the targets `previous`, a whole number."""
     filtered: Any = None
     """Outputs [nu] of the servos' first-order lags before the first step."""
     lag: Any = None
@@ -28,11 +28,11 @@ class Control(NamedTuple):
     ball_force: Any = None
     """Force [3] on the ball's centre, N."""
     ball_push: Any = None
-    """Velocity [3] that the ball is given, m/s."""
+    """Velocity [3] added to the ball's before the first step, m/s."""
 
 
 def servo_target(control: Control, step: Scalar) -> Scalar:
-    """Target of a servo in a physics step.
+    """Target of a servo during one physics step.
 
     The lag is the exact solution of a first-order filter whose input is constant during a step.
 
@@ -47,7 +47,7 @@ def servo_target(control: Control, step: Scalar) -> Scalar:
         asked = jnp.where(step < before, control.previous, control.ctrl)
     if control.lag is None:
         return asked
-    # A time constant of 0 is a filter without memory.
+    # A filter with a time constant of 0 has no memory.
     rate = -1.0 / jnp.maximum(control.lag, 1e-3)
     held = jnp.minimum(step + 1.0, before) if late else 0.0
     at_switch = control.filtered

@@ -1,4 +1,4 @@
-"""Whether MuJoCo's C engine converges with the solver settings of a model."""
+"""Check of a model's solver settings: does MuJoCo's C solver converge with them?"""
 
 import copy
 from collections.abc import Sequence
@@ -10,16 +10,16 @@ from bounce_mjx.robot.model import find_addresses
 
 _SETTINGS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance")
 _NUM_BOUNCES, _NUM_STEPS = 8, 30
-# The resolution of the arm's and the ball's speeds in float32 (m/s, rad/s).
+# Resolution of the arm's and the ball's speeds in float32 (m/s, rad/s).
 _MAX_ERROR = 1e-5
 
 
 def solver_warning(mj_model: mujoco.MjModel) -> str | None:
-    """One sentence that names the solver settings which leave MuJoCo's C solver unconverged; None
-    where it converges.
+    """Warning that names the settings with which MuJoCo's C solver stops before it converges; None
+    if it converges.
 
-    It compares `mj_step` in some bounces to MuJoCo's default settings, which converge for a single
-    contact.
+    The check simulates several bounces with `mj_step` and compares them to the same bounces with
+    MuJoCo's default settings, which converge for a single contact.
     """
     default = mujoco.MjOption()
     converged = _with_settings(mj_model, default, _SETTINGS)
@@ -43,7 +43,7 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
 def _with_settings(
     mj_model: mujoco.MjModel, default: mujoco.MjOption, settings: Sequence[str]
 ) -> mujoco.MjModel:
-    """A copy of the model with some solver settings of `default`."""
+    """Copy of the model with the named solver settings of `default`."""
     changed = copy.copy(mj_model)
     for setting in settings:
         setattr(changed.opt, setting, getattr(default, setting))
@@ -51,8 +51,8 @@ def _with_settings(
 
 
 def _largest_error(mj_model: mujoco.MjModel, converged: mujoco.MjModel) -> float:
-    """Largest difference of a velocity (m/s, rad/s) after one step, over the steps of some bounces
-    with a moving arm."""
+    """Largest velocity error (m/s, rad/s) of a single step, over several bounces with a moving
+    arm."""
     addresses = find_addresses(mj_model)
     rng = np.random.default_rng(0)
     half_size = mj_model.geom_size[addresses.paddle_geom]
@@ -73,7 +73,7 @@ def _largest_error(mj_model: mujoco.MjModel, converged: mujoco.MjModel) -> float
         truth.qvel[addresses.ball_qvel[:3],] = -rng.uniform(0.5, 4.0) * normal
         data.ctrl[:] = truth.ctrl
         for _ in range(_NUM_STEPS):
-            # The solver's warm start stays its own.
+            # Each solver keeps its own warm start.
             data.qpos[:], data.qvel[:], data.act[:] = truth.qpos, truth.qvel, truth.act
             mujoco.mj_step(mj_model, data)
             mujoco.mj_step(converged, truth)

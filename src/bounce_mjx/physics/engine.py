@@ -1,4 +1,4 @@
-"""The interface of a physics engine, and the choice of one for a model."""
+"""Interface of the physics engines, and the choice of an engine for a model."""
 
 import contextlib
 import functools
@@ -19,18 +19,18 @@ from bounce_mjx.physics.state import PhysicsState
 
 
 class Engine(NamedTuple):
-    """Pure functions over one environment; `jax.vmap` batches them."""
+    """Pure functions of one environment; `jax.vmap` batches them."""
 
     name: str
     """fused or mjx."""
     reason: str
-    """Reason of the choice, for the user."""
+    """Reason for the choice, shown to the user."""
     step: Callable[[PhysicsParameters, PhysicsState, Control, int], PhysicsState]
     """(parameters, state, control, number of physics steps) -> state."""
     paddle_position: Callable[[PhysicsParameters, jax.Array], jax.Array]
     """(parameters, qpos [nq]) -> world position [3] of the paddle's centre, m."""
     warnings: tuple[str, ...] = ()
-    """Known differences to MuJoCo's C engine, one sentence each, for the user."""
+    """Known differences from MuJoCo's C engine, one sentence each, shown to the user."""
 
 
 def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
@@ -87,15 +87,15 @@ def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
 
 
 def _mjx_engine() -> ModuleType:
-    # MJX takes seconds to import, which the fused engine saves, and prints a line for each of its
-    # optional parts that is not installed.
+    # The import is lazy because MJX takes seconds to import, and silent because MJX prints a line
+    # for each optional dependency that is not installed.
     with contextlib.redirect_stdout(io.StringIO()):
         from bounce_mjx.physics import mjx_engine
     return mjx_engine
 
 
 def _refusal(beyond_fused: str | None, beyond_mjx: str | None, choice: str) -> str:
-    """The sentence for a model with a feature that the chosen engine lacks."""
+    """Error message for a model with a feature that the chosen engine lacks."""
     if beyond_fused is not None and beyond_fused == beyond_mjx:
         return f"no physics engine here supports {beyond_fused}; change the MJCF"
     if beyond_fused is not None and beyond_mjx is not None:

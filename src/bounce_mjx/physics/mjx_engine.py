@@ -1,4 +1,4 @@
-"""The mjx engine: MuJoCo's own JAX implementation, for any model that has the task's names."""
+"""The mjx engine: MuJoCo's own JAX implementation, for any model with the task's names."""
 
 import contextlib
 import copy
@@ -28,9 +28,9 @@ class MjxModel(NamedTuple):
 
     model: mjx.Model
     frictional: mjx.Model
-    """`model` with a frictional contact pair; MJX holds the pair's dimension fixed."""
+    """`model` with a frictional contact pair; MJX cannot change a pair's dimension later."""
     mj_model: mujoco.MjModel
-    """Its source."""
+    """Source of both models."""
     addresses: Addresses
 
 
@@ -45,7 +45,7 @@ def read_model(mj_model: mujoco.MjModel) -> MjxModel:
 
 
 def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose pair of the ball and the paddle, if it has one, has sliding friction."""
+    """Copy of the model with sliding friction in the contact pair of ball and paddle, if any."""
     model = copy.copy(mj_model)
     with contextlib.suppress(UserError):
         fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
@@ -54,9 +54,9 @@ def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
-    """A feature of the model that MJX does not compute; None if it computes all.
+    """Name of a feature of the model that MJX does not simulate; None if it simulates them all.
 
-    MJX itself refuses some features. It ignores others silently; they are named here.
+    MJX itself refuses some features and silently ignores others; this function checks both.
     """
     m = mj_model
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
@@ -127,12 +127,12 @@ def step(
 
 
 def _with_saturated_servos(model: mjx.Model, constants: MjxModel, data: mjx.Data) -> mjx.Model:
-    """The model of one step, in which a servo at its force limit is a constant force.
+    """Model of one step, with a constant force in place of each servo at its force limit.
 
-    MJX's implicit integrator gives such a servo its damping; MuJoCo's C engine does not.
+    MJX's implicit integrator still damps a saturated servo; MuJoCo's C engine does not.
     """
-    m, at = constants.mj_model, constants.addresses
-    servos = np.array(at.actuators)
+    m = constants.mj_model
+    servos = np.array(constants.addresses.actuators)
     affine = (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (
         m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
     )
@@ -180,11 +180,11 @@ def paddle_position(
 
 
 def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
-    """The model with the given numbers of one environment."""
+    """Model with the parameters of one environment."""
     numbers = jax.tree.map(jnp.asarray, parameters)
     fields, options = edited_fields(constants.mj_model, numbers)
     replaced = fields | {f"opt.{name}": value for name, value in options.items()}
-    # MJX transforms every geom, whether or not it is known to share its body's frame.
+    # MJX transforms every geom, even one flagged as sharing its body's frame.
     replaced.pop("geom_sameframe", None)
     replaced.pop("pair_dim", None)
     model = constants.model if parameters.contact_friction is None else constants.frictional
@@ -192,6 +192,6 @@ def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
 
 
 def _full_precision() -> contextlib.AbstractContextManager:
-    """Keeps MJX's matrix products in float32. The default on a GPU, tf32, has three digits, and the
-    ball bounces wrong."""
+    """Full float32 precision for MJX's matrix products. The default on a GPU, TF32, has three
+    significant digits, and the ball bounces wrongly."""
     return jax.default_matmul_precision("highest")

@@ -1,4 +1,4 @@
-"""The world's numbers: the part of a model that may differ between environments."""
+"""Physics parameters: the numbers of a model that may differ between environments."""
 
 import copy
 from collections.abc import Mapping
@@ -18,49 +18,49 @@ MIN_FRICTION = 1e-5
 
 
 class PhysicsParameters(NamedTuple):
-    """Numbers of one environment's world; None stands for the model's own value.
+    """Physics parameters of one environment; None keeps the model's own value.
 
-    A given number replaces the same number of the model in every engine; `mj_step` on the model
-    that `edited_model` returns defines the result. Quantities of joints and links are in the order
-    of Joint1..Joint6. `jax.vmap` batches the given arrays.
+    Every engine replaces the model's value by the given one; the reference is `mj_step` on the
+    model returned by `edited_model`. Quantities of joints and links are in the order of
+    Joint1..Joint6. `jax.vmap` batches the arrays.
     """
 
     ball_mass: Array | None = None
-    """Mass [] of the ball, kg; its inertia changes in proportion."""
+    """Mass [] of the ball, kg; its inertia scales in proportion."""
     ball_radius: Array | None = None
-    """Radius [] of the ball, m; its mass stays, its inertia changes with the square."""
+    """Radius [] of the ball, m; its mass stays the same, its inertia scales with the square."""
     contact_stiffness: Array | None = None
     """Stiffness [] of the contact, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
     contact_damping: Array | None = None
     """Damping [] of the contact, 1/s: b of `solref="-k -b"`."""
     contact_friction: Array | None = None
-    """Coefficient [] of sliding friction between ball and paddle; given, it makes a pair without
-    friction one of `condim="3"`."""
+    """Coefficient [] of sliding friction between ball and paddle; it turns a frictionless pair into
+    one with `condim="3"`."""
     servo_gain: Array | None = None
     """Stiffness [6] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
     """Damping [6] of the position servos, N m s/rad: `kv`."""
     force_limit: Array | None = None
-    """Largest forces [6] of the position servos, N m: the symmetrical `forcerange`."""
+    """Force limits [6] of the position servos, N m: a symmetric `forcerange`."""
     armature: Array | None = None
     """Rotor inertia [6] at the joints, kg m^2."""
     damping: Array | None = None
     """Viscous damping [6] of the joints, N m s/rad."""
     frictionloss: Array | None = None
-    """Dry friction [6] of the joints, N m; on MuJoCo's C engine alone."""
+    """Dry friction [6] of the joints, N m; only MuJoCo's C engine simulates it."""
     link_mass: Array | None = None
-    """Masses [6] of the links, kg; first moment and inertia change in proportion, the centre of
-    mass stays."""
+    """Masses [6] of the links, kg; first moment and inertia scale in proportion, the centre of mass
+    stays in place."""
     paddle_position: Array | None = None
     """Centre [3] of the paddle in the frame of the last link, m."""
     paddle_rotation: Array | None = None
     """Orientation [4] of the paddle in the frame of the last link: a unit quaternion w, x, y, z."""
     gravity: Array | None = None
-    """Acceleration [3] of gravity in the world, m/s^2."""
+    """Gravitational acceleration [3] in the world, m/s^2."""
 
 
 MODEL_PARAMETERS = PhysicsParameters()
-"""The model's own world: nothing is given."""
+"""The model's own parameters: no value is replaced."""
 
 _NUM_JOINTS = len(JOINT_NAMES)
 SHAPES = PhysicsParameters(
@@ -80,14 +80,14 @@ SHAPES = PhysicsParameters(
     paddle_rotation=(4,),
     gravity=(3,),
 )
-"""Shape of each parameter of one environment."""
+"""Shape of each parameter for one environment."""
 
 
 def check_shapes(parameters: PhysicsParameters) -> None:
-    """Checks the parameters of one environment.
+    """Checks the shapes of one environment's parameters.
 
     Raises:
-      UserError: an array has another shape than its field.
+      UserError: an array does not have the shape of its field.
     """
     for name, value, shape in zip(parameters._fields, parameters, SHAPES, strict=True):
         if value is not None and jnp.shape(value) != shape:
@@ -100,12 +100,12 @@ def check_shapes(parameters: PhysicsParameters) -> None:
 def edited_fields(
     mj_model: mujoco.MjModel, parameters: PhysicsParameters
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Arrays of a `MjModel`, and of its `opt`, that replace the model's own ones.
+    """New arrays for the fields of a `MjModel` and of its `opt`.
 
-    NumPy's numbers give NumPy's arrays, for MuJoCo's C engine; traced ones give JAX's, for MJX.
+    NumPy parameters give NumPy arrays, for MuJoCo's C engine; traced ones give JAX arrays, for MJX.
 
-    `body_invweight0`, which scales the contact's softness, follows the ball's mass; the last
-    link's share, a thousandth of the sum, stays as it is in the unedited model.
+    `body_invweight0` scales the softness of the contact and follows the ball's mass. The last
+    link's share of the softness, a thousandth of the sum, keeps its value of the unedited model.
     """
     m, addresses, p = mj_model, find_addresses(mj_model), parameters
     links, dofs, servos = (
@@ -135,7 +135,7 @@ def edited_fields(
         put("body_inertia", ball, current("body_inertia")[ball] * ratio)
         put("body_invweight0", (ball, 1), current("body_invweight0")[ball, 1] / ratio)
     if p.ball_mass is not None or p.ball_radius is not None:
-        # MuJoCo keeps the inertia matrix of a body that moves alone, the ball, in the model.
+        # MuJoCo stores the constant inertia matrix of a free body, here the ball, in the model.
         put("dof_M0", np.array(addresses.ball_qvel[:3]), current("body_mass")[ball])
         put("dof_M0", np.array(addresses.ball_qvel[3:]), current("body_inertia")[ball])
     if p.contact_stiffness is not None or p.contact_damping is not None:
@@ -175,16 +175,16 @@ def edited_fields(
     if p.paddle_rotation is not None:
         put("geom_quat", paddle, p.paddle_rotation)
     if p.paddle_position is not None or p.paddle_rotation is not None:
-        # MuJoCo skips the transformation of a geom that is known to share its body's frame.
+        # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         put("geom_sameframe", paddle, int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE))
     return fields, {} if p.gravity is None else {"gravity": p.gravity}
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:
-    """A copy of the model that has the given numbers of one environment.
+    """Copy of the model with the parameters of one environment.
 
     Raises:
-      UserError: an array has another shape than its field.
+      UserError: an array does not have the shape of its field.
     """
     check_shapes(parameters)
     numbers = jax.tree.map(lambda x: np.asarray(x, np.float64), parameters)
@@ -198,19 +198,19 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     """k and b of the contact pair's `solref` in MuJoCo's direct format, `solref="-k -b"`.
 
-    The standard format, a time constant and a damping ratio, has an equal in the direct one
-    (documentation, "Modeling", solver parameters).
+    The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
+    documentation, "Modeling", solver parameters).
     """
     first, second = (float(x) for x in mj_model.pair_solref[_contact_pair(mj_model)])
     if first <= 0.0:
         return -first, -second
-    # MuJoCo's limit: the time constant spans two steps at least.
+    # MuJoCo's lower limit for the time constant is two steps.
     time_constant = max(first, 2.0 * mj_model.opt.timestep)
     return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
 
 
 def _contact_pair(mj_model: mujoco.MjModel) -> int:
-    """Index of the pair of the ball and the paddle."""
+    """Index of the contact pair of ball and paddle."""
     addresses = find_addresses(mj_model)
     for pair in range(mj_model.npair):
         geoms = {int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair])}
@@ -227,7 +227,7 @@ def _given(value: Array | None, default: float) -> Array | float:
 
 
 def _replaced(array: Array, index, value) -> Array:
-    """A copy of the array with new entries."""
+    """Copy of the array with new entries at an index."""
     if isinstance(array, jax.Array) or isinstance(value, jax.Array):
         return jnp.asarray(array).at[index].set(value)
     array = np.array(array)
@@ -236,7 +236,7 @@ def _replaced(array: Array, index, value) -> Array:
 
 
 def _subtree_masses(mj_model: mujoco.MjModel, mass: Array) -> Array:
-    """Mass of each body with all that it carries; MuJoCo numbers parents before children."""
+    """Mass of each body's subtree; MuJoCo numbers parents before children."""
     total = list(mass)
     for body in range(mj_model.nbody - 1, 0, -1):
         parent = mj_model.body_parentid[body]

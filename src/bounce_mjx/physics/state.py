@@ -1,4 +1,4 @@
-"""The state that every physics engine takes and returns."""
+"""State of the physics, the same for every engine."""
 
 from typing import NamedTuple
 
@@ -13,4 +13,4 @@ class PhysicsState(NamedTuple):
     qvel: jax.Array
     """Velocities [nv]: joints in rad/s; the ball in m/s (world) and rad/s (ball's frame)."""
     act: jax.Array | None = None
-    """Activations [na] of the actuators; None where the model has none."""
+    """Activations [na] of the actuators; None if the model has none."""

@@ -1,9 +1,8 @@
 """Rigid-body dynamics of a serial chain of hinges, unrolled into scalar arithmetic.
 
-Every quantity of link i is expressed in the frame of link i, whose origin lies on the axis of
-joint i, unless its name says `world`. Featherstone, Rigid Body Dynamics Algorithms (2008), is the
-source: table 5.1 (recursive Newton-Euler) and table 6.2 (composite rigid bodies), in their
-three-dimensional form.
+Quantities of link i are in the frame of link i, with its origin on the axis of joint i, unless
+their names say `world`. Source: Featherstone, Rigid Body Dynamics Algorithms (2008), table 5.1
+(recursive Newton-Euler) and table 6.2 (composite rigid bodies), in three-dimensional form.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ SquareMatrix = list[list[Scalar]]
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """Numbers of one hinge and the link that it carries."""
+    """One hinge and its link."""
 
     offset: tuple[float, float, float]
     """Origin of the link in the frame of its parent, m."""
@@ -48,24 +47,24 @@ class Link:
     axis: tuple[float, float, float]
     """Unit axis of the hinge."""
     zero_angle: float
-    """Joint angle at which the link stands at `rotation`, rad."""
+    """Joint angle of the orientation `rotation`, rad."""
     mass: Scalar
-    """kg."""
+    """Mass, kg."""
     first_moment: Vec3
     """Mass times centre of mass, kg m."""
     inertia: Mat3
     """Rotational inertia about the origin of the link, kg m^2."""
     armature: Scalar
-    """Inertia of the rotor, seen at the joint, kg m^2."""
+    """Rotor inertia reflected to the joint, kg m^2."""
     damping: Scalar
     """Viscous damping of the joint, N m s/rad."""
 
 
 class Pose(NamedTuple):
-    """Where the links are."""
+    """Poses of all links."""
 
     rotation: list[Mat3]
-    """Orientation of each link in its parent."""
+    """Orientation of each link in its parent's frame."""
     world_rotation: list[Mat3]
     """Orientation of each link in the world."""
     world_origin: list[Vec3]
@@ -146,14 +145,14 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
 
 
 def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3) -> list[Scalar]:
-    """Velocity along a world direction, per unit joint velocity, of a world point fixed to the
-    last link."""
+    """Velocity of a point fixed to the last link along a direction, per unit velocity of each joint;
+    point and direction are in the world."""
     return [dot(direction, velocity) for velocity in point_velocities(links, pose, point)]
 
 
 def point_velocities(links: Sequence[Link], pose: Pose, point: Vec3) -> Iterator[Vec3]:
-    """World velocities of a world point fixed to the last link, each per unit velocity of one
-    joint."""
+    """Velocity of a point fixed to the last link, per unit velocity of each joint; all in the
+    world."""
     for link, rotation, origin in zip(links, pose.world_rotation, pose.world_origin, strict=True):
         arm = vsub(point, origin)
         yield cross(matvec(rotation, link.axis), arm)
@@ -163,48 +162,48 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
     """Lower Cholesky factor of a symmetric positive definite matrix, and the reciprocals of its
     diagonal."""
     n = len(matrix)
-    lower: SquareMatrix = [[0.0] * n for _ in range(n)]
+    triangle: SquareMatrix = [[0.0] * n for _ in range(n)]
     inverse_diagonal = []
     for j in range(n):
         pivot = matrix[j][j]
         for k in range(j):
-            pivot = sub(pivot, mul(lower[j][k], lower[j][k]))
+            pivot = sub(pivot, mul(triangle[j][k], triangle[j][k]))
         inverse_diagonal.append(jax.lax.rsqrt(pivot))
         for i in range(j + 1, n):
             entry = matrix[i][j]
             for k in range(j):
-                entry = sub(entry, mul(lower[i][k], lower[j][k]))
-            lower[i][j] = mul(entry, inverse_diagonal[j])
-    return lower, inverse_diagonal
+                entry = sub(entry, mul(triangle[i][k], triangle[j][k]))
+            triangle[i][j] = mul(entry, inverse_diagonal[j])
+    return triangle, inverse_diagonal
 
 
 def solve_lower(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-1 b for the factor L of `cholesky`."""
-    lower, inverse_diagonal = factor
+    triangle, inverse_diagonal = factor
     x: list[Scalar] = []
     for i, entry in enumerate(b):
         for k in range(i):
-            entry = sub(entry, mul(lower[i][k], x[k]))
+            entry = sub(entry, mul(triangle[i][k], x[k]))
         x.append(mul(entry, inverse_diagonal[i]))
     return x
 
 
 def solve_upper(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-T b for the factor L of `cholesky`."""
-    lower, inverse_diagonal = factor
+    triangle, inverse_diagonal = factor
     n = len(b)
     x: list[Scalar] = [0.0] * n
     for i in reversed(range(n)):
         entry = b[i]
         for k in range(i + 1, n):
-            entry = sub(entry, mul(lower[k][i], x[k]))
+            entry = sub(entry, mul(triangle[k][i], x[k]))
         x[i] = mul(entry, inverse_diagonal[i])
     return x
 
 
 def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
-    """A force and its moment about the link's origin, both transformed to the parent's frame; the
-    resulting moment is about the parent's origin."""
+    """A force and its moment about the link's origin, transformed to the parent's frame and
+    origin."""
     force = matvec(rotation, force)
     return force, vadd(matvec(rotation, moment), cross(link.offset, force))
 
@@ -212,8 +211,8 @@ def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[V
 def _inertia_to_parent(
     link: Link, rotation: Mat3, mass: Scalar, first_moment: Vec3, inertia: Mat3
 ) -> tuple[Vec3, Mat3]:
-    """First moment and inertia of the composite body, seen in the parent's frame about its origin
-    (the parallel-axis theorem with the offset p of the link's origin)."""
+    """First moment and inertia of the composite body in the parent's frame, about the parent's
+    origin (parallel-axis theorem with the offset p of the link's origin)."""
     p = link.offset
     h = matvec(rotation, first_moment)
     rotated = congruence(rotation, inertia)

@@ -1,7 +1,7 @@
-"""The one contact: a sphere against a box, as MuJoCo computes it; its force without friction.
+"""MuJoCo's contact of a sphere and a box: geometry, impedance and the force without friction.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: impedance, reference
-acceleration, the diagonal regulariser) and its collision function for a sphere and a box.
+acceleration, diagonal regulariser), and its collision function for a sphere and a box.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ _MIN_DISTANCE = 1e-15
 
 @dataclasses.dataclass(frozen=True)
 class ContactModel:
-    """Numbers of the pair."""
+    """Parameters of the contact pair."""
 
     radius: Scalar
     """Radius of the sphere, m."""
@@ -35,26 +35,26 @@ class ContactModel:
     ball_inverse_weight: Scalar
     """Translational inverse inertia of the ball, 1/kg."""
     friction: tuple[Scalar, Scalar] | None = None
-    """Coefficients of sliding friction along the two tangents; None for a contact without."""
+    """Coefficients of sliding friction along the two tangents; None for a frictionless contact."""
     elliptic: bool = False
-    """Whether the friction cone is elliptic; else pyramidal."""
+    """Shape of the friction cone: elliptic if true, pyramidal if false."""
     impratio: float = 1.0
-    """Ratio of the impedances along the tangents and the normal (the option `impratio`)."""
+    """Ratio of the tangential to the normal impedance (the option `impratio`)."""
     tangent_damping: float | None = None
-    """b of the reference acceleration along the tangents, 1/s; None where it is `damping`."""
+    """b of the reference acceleration along the tangents, 1/s; None if equal to `damping`."""
 
 
 class Contact(NamedTuple):
-    """Geometry of the pair."""
+    """Geometry of a contact."""
 
     distance: jax.Array
     """Gap between the surfaces, negative when they overlap, m."""
     normal: Vec3
-    """World direction from the box to the sphere, of length 1."""
+    """Unit vector in the world from the box to the sphere."""
 
 
 def sphere_box(model: ContactModel, centre: Vec3, box_origin: Vec3, box_rotation: Mat3) -> Contact:
-    """Nearest point of the box; for a centre inside the box, its nearest face."""
+    """Contact at the box's nearest point; for a centre inside the box, at its nearest face."""
     local = matvec(transpose(box_rotation), vsub(centre, box_origin))
     half = model.half_size
     offset = tuple(x - jnp.clip(x, -s, s) for x, s in zip(local, half, strict=True))
@@ -103,7 +103,8 @@ def normal_force(
     free_acceleration: Scalar,
     inverse_inertia: Scalar,
 ) -> jax.Array:
-    """Force (N) along the normal: the exact solution of MuJoCo's problem with one inequality.
+    """Force (N) along the normal: the exact solution of MuJoCo's constraint problem
+    with one inequality.
 
     Args:
       normal_velocity: velocity of the sphere relative to the box along the normal, m/s.

@@ -1,7 +1,7 @@
-"""The fused engine's step, unrolled into scalar arithmetic while tracing.
+"""Step of the fused engine, unrolled into scalar arithmetic while tracing.
 
 Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physics step into a few
-loops; on a GPU all physics steps of a control step are one kernel (`gpu/elementwise.py`).
+loops; on a GPU one kernel computes all physics steps of a control step (`gpu/elementwise.py`).
 """
 
 import dataclasses
@@ -33,14 +33,14 @@ from bounce_mjx.physics.state import PhysicsState
 
 
 class Motion(NamedTuple):
-    """The coordinates that a substep changes, one scalar each."""
+    """Coordinates changed by a physics step, one scalar each."""
 
     q: tuple[Scalar, ...]
     v: tuple[Scalar, ...]
     ball_position: Vec3
     ball_velocity: Vec3
     turning: friction.Turning | None
-    """The ball's; None without friction, which alone changes it."""
+    """Spin and orientation of the ball; None without friction, as the spin is then constant."""
 
 
 def step(
@@ -52,10 +52,10 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps.
 
-    The parameters that are given enter the program as inputs; the others fold as constants. The
-    coordinates go through the loop as scalars. Without friction the ball's spin is constant,
-    because the contact's force goes through the centre; so the orientation turns once, by the angle
-    of the whole interval.
+    Given parameters are inputs of the program; the others fold into it as constants. The loop
+    carries the coordinates as scalars. Without friction the contact's force goes through the ball's
+    centre and the spin stays constant, so one rotation over the whole interval updates the
+    orientation.
     """
     addresses = model.addresses
     frictional = model.contact.friction is not None or parameters.contact_friction is not None
@@ -94,7 +94,7 @@ def step(
 def _orientation_and_spin(
     model: FusedModel, state: PhysicsState
 ) -> tuple[tuple[Scalar, ...], Vec3]:
-    """The ball's, in MuJoCo's coordinates."""
+    """Orientation and spin of the ball in MuJoCo's coordinates."""
     addresses = model.addresses
     return (
         tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
@@ -106,13 +106,13 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
     relevant = PhysicsParameters(paddle_position=parameters.paddle_position)
     numbers, given = jax.tree.flatten(as_scalars(relevant, qpos.dtype))
-    # A kernel of its own: XLA would take long to fuse such a chain with the program around it.
+    # A separate kernel: XLA takes long to fuse such a chain with the surrounding program.
     position = elementwise(_paddle_position(model, given), num_results=3)
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
 
 
 def _of_servos(control: Control, actuators: tuple[int, ...]) -> Control:
-    """The control of the arm's servos, in the order of the joints; the push is spent."""
+    """Control of the arm's servos in the order of the joints, without the push."""
 
     def chosen(ctrl: jax.Array | None) -> jax.Array | None:
         return None if ctrl is None else jnp.stack([ctrl[i] for i in actuators])
@@ -126,7 +126,7 @@ def _of_servos(control: Control, actuators: tuple[int, ...]) -> Control:
 
 
 def as_scalars(arrays: Any, dtype: jnp.dtype) -> Any:
-    """The arrays of one environment as scalars, or tuples of scalars, of one type."""
+    """Arrays of one environment as scalars, or tuples of scalars, of one dtype."""
 
     def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
         array = jnp.asarray(array, dtype)
@@ -142,11 +142,11 @@ def _substeps(
     given: jax.tree_util.PyTreeDef,
     num_substeps: int,
 ) -> Callable[..., tuple[Scalar, ...]]:
-    """Physics steps as a function of scalars: a flat `Motion` of the structure `coordinates`, then
-    the `Control` and the parameters, flat, of the structure `given`.
+    """Physics steps as a function of scalars.
 
-    The cache and the inline jit let JAX trace this long function once for all the programs that
-    have it; each trace takes some tenths of a second.
+    Its arguments are the leaves of a `Motion` (tree structure `coordinates`), then the leaves of
+    the `Control` and the parameters (tree structure `given`). Thanks to the cache and the inline
+    jit, JAX traces this long function once for all programs; a trace takes some tenths of a second.
     """
     num_coordinates = coordinates.num_leaves
 
@@ -167,7 +167,7 @@ def _substeps(
 
 
 def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
-    """Targets of the servos in a physics step."""
+    """Servo targets during one physics step."""
     if control.previous is None and control.lag is None:
         return control.ctrl
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
@@ -181,8 +181,8 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
 
 @functools.lru_cache
 def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec3]:
-    """`paddle_position` as a function of the joint angles and the given parameters; cached as
-    `_substeps` is."""
+    """`paddle_position` as a function of the joint angles and the given parameters; cached
+    like `_substeps`."""
     n = len(model.links)
 
     def position(*scalars: Scalar) -> Vec3:
@@ -193,7 +193,7 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
 
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
-    """One physics step: mj_step of this kind of model."""
+    """One physics step: the equivalent of `mj_step`."""
     keep = stored if motion.turning is not None else lambda values: values
     pose = keep(chain.forward_kinematics(model.links, motion.q))
     bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
@@ -221,7 +221,7 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
 
 def servo_torque(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
     """Torque (N m) of MuJoCo's affine actuator for the servo target (rad), and its derivative with
-    respect to the velocity, which a torque at its limit has not."""
+    respect to the velocity; the derivative is 0 at the torque limit."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
     torque = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
@@ -239,8 +239,8 @@ def contact_response(
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
 ) -> tuple[list[Scalar], Vec3, Vec3 | None]:
-    """Joint torques (N m) of the contact, and the ball's acceleration (m/s^2) and that of its spin
-    (rad/s^2, in the world) with it; None for the latter without friction."""
+    """Joint torques (N m) from the contact, total acceleration of the ball (m/s^2) and angular
+    acceleration of the ball (rad/s^2, world); the last is None without friction."""
     contact = sphere_box(
         model.contact,
         motion.ball_position,
@@ -262,7 +262,7 @@ def contact_response(
         )
         ball_acceleration = vadd(ball_free, response.ball_acceleration)
         return response.joint_torque, ball_acceleration, response.spin_acceleration
-    # The torque of a force along the normal is the same at the contact as at the ball's centre.
+    # A force along the normal has the same torque at the contact point and at the ball's centre.
     jacobian = [
         -entry
         for entry in chain.point_jacobian(model.links, pose, motion.ball_position, contact.normal)

@@ -1,14 +1,15 @@
-"""The one contact with sliding friction (MuJoCo's `condim="3"`), as MuJoCo computes it.
+"""Contact force with sliding friction (`condim="3"`), as MuJoCo computes it.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: friction cones, the dual problem,
-impedance, the diagonal regulariser), and its engine for the regulariser of each cone. The force f
+impedance, diagonal regulariser), and its source code for the regulariser of each cone. The force f
 along the normal and the two tangents minimises
 
     1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)    over the friction cone
 
 with a0 the acceleration without the contact. In units of the cone, x = (f_n, f_1 / mu_1,
-f_2 / mu_2), the cone is |(x_1, x_2)| <= x_0 or the sum of four edges (1, +-1, 0), (1, 0, +-1).
-Both solutions take the same operations in every state, as a kernel's threads need.
+f_2 / mu_2), the elliptic cone is |(x_1, x_2)| <= x_0, and the pyramidal cone consists of the
+nonnegative combinations of the four edges (1, +-1, 0), (1, 0, +-1). Both solvers run the same
+operations in every state, so that the threads of a GPU kernel do not diverge.
 """
 
 import functools
@@ -41,40 +42,41 @@ from bounce_mjx.physics.fused.scalars import (
 
 Quaternion = tuple[Scalar, Scalar, Scalar, Scalar]
 
-# Newton's steps to the direction in which the ball slips, and the longest one (rad). In the states
-# of test_friction.py two reach rounding with the shipped ball, four with one as heavy as the arm.
+# Newton iterations for the slip direction, and the longest step (rad). In the states of
+# test_friction.py two iterations reach rounding error with the shipped ball, and four with a ball
+# as heavy as the arm.
 _SLIP_ITERATIONS = 6
 _LONGEST_STEP = 0.5
 
 
 class Turning(NamedTuple):
-    """The coordinates of the ball that only friction changes."""
+    """Spin and orientation of the ball."""
 
     spin: Vec3
-    """Angular velocity in the world, rad/s. That of a sphere is constant without a torque, in the
-    world as in the ball's frame."""
+    """Angular velocity in the world, rad/s. Without a torque it is constant for a sphere, both in
+    the world and in the ball's frame."""
     orientation: Quaternion
-    """w, x, y, z."""
+    """Unit quaternion w, x, y, z."""
 
 
 class Response(NamedTuple):
-    """The effect of the contact's force."""
+    """Effect of the contact's force on the joints and the ball."""
 
     joint_torque: list[Scalar]
-    """N m."""
+    """Joint torques, N m."""
     ball_acceleration: Vec3
-    """Without gravity, m/s^2."""
+    """Acceleration of the ball by the contact alone, m/s^2."""
     spin_acceleration: Vec3
-    """In the world, rad/s^2."""
+    """Angular acceleration of the ball in the world, rad/s^2."""
 
 
 class Problem(NamedTuple):
-    """The problem in units of the cone, without the regulariser: 1/2 x.Q x + c.x."""
+    """Objective 1/2 x.Q x + c.x in units of the cone, without the regulariser."""
 
     q: tuple[Scalar, ...]
-    """Q00, Q01, Q02, Q11, Q12, Q22, 1/kg."""
+    """Entries Q00, Q01, Q02, Q11, Q12, Q22, 1/kg."""
     c: Vec3
-    """m/s^2."""
+    """Linear term, m/s^2."""
 
 
 def contact_response(
@@ -102,10 +104,10 @@ def contact_response(
     normal = contact.normal
     first, second = tangents(normal)
     first, second = stored((first, second))
-    # From the contact's point, midway between the surfaces, to the ball's centre.
+    # Distance from the contact point, midway between the surfaces, to the ball's centre.
     lever = model.radius + 0.5 * contact.distance
     point = vsub(position, scale(normal, lever))
-    # Torques on the ball of unit forces along the tangents.
+    # Torques on the ball from unit forces along the tangents.
     torques = (scale(second, -lever), scale(first, lever))
     columns = list(chain.point_velocities(links, pose, point))
     rows = [[-dot(axis, column) for column in columns] for axis in (normal, first, second)]
@@ -158,8 +160,8 @@ def contact_response(
 
 
 def tangents(normal: Vec3) -> tuple[Vec3, Vec3]:
-    """The tangents of MuJoCo's contact frame (mju_makeFrame), the second one up to its sign: y, or
-    z where the normal is near y, made orthogonal to the normal."""
+    """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign. The first
+    tangent is y, or z if the normal is close to y, made orthogonal to the normal."""
     x, y, z = normal
     from_y = jnp.abs(y) < 0.5
     along = jnp.where(from_y, y, z)
@@ -178,12 +180,13 @@ def tangents(normal: Vec3) -> tuple[Vec3, Vec3]:
 def contact_force(
     model: ContactModel, matrix: tuple[Scalar, ...], offsets: Vec3, regulariser: Scalar
 ) -> Vec3:
-    """Force [normal, first and second tangent] (N) that solves the problem above.
+    """Force [normal, first and second tangent] (N): the minimum of the objective at
+    the top of this file.
 
     Args:
       matrix: J M^-1 J^T, the entries 00, 01, 02, 11, 12, 22, 1/kg.
       offsets: J a0 - aref, m/s^2.
-      regulariser: that of the normal in a contact without friction, 1/kg.
+      regulariser: regulariser of the normal force without friction, 1/kg.
     """
     m1, m2 = model.friction
     units = (1.0, m1, m2)
@@ -203,13 +206,13 @@ def contact_force(
 
 
 def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Vec3:
-    """x in the cone |(x_1, x_2)| <= x_0, with regularisers along the axis and across it."""
+    """Minimum x in the cone |(x_1, x_2)| <= x_0, with regularisers of x_0 and of (x_1, x_2)."""
     (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
     q00, q11, q22 = q00 + normal, q11 + tangential, q22 + tangential
     squared = c1 * c1 + c2 * c2
     open_ = (c0 >= 0.0) & (c0 * c0 >= squared)
 
-    # The ball sticks: the solution without the cone.
+    # The ball sticks: the unconstrained minimum.
     inverse = 1.0 / q00
     a, b = q01 * inverse, q02 * inverse
     k11, k12, k22 = q11 - a * q01, q12 - a * q02, q22 - b * q02
@@ -220,8 +223,8 @@ def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Ve
     s0 = -(c0 * inverse + a * s1 + b * s2)
     sticks = (s0 >= 0.0) & (s1 * s1 + s2 * s2 <= s0 * s0)
 
-    # It slips: x = n (1, u) on the cone's surface, with the unit vector u that minimises
-    # c.w / sqrt(w.Q w) over w = (1, u). Newton's method on the angle of u.
+    # The ball slips: x = n (1, u) lies on the cone's surface. The unit vector u minimises
+    # c.w / sqrt(w.Q w) over w = (1, u); Newton's method finds its angle.
     pressed = c0 < 0.0
     u1, u2 = -jnp.where(pressed, e1, c1), -jnp.where(pressed, e2, c2)
     u1, u2 = _unit(u1, u2)
@@ -255,22 +258,22 @@ def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Ve
 
 
 def in_pyramidal_cone(problem: Problem, regulariser: Scalar) -> Vec3:
-    """x as a sum of nonnegative multiples of the four edges, with a regulariser on each.
+    """Minimum x over nonnegative combinations of the four edges, each with a regulariser.
 
-    Edges are active or not. The second tangent's pair of edges is solved with each of the four
-    choices for the first one's put in; one choice agrees with the signs. The pairs are in sums and
-    differences, and no term cancels where the friction is small.
+    The first tangent's two edges have four active sets. Each is eliminated in turn, and the second
+    tangent's pair of edges is solved in closed form; the solution is the active set with the right
+    signs. Sums and differences of the coefficients of a pair avoid cancellation at small friction.
     """
     (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
     h = 0.5 * regulariser
 
-    # Neither edge of the first pair.
+    # Neither edge of the first pair is active.
     s2, t2 = _pair(q00, q02, q22, c0, c2, regulariser)
     push = c0 + q00 * s2 + q02 * t2
     pull = c1 + q01 * s2 + q12 * t2
     none = (s2, jnp.zeros_like(t2), t2), push - jnp.abs(pull)
 
-    # Both.
+    # Both edges are active.
     k00, k11 = q00 + h, q11 + h
     i = 1.0 / (k00 * k11 - q01 * q01)
     p00 = h * (q00 * k11 - q01 * q01) * i
@@ -285,7 +288,7 @@ def in_pyramidal_cone(problem: Problem, regulariser: Scalar) -> Vec3:
     t1 = (q01 * push - k00 * pull) * i
     both = (s1 + s2, t1, t2), (s1 - jnp.abs(t1)) * q00
 
-    # One: the first edge, or its opposite.
+    # One edge is active: the first, or its opposite.
     def one(i: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         sign = 1.0 - 2.0 * lax.convert_element_type(i, q01.dtype)
         q_01, q_12, c_1 = sign * q01, sign * q12, sign * c1
@@ -317,7 +320,7 @@ def _better(a: tuple[Vec3, jax.Array], b: tuple[Vec3, jax.Array]) -> tuple[Vec3,
 
 
 def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
-    """Sum s and difference t of two nonnegative multiples of the edges (1, 1) and (1, -1)."""
+    """Sum s and difference t of the nonnegative coefficients of the edges (1, 1) and (1, -1)."""
     h = 0.5 * regulariser
     k00, k22 = p00 + h, p22 + h
     inverse_determinant = 1.0 / (k00 * k22 - p02 * p02)
@@ -327,7 +330,7 @@ def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
     diagonal, off = p00 + p22 + regulariser, p00 - p22
     plus = jnp.maximum(-(g0 + g2) / (diagonal + 2.0 * p02), 0.0)
     minus = jnp.maximum(-(g0 - g2) / (diagonal - 2.0 * p02), 0.0)
-    # The one that leaves the other edge nothing to do.
+    # One edge is active: the one that leaves the larger gradient on the other.
     first = g0 - g2 + off * plus >= g0 + g2 + off * minus
     s_one = jnp.where(first, plus, minus)
     t_one = jnp.where(first, plus, -minus)
@@ -335,7 +338,7 @@ def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
 
 
 def _unit(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The direction of a vector; any for a vector without length."""
+    """Unit vector along (x, y); (1, 0) for a zero vector."""
     squared = x * x + y * y
     short = squared < _tiny(squared)
     inverse = lax.rsqrt(jnp.where(short, 1.0, squared))
@@ -347,7 +350,7 @@ def _tiny(x: jax.Array) -> float:
 
 
 def turning_of(quaternion: Quaternion, spin: Vec3) -> Turning:
-    """The ball's spin in the world and its orientation, of length 1, from MuJoCo's coordinates."""
+    """Spin in the world and normalised orientation from MuJoCo's coordinates."""
     w, x, y, z = quaternion
     inverse_norm = lax.rsqrt(w * w + x * x + y * y + z * z)
     quaternion = tuple(c * inverse_norm for c in quaternion)
@@ -355,13 +358,13 @@ def turning_of(quaternion: Quaternion, spin: Vec3) -> Turning:
 
 
 def spin_in_ball(turning: Turning) -> Vec3:
-    """MuJoCo's coordinates of the spin: in the ball's frame."""
+    """Spin in the ball's frame, MuJoCo's coordinates."""
     matrix = quaternion_matrix(turning.orientation)
     return matvec(transpose(matrix), turning.spin)
 
 
 def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
-    """Spin, then orientation, one step later."""
+    """Spin and orientation one step later; the new spin turns the orientation."""
     spin = vadd(turning.spin, scale(acceleration, dt))
     squared = dot(spin, spin)
     still = squared < _tiny(squared)

@@ -1,4 +1,4 @@
-"""The fused engine's model: the constants of a compiled MJCF, and one environment's numbers."""
+"""Model of the fused engine: constants of a compiled MJCF, and parameters of one environment."""
 
 import dataclasses
 
@@ -42,10 +42,10 @@ class Servo:
 
 @dataclasses.dataclass(frozen=True)
 class FusedModel:
-    """Numbers of the fused engine, in SI units.
+    """Model of the fused engine, in SI units.
 
-    `read_model` gives constants alone, which fold while tracing; `in_world` puts scalars of one
-    environment in the place of some.
+    `read_model` returns constants, which fold while tracing; `in_world` replaces some of them by
+    the scalars of one environment.
     """
 
     dt: float
@@ -59,7 +59,7 @@ class FusedModel:
     """Orientation of the paddle in the frame of the last link."""
     ball_mass: Scalar
     ball_inertia: Scalar
-    """Of the homogeneous sphere, about any axis through its centre, kg m^2."""
+    """Inertia of the homogeneous ball about any axis through its centre, kg m^2."""
     contact: ContactModel
     addresses: Addresses
     nq: int
@@ -72,7 +72,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
     """Constants of a compiled model.
 
     Raises:
-      UnsupportedModelError: the model has a feature outside the fused engine's kind; the text
+      UnsupportedModelError: the fused engine does not support a feature of the model; the text
         names it.
     """
     addresses = find_addresses(mj_model)
@@ -94,10 +94,10 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
 
 
 def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
-    """The model with the given numbers of one environment.
+    """Model with the parameters of one environment.
 
     Args:
-      parameters: as scalars, or tuples of scalars; without any, the model stays as it is.
+      parameters: scalars, or tuples of scalars; None keeps the model's own value.
     """
     p, contact, ball_inertia = parameters, model.contact, model.ball_inertia
     if p.ball_mass is not None:
@@ -113,7 +113,7 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
     if p.contact_friction is not None:
         friction = jnp.maximum(p.contact_friction, MIN_FRICTION)
         contact = dataclasses.replace(contact, friction=(friction, friction))
-    # The direct format of solref, scaled by the impedance as MuJoCo does.
+    # MuJoCo scales the direct format of solref by the largest impedance.
     max_impedance = contact.solimp[1]
     if p.contact_stiffness is not None:
         stiffness = mul(p.contact_stiffness, 1.0 / max_impedance**2)
@@ -185,7 +185,7 @@ def _floats(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _rotation(quaternion: np.ndarray) -> Mat3:
-    """Rotation matrix, its entries within rounding of -1, 0 and 1 made exact so that they fold."""
+    """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     nearest = np.round(matrix)
@@ -233,10 +233,10 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
 
 def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactModel:
     solref, solimp = mj_model.pair_solref[0], mj_model.pair_solimp[0]
-    # The limits that MuJoCo's engine puts on solimp (mjMINIMP, mjMAXIMP).
+    # MuJoCo's limits for solimp (mjMINIMP, mjMAXIMP).
     dmin, dmax, midpoint = np.clip(solimp[[0, 1, 3]], 1e-4, 1.0 - 1e-4)
     if solref[0] > 0.0:
-        # solref is (time constant, damping ratio); the time constant spans two steps at least.
+        # solref is (time constant, damping ratio), with a time constant of at least two steps.
         time_constant = max(solref[0], 2.0 * mj_model.opt.timestep)
         stiffness = 1.0 / (dmax * time_constant * solref[1]) ** 2
         damping = 2.0 / (dmax * time_constant)
@@ -270,7 +270,7 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
 
 
 def _tangent_damping(mj_model: mujoco.MjModel, max_impedance: float) -> float | None:
-    """b of the pair's `solreffriction`; None where the pair's `solref` holds."""
+    """b of the pair's `solreffriction`; None if the pair's `solref` applies."""
     first, second = (float(x) for x in mj_model.pair_solreffriction[0])
     if (first > 0.0) != (second > 0.0) or (first == 0.0 and second == 0.0):
         return None

@@ -1,9 +1,8 @@
 """Three-dimensional algebra on scalars, folded at trace time.
 
 A scalar is a Python float (known while tracing) or a JAX array (known when running). Products with
-the 0 and 1 of a robot's fixed rotations vanish here, so that XLA gets straight-line arithmetic
-without them. A physics step has thousands of operations: `jax.lax` traces them in a fraction of the
-time of `jax.numpy`.
+the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees them. A physics step
+has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
 """
 
 import math
@@ -169,8 +168,8 @@ def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine of an angle (rad).
 
     In float32 by the method of sinf and cosf in Moshier's Cephes library: accurate to 1e-7 up to
-    1000 rad. XLA's own ones call a function for each element on a CPU and take a slow path for
-    large angles on a GPU, which was two thirds of the time of a physics step.
+    1000 rad. XLA's own functions make one call per element on a CPU and have a slow path for
+    large angles on a GPU; they would take two thirds of the time of a physics step.
     """
     if angle.dtype != jnp.float32:
         return jnp.sin(angle), jnp.cos(angle)
@@ -198,10 +197,10 @@ def polynomial(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
 
 
 def stored(values: Tree) -> Tree:
-    """The same scalars, each computed once.
+    """The same scalars, each computed only once.
 
-    XLA on a CPU makes one loop for each result, and in each computes again all that it needs, if
-    that is cheap by the operation. A call that it may not inline ends its loops.
+    On a CPU, XLA emits one loop per result and recomputes cheap intermediate values in each loop.
+    A call that XLA may not inline separates the loops and prevents this.
     """
     leaves, tree = jax.tree.flatten(values)
     with set_xla_metadata(inlineable="false"):
@@ -209,5 +208,5 @@ def stored(values: Tree) -> Tree:
     return tree.unflatten(x if is_constant(x) else next(computed) for x in leaves)
 
 
-# JAX returns the argument of a function that does nothing with it.
+# The product with 1 keeps the call: JAX removes a function that only returns its arguments.
 _times_one = jax.jit(lambda *leaves: tuple(lax.mul(x, jnp.ones_like(x)) for x in leaves))

@@ -1,4 +1,4 @@
-"""Which models the fused engine computes; any other is refused by the name of a feature."""
+"""Check that the fused engine supports a model; a refusal names the unsupported feature."""
 
 import mujoco
 import numpy as np
@@ -7,11 +7,11 @@ from bounce_mjx.robot.model import Addresses, find_addresses
 
 
 class UnsupportedModelError(ValueError):
-    """The model has a feature that the fused engine does not compute; the text names it."""
+    """The fused engine does not support a feature of the model; the text names it."""
 
 
 def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
-    """A feature of the model that the fused engine does not compute; None if it computes all."""
+    """Name of a feature that the fused engine does not support; None if it supports the model."""
     try:
         check_supported(mj_model, find_addresses(mj_model))
     except UnsupportedModelError as error:
@@ -20,10 +20,10 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
 
 
 def check_supported(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Checks that the fused engine computes every feature of a model.
+    """Checks that the fused engine supports every feature of a model.
 
     Raises:
-      UnsupportedModelError: it does not; the text names the feature.
+      UnsupportedModelError: a feature is not supported; the text names it.
     """
     _check_options(mj_model)
     _check_bodies(mj_model, addresses)
@@ -36,13 +36,13 @@ def _require(condition: bool, feature: str) -> None:
         raise UnsupportedModelError(feature)
 
 
-# Flags of the MJCF that change nothing in a model of the fused engine's kind.
+# MJCF flags without effect on the models that the fused engine supports.
 _HARMLESS_DISABLED = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
     "autoreset nativeccd island multiccd".split()
 )
 _HARMLESS_ENABLED = frozenset(("energy", "fwdinv", "invdiscrete"))
-# MuJoCo's mjMINVAL: without a greater width, the impedance is the mean of dmin and dmax.
+# MuJoCo's mjMINVAL: up to this width, the impedance is the mean of dmin and dmax.
 _MIN_WIDTH = 1e-15
 
 
