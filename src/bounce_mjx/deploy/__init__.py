@@ -1,1 +1,1 @@
-"""A policy outside the simulation: its ONNX file, and the NumPy around it."""
+"""Policies outside the simulation: ONNX files, and the NumPy code that runs them."""

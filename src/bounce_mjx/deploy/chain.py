@@ -6,7 +6,7 @@ from bounce_mjx.deploy.metadata import Metadata
 
 
 class Chain:
-    """The hinges from the world to the paddle."""
+    """The chain of hinges from the world to the paddle."""
 
     def __init__(self, metadata: Metadata):
         links = metadata.chain
@@ -14,16 +14,16 @@ class Chain:
         self._joints = [link.joint for link in links]
         self._references = np.array([link.reference for link in links])
         self._positions = np.array([link.position for link in links])
-        # A hinge's rotation by Rodrigues' formula: R (1 + sin(a) K + (1 - cos(a)) K K).
+        # Rodrigues' formula for a hinge's rotation: R (1 + sin(a) K + (1 - cos(a)) K K).
         cross = np.array([_cross(link.axis) for link in links])
         self._fixed = np.array([_matrix(link.quaternion) for link in links])
-        self._of_sine = self._fixed @ cross
-        self._of_cosine = self._of_sine @ cross
+        self._sine_term = self._fixed @ cross
+        self._cosine_term = self._sine_term @ cross
 
     def paddle_position(self, joint_angles: np.ndarray) -> np.ndarray:
         """World position [3] of the paddle's centre at joint angles [J] (rad), m."""
         angles = (joint_angles[self._joints] - self._references)[:, None, None]
-        turned = np.sin(angles) * self._of_sine + (1.0 - np.cos(angles)) * self._of_cosine
+        turned = np.sin(angles) * self._sine_term + (1.0 - np.cos(angles)) * self._cosine_term
         position = self._paddle
         for origin, rotation in zip(
             self._positions[::-1], (self._fixed + turned)[::-1], strict=True

@@ -1,7 +1,7 @@
 """A trained policy as one ONNX graph, or as a compiled JAX function.
 
-Both have one input for each part of the observation, as a robot's engineer has the measurements:
-names and shapes are checked where one vector would hide a wrong order.
+Both have a separate input for each part of the observation. The runtime checks the names and shapes
+of the inputs; a single vector would hide a wrong order.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.observation import QUANTITIES
 
-# Of 2022: any onnxruntime from 1.14 on reads them.
+# Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
 
 # An input and the output cannot share a name.
@@ -36,7 +36,7 @@ _ACTION = (
 
 
 def export_onnx(checkpoint: Checkpoint) -> bytes:
-    """The policy of a checkpoint as an ONNX file with normaliser, network, clipping and metadata.
+    """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping and metadata.
 
     The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
     action); the output is `action`, float32 [N, 6].
@@ -53,10 +53,10 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 
 
 def export_jax(checkpoint: Checkpoint) -> bytes:
-    """The policy of a checkpoint as a `jax.export` artefact for the CPU and CUDA.
+    """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
 
-    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, 6], for any N; the inputs
-    are a dict with the names and shapes of `export_onnx`.
+    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, 6] for any N; `inputs` is
+    a dict with the names and shapes of `export_onnx`.
 
     Raises:
       UserError: the checkpoint is damaged.
@@ -76,13 +76,13 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
 
 
 def describe(config: TrainConfig, steps: int) -> Metadata:
-    """The metadata of a run's policy.
+    """Metadata of a run's policy.
 
     Args:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, or its arm is no chain of hinges Joint1..Joint6.
+      UserError: the MJCF file is missing, or its arm is not a chain of hinges Joint1..Joint6.
     """
     env = config.env
     m = load_model(env.mjcf, env.physics_dt, visual=False)
@@ -134,7 +134,7 @@ def _plain(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, float]]:
-    """The hinges from the world to the paddle, and the paddle's centre in the last one's frame."""
+    """Hinges from the world to the paddle, and the paddle's centre in the last hinge's frame."""
     addresses = find_addresses(m)
     body = m.geom_bodyid[addresses.paddle_geom]
     bodies = [body]
@@ -180,7 +180,7 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> Any:
-    """The ONNX model of a policy network; flax names its layers MLP_0/hidden_i and Dense_0."""
+    """ONNX model of a policy network; flax names the layers MLP_0/hidden_i and Dense_0."""
     try:
         import onnx
         from onnx import helper, numpy_helper

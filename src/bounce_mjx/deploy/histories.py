@@ -1,6 +1,6 @@
-"""The observation from the measurements of each control step: the NumPy twin of `task/sensing.py`.
+"""Observations from the measurements of each control step: the NumPy twin of `task/sensing.py`.
 
-`remember` there is the reference for every history, and a test compares the two.
+Its function `remember` is the reference for every history; a test compares the two.
 """
 
 import numpy as np
@@ -10,27 +10,28 @@ from bounce_mjx.deploy.metadata import Metadata
 
 Measurements = dict[str, np.ndarray]
 
-# The quantities that have a value for each bounce, by the moment of it.
+# Quantities with one value for each bounce: those fixed by the flight before the bounce, and those
+# measured at the ball's lowest point.
 OF_FLIGHT = frozenset(("apex_error", "bounce_interval"))
 OF_LOWEST = frozenset(("bounce_position", "bounce_joint_angles", "bounce_joint_velocities"))
 OF_BOUNCES = OF_FLIGHT | OF_LOWEST
 
-# A picture counts as another one if it was taken later by more than this, s.
+# Smallest difference between the times of two pictures, s.
 _SAME_PICTURE = 1e-4
 # Shortest time between two pictures in a difference quotient, s.
 _SHORTEST = 1e-3
 
 
 class Histories:
-    """The last values of each observed quantity.
+    """Last values of each observed quantity.
 
-    The measurements of a step are all that the policy needs: `joint_angles` [J],
+    Measurements are arrays by name, as many as the policy needs: `joint_angles` [J],
     `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `target_height` [1],
     `ball_age` [1], and so on; units m, rad and s.
     """
 
     def __init__(self, metadata: Metadata, measured: Measurements):
-        """The past of the first control step is as its present."""
+        """Fills the history with the measurements of the first control step."""
         self._metadata, self._chain = metadata, Chain(metadata)
         self._ball = measured.get("ball_position", np.zeros(3))
         self._ball_velocity = np.zeros(3)
@@ -55,10 +56,10 @@ class Histories:
         self.values = {
             part.name: np.tile(start[part.name], (part.history, 1)) for part in metadata.observation
         }
-        """The last values of each quantity [history, size], the newest first."""
+        """Last values of each quantity [history, size], the newest first."""
 
     def add(self, measured: Measurements, action: np.ndarray) -> None:
-        """Adds the measurements of the next control step, before which the action [J] was taken."""
+        """Adds the measurements of the next control step, and the action [J] of the step before."""
         metadata = self._metadata
         angles = measured.get("joint_angles")
         paddle = np.zeros(3) if angles is None else self._chain.paddle_position(angles)
@@ -77,8 +78,8 @@ class Histories:
                 past[0] = value
 
     def _picture(self, measured: Measurements) -> Measurements:
-        """Age of the ball's picture, and the velocity by the last two pictures if the policy wants
-        it. Where the age is not measured, a picture is new as soon as the position differs."""
+        """Ball velocity from the last two pictures, if the policy uses differences; updates the age
+        of the picture. Without a measured age, a picture is new as soon as the position differs."""
         held_age = self._age + self._metadata.control_dt
         position = measured["ball_position"]
         if "ball_age" in measured:
@@ -99,10 +100,10 @@ class Histories:
     def _bounces(
         self, measured: Measurements, near_height: float
     ) -> dict[str, tuple[bool, np.ndarray]]:
-        """The quantities of bounces that change: whether a bounce starts, and the value.
+        """Changed quantities of bounces: a flag for the start of a new bounce, and the value.
 
-        A bounce starts when the ball is first measured near the paddle, and its values belong to
-        the ball's lowest measured point.
+        A bounce starts when the ball is first measured near the paddle; its values are taken at the
+        ball's lowest measured point.
         """
         if not OF_BOUNCES & self.values.keys():
             return {}

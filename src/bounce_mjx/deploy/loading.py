@@ -1,4 +1,4 @@
-"""`load_policy`: a policy by its name, from an ONNX file, or from a run."""
+"""`load_policy`: loads a policy by name, from an ONNX file, or from a run."""
 
 import os
 from pathlib import Path
@@ -8,16 +8,16 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 
 NAMES = ("robust", "pretrained")
-"""Policies of the package, as `pretrained/<name>.onnx`."""
+"""Policies that come with the package, in `pretrained/<name>.onnx`."""
 
 
 def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
     Args:
-      policy: "robust" or "pretrained", the policies of the package; a `.onnx` file that
-        `bounce-mjx export` wrote; or a run's folder or a checkpoint in it, which needs JAX to be
-        exported first.
+      policy: "robust" or "pretrained", the policies that come with the package; a `.onnx` file
+        from `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported
+        with JAX.
 
     Raises:
       UserError: there is no such policy, or the file is damaged.

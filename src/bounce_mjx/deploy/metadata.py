@@ -1,6 +1,6 @@
-"""The facts that an exported policy carries with it, as the ONNX file's `metadata_props`.
+"""Metadata of an exported policy, stored in the ONNX file's `metadata_props`.
 
-Every entry is JSON, under the name of its field here.
+Every entry is JSON under the name of its field in `Metadata`.
 """
 
 import json
@@ -8,14 +8,14 @@ import math
 from typing import Any, NamedTuple
 
 FORMAT = 1
-"""Version of the entries; a reader refuses any other."""
+"""Version of the entries; readers refuse other versions."""
 
 
 class Part(NamedTuple):
     """One input of the network."""
 
     name: str
-    """The quantity; `past_actions` are the outputs of the last steps."""
+    """Name of the quantity; `past_actions` are the network's outputs in the last steps."""
     history: int
     """Number of values, the newest first."""
     size: int
@@ -25,7 +25,7 @@ class Part(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A hinge on the way from the world to the paddle, in the frame of the hinge before it."""
+    """A hinge between the world and the paddle, in the frame of the previous hinge."""
 
     joint: int
     """Index of its joint."""
@@ -34,17 +34,17 @@ class Link(NamedTuple):
     quaternion: tuple[float, float, float, float]
     """Orientation at the angle `reference`, in the order w, x, y, z."""
     axis: tuple[float, float, float]
-    """Unit vector."""
+    """Unit vector along the axis."""
     reference: float
-    """Joint angle at which the hinge is not turned, rad."""
+    """Joint angle of the unturned hinge, rad."""
 
 
 class Metadata(NamedTuple):
-    """Everything that acting with the network needs."""
+    """All information needed to act with the network."""
 
     format: int
     steps: int
-    """Environment steps of the training."""
+    """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J = 6 joints."""
     observation: tuple[Part, ...]
@@ -60,20 +60,20 @@ class Metadata(NamedTuple):
     joint_ranges: tuple[tuple[float, float] | None, ...]
     """Range of each servo target, rad; None for a joint without one."""
     servo_stiffness: tuple[float, ...]
-    """Torque of each servo over its position error, N m/rad."""
+    """Torque of each servo per position error, N m/rad."""
     servo_damping: tuple[float, ...]
-    """Torque of each servo over its joint's velocity, N m s/rad."""
+    """Torque of each servo per joint velocity, N m s/rad."""
     torque_limits: tuple[float | None, ...]
-    """Largest torque of each servo, N m; None for one without a limit."""
+    """Largest torque of each servo, N m; None for a servo without a limit."""
     default_joint_angles: tuple[float, ...]
     """Joint angles at the start of an episode, rad."""
     target_height_range: tuple[float, float]
-    """Target heights of the training, m."""
+    """Range of target heights in the training, m."""
     randomization: dict[str, tuple[float, float]]
-    """Ranges of the training's worlds, by the keys of `env.randomization`, which documents their
-    units; a term that is not here did not differ."""
+    """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
+    documents their units; missing terms were not randomised."""
     bounce_max_distance: float
-    """Height above the paddle below which the ball counts as near it, m."""
+    """Largest height above the paddle at which the ball counts as near it, m."""
     chain: tuple[Link, ...]
     """The hinges from the world to the paddle."""
     paddle: tuple[float, float, float]
@@ -81,7 +81,7 @@ class Metadata(NamedTuple):
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """The metadata as JSON, by name."""
+    """JSON texts of the metadata by field name."""
     plain = metadata._asdict() | {
         "observation": [part._asdict() for part in metadata.observation],
         "chain": [link._asdict() for link in metadata.chain],
@@ -90,7 +90,7 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
-    """The metadata of `to_entries`; ValueError for anything else."""
+    """Metadata from the entries of `to_entries`; ValueError for anything else."""
     missing = [name for name in Metadata._fields if name not in entries]
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")

@@ -1,4 +1,4 @@
-"""A trained policy on a robot: measurements in, actions out, with NumPy and onnxruntime alone."""
+"""A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,11 +23,11 @@ UNITS = {
     "target_height": "m",
     "time": "s",
 }
-"""The measurements that a step may be given, and their units."""
+"""Measurements accepted by a step, and their units."""
 
 
 class DeployedPolicy:
-    """A policy with the histories that it sees; `load_policy` makes one.
+    """A policy with the histories of its inputs; `load_policy` creates it.
 
     Call `reset` before each ball and `step` once each control step. Positions are in the robot's
     frame: x forward, z upward, the floor at z = 0.
@@ -38,10 +38,10 @@ class DeployedPolicy:
 
         Args:
           model: content of the file.
-          source: its name, for messages.
+          source: name of the file, for messages.
 
         Raises:
-          UserError: it is not a policy that `bounce-mjx export` wrote, or onnxruntime is missing.
+          UserError: the file is not a policy from `bounce-mjx export`, or onnxruntime is missing.
         """
         try:
             import onnxruntime
@@ -61,7 +61,7 @@ class DeployedPolicy:
             self.metadata: Metadata = from_entries(entries)
             self._shapes = _shapes(len(self.metadata.joint_names))
             self._check_inputs()
-        # onnxruntime raises many types for a damaged file; all of them mean the same here.
+        # onnxruntime raises exceptions of many types for a damaged file.
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
             raise UserError(
@@ -69,38 +69,39 @@ class DeployedPolicy:
                 "that bounce-mjx export wrote"
             ) from error
         self.needs = self._needs()
-        """Measurements that every step must be given; `UNITS` has their units."""
+        """Measurements required in every step; `UNITS` has their units."""
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the past. The next step starts it: all past values are as the present ones."""
+        """Forgets the past. The next step fills the whole history with its measurements."""
         self._histories: Histories | None = None
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """The action of a control step.
+        """Action of a control step.
 
         Args:
           measurements: `joint_angles` [J] (rad) and `joint_velocities` [J] (rad/s) in the order of
-            `metadata.joint_names`; of the ball's newest picture `ball_position` [3] (m),
+            `metadata.joint_names`; from the newest picture of the ball `ball_position` [3] (m),
             `ball_velocity` [3] (m/s), `ball_age` (time since the picture was taken, s),
             `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
-            (rad/s; default 0); `target_height` (m); `time` of any clock (s). Those in `needs` must
-            be there. Without `time`, a step is one control step after the last one.
+            (rad/s; default 0); `target_height` (m); `time` of any clock (s). The measurements in
+            `needs` are required. Without `time`, a step is one control step after the last one.
 
             With `time`, the elapsed time is rounded to control steps. A call less than half a
             control step after the last one, or before it, is a repetition: it changes nothing and
-            returns the last action. A call several control steps late fills the missed ones with
-            measurements between the last and the new, and with the last action.
+            returns the last action. A call several control steps late fills the missed steps with
+            interpolated measurements and the last action.
 
         Returns:
-          The action [J], from -1 to 1; `servo_targets` converts it.
+          Action [J], from -1 to 1; `servo_targets` converts it.
 
         Raises:
-          UserError: a needed measurement is missing, one is unknown, of another shape or not
-            finite, or the time is more than 1 s from the last. The policy stays as it was.
+          UserError: a required measurement is missing; a measurement is unknown, has the wrong
+            shape or is not finite; or the time is more than 1 s from the last. The policy's
+            state does not change.
         """
         measured = self._checked(measurements)
         time = float(measured.pop("time")[0]) if "time" in measured else None
@@ -127,11 +128,11 @@ class DeployedPolicy:
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
-        """Servo targets [J] (rad) of the last step's action [J]: its measured joint angles plus the
-        scaled action, clipped to the joint ranges.
+        """Servo targets [J] (rad) for the last step's action [J]: the joint angles measured in that
+        step plus the scaled action, clipped to the joint ranges.
 
         Raises:
-          UserError: there was no step since the reset, or its measurements had no joint angles.
+          UserError: there was no step since the reset, or it had no measured joint angles.
         """
         if "joint_angles" not in self._measured:
             raise UserError(
@@ -146,13 +147,13 @@ class DeployedPolicy:
 
     @property
     def observation(self) -> np.ndarray:
-        """The network's inputs at the last step, in one vector: each quantity, the newest first;
-        empty before the first step."""
+        """Inputs of the network at the last step in one vector, with the newest value of each
+        quantity first; empty before the first step."""
         values = [] if self._histories is None else self._histories.values.values()
         return np.concatenate([np.zeros(0), *(value.ravel() for value in values)])
 
     def _check_inputs(self) -> None:
-        """ValueError where the network is not of its metadata."""
+        """Raises ValueError if the network does not match its metadata."""
         stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
         actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
         outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
@@ -178,7 +179,7 @@ class DeployedPolicy:
         return tuple(name for name, users in needs.items() if users & seen)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
-        """The measurements as arrays of their own, with defaults for the missing ones."""
+        """Copies of the measurements as arrays, with defaults for optional ones."""
         for name in measurements:
             if name not in self._shapes:
                 raise UserError(f"{name} is no measurement; a step takes {', '.join(self._shapes)}")

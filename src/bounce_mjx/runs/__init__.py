@@ -1,1 +1,1 @@
-"""A run's folder."""
+"""Folders of training runs: configs, checkpoints and results."""

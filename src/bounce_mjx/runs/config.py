@@ -48,29 +48,29 @@ class TrainConfig(StrictModel):
 
 
 def load_run_config(run: Path) -> TrainConfig:
-    """The resolved config of a run.
+    """Reads the resolved config of a run.
 
     Raises:
-      UserError: it is missing or damaged.
+      UserError: the file is missing or damaged.
     """
     return load_config(run / CONFIG_FILE)
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Reads a run's config from a YAML file, missing keys at their defaults.
+    """Reads a run's config from a YAML file, with defaults for missing keys.
 
     Raises:
-      UserError: the file is missing, is no YAML mapping, or holds an unknown key or a bad value.
+      UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
     return validate(TrainConfig, values, str(path))
 
 
 def read_preset(path: Path | None) -> TrainConfig:
-    """The config of a preset in configs/; without a path, of the preset for this machine.
+    """Reads a preset from configs/; without a path, the preset for this machine.
 
     Raises:
-      UserError: the file is missing or wrong.
+      UserError: the file is missing or invalid.
     """
     if path is None:
         preset = "cpu" if jax.default_backend() == "cpu" else "default"

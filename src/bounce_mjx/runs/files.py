@@ -1,5 +1,4 @@
-"""Files of a run: JSON that is checked as it is read, text that is written whole or not at all, and
-the manifest that tells whether a checkpoint is as it was written."""
+"""Files of a run: validated JSON, atomic writes, and a manifest that verifies a checkpoint."""
 
 import hashlib
 import json
@@ -18,20 +17,20 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
 class Manifest(pydantic.BaseModel):
-    """manifest.json: size and SHA-256 of every other file of a checkpoint, by name."""
+    """manifest.json: size and SHA-256 of every other file in a checkpoint, by name."""
 
     format: int = 1
     files: dict[str, dict[str, int | str]]
 
 
 def to_json(plain: Any) -> str:
-    """Plain data as JSON. A number that is not finite becomes null: JSON cannot spell it."""
-    # Not by `pydantic_core.to_json`, which cannot write a path that is not UTF-8.
+    """Plain data as JSON. Non-finite numbers, which JSON cannot express, become null."""
+    # `pydantic_core.to_json` fails for paths that are not UTF-8.
     return json.dumps(to_jsonable_python(plain, inf_nan_mode="null"), indent=2) + "\n"
 
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
-    """Reads JSON of the shape that `model` describes; OSError or ValueError for anything else."""
+    """Reads and validates a JSON file; raises OSError or ValueError if it does not fit `model`."""
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise ValueError(f"{path.name} is too large")
     try:
@@ -43,13 +42,13 @@ def read_json(path: Path, model: type[ModelT]) -> ModelT:
 
 
 def first_mistake(error: pydantic.ValidationError) -> str:
-    """The first mistake in stored data, on one line: its place, and the type expected there."""
+    """First validation error in stored data, on one line: its place and the expected type."""
     first = error.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}".removeprefix(": ")
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Writes a text file; a reader sees the old text or the new one, both whole."""
+    """Writes a text file; readers see either the complete old text or the complete new text."""
     partial = path.with_name(path.name + PARTIAL)
     try:
         partial.write_text(text, encoding="utf-8")
@@ -61,7 +60,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def sync(path: Path) -> None:
-    """Brings a file, or the entries of a folder, to the disk."""
+    """Flushes a file, or the entries of a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -70,12 +69,12 @@ def sync(path: Path) -> None:
 
 
 def seal(folder: Path) -> None:
-    """Writes the manifest of a checkpoint whose other files are complete."""
+    """Writes the manifest of a checkpoint; all other files must be complete."""
     write_atomically(folder / MANIFEST_FILE, to_json(Manifest(files=_describe_files(folder))))
 
 
 def check_integrity(folder: Path) -> None:
-    """Raises OSError or ValueError where a file is not as the manifest describes it."""
+    """Raises OSError or ValueError if a file does not match the manifest."""
     found = _describe_files(folder)
     expected = read_json(folder / MANIFEST_FILE, Manifest).files
     for name in sorted(found.keys() | expected.keys()):
@@ -86,7 +85,7 @@ def check_integrity(folder: Path) -> None:
 
 
 def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:
-    """The entries of a manifest; ValueError for a link or a device, which may have no end."""
+    """Entries of a manifest; ValueError for links and devices, which may be endless."""
     entries = {}
     for path in folder.rglob("*"):
         if path.is_symlink() or not (path.is_file() or path.is_dir()):

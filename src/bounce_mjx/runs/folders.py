@@ -1,9 +1,9 @@
-"""Where runs and checkpoints lie, and how they are found.
+"""Folders of runs and checkpoints, and functions that find them.
 
     runs/bounce_ball/<time stamp>/
         config.yaml                     the resolved config
         events.out.tfevents.*           TensorBoard scalars
-        results.json                    all evaluations, and where the time went
+        results.json                    all evaluations, and the time of each activity
         checkpoints/latest/<steps>/     the newest state
         checkpoints/best/<steps>/       the state with the best evaluation
             policy/                     the policy, written by orbax
@@ -11,10 +11,10 @@
             run.json                    the steps, the config, the evaluations so far
             manifest.json               size and SHA-256 of every other file
 
-A run of several seeds has a folder for each, such as seed_003/, laid out like the folder of a run
-of one seed; the run's own checkpoints/latest/ holds the state of all seeds.
+A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
+one seed; the run's own checkpoints/latest/ holds the state of all seeds.
 
-Every function that finds something raises a `UserError` where there is nothing to find.
+Functions that search raise a `UserError` if they find nothing.
 """
 
 import datetime
@@ -36,13 +36,13 @@ from bounce_mjx.runs.progress import load_results
 CheckpointName = Literal["latest", "best"]
 PRETRAINED = "pretrained"
 SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
-"""Names of the policies that come with the package, and the folders of their runs."""
+"""Policies that come with the package: their names, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
 REPLACED = ".discarded"
 
 
 class Checkpoint(NamedTuple):
-    """Where a checkpoint lies."""
+    """Location of a checkpoint."""
 
     run: Path
     """The run's folder."""
@@ -53,7 +53,7 @@ class Checkpoint(NamedTuple):
 
 
 def create_run(config: TrainConfig) -> Path:
-    """Makes a new run's folder, named by the time, with the config in it.
+    """Creates a new run's folder, named after the current time, with the config in it.
 
     Raises:
       UserError: the folder cannot be written.
@@ -82,18 +82,18 @@ def save_config(run: Path, config: TrainConfig) -> None:
 
 
 def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
-    """The folders of the seeds of a run."""
+    """Folders of a run's seeds."""
     return [run / f"seed_{seed:03d}" for seed in seeds]
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
-    """The seeds' folders in a run; the run itself if it has one seed."""
+    """Existing folders of a run's seeds; the run itself if it has one seed."""
     return sorted(run.glob("seed_*")) or [run]
 
 
 def find_run(path: Path) -> Path:
-    """The run's folder that a path is or lies in."""
-    # Unlike Path.is_dir, false for a name that is too long.
+    """Folder of the run that contains a path; the path may be the folder itself."""
+    # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
         raise UserError(
             f"there is no checkpoint folder {path}; give a run's folder such as "
@@ -109,7 +109,7 @@ def find_run(path: Path) -> Path:
 
 
 def newest_run(log_dir: Path) -> Path:
-    """The newest run's folder that holds a checkpoint."""
+    """Folder of the newest run with a checkpoint."""
     found = [p.parent.parent for p in log_dir.glob(f"*/{CHECKPOINTS}/*") if stored_checkpoints(p)]
     if not found:
         raise UserError(
@@ -123,8 +123,8 @@ def find_checkpoint(path: Path) -> Checkpoint:
     """Finds a checkpoint.
 
     Args:
-      path: a run's folder (its best checkpoint, or else its latest), a folder of checkpoints in
-        it, or a checkpoint itself.
+      path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
+        of checkpoints in it, or a checkpoint.
     """
     run, place = find_run(path), Path(os.path.abspath(path))
     if place == Path(os.path.abspath(run)):
@@ -139,17 +139,17 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:
-    """The newest state of a run, from which its training is resumed."""
+    """Newest checkpoint of a run, from which its training resumes."""
     return find_checkpoint(run / CHECKPOINTS / "latest")
 
 
 def best_checkpoint(run: Path) -> Checkpoint:
-    """The state of a run with the best evaluation."""
+    """Checkpoint of a run with the best evaluation."""
     return find_checkpoint(run / CHECKPOINTS / "best")
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
-    """The checkpoint of a policy in `SHIPPED`."""
+    """Checkpoint of a policy in `SHIPPED`."""
     folder = resource_path(SHIPPED[name])
     if not folder.is_dir():
         others = " or ".join(other for other in SHIPPED if other != name)
@@ -161,11 +161,12 @@ def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
 
 
 def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Checkpoint:
-    """The checkpoint to show or to evaluate; prints the choice where the user made none.
+    """Checkpoint to show or to evaluate; prints the choice if the user made none.
 
     Args:
-      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder of that name.
-        Where it is None and the default folder of runs is empty, the choice is `PRETRAINED`.
+      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder with that name.
+        For None, the newest run in `log_dir`, or `PRETRAINED` if the default folder of runs is
+        empty.
     """
     if str(path) in SHIPPED and not path.is_dir():
         return pretrained_checkpoint(str(path))
@@ -183,8 +184,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
-    """The checkpoints in a folder by their steps."""
-    # One that is being replaced counts until the next has its place.
+    """Checkpoints in a folder by their steps."""
+    # A checkpoint marked as replaced counts until its successor is in place.
     for suffix in ("", REPLACED):
         paths = [p for p in folder.glob("*") if p.suffix == suffix and p.is_dir()]
         if found := {int(p.stem): p for p in paths if p.stem.isdecimal()}:
@@ -193,7 +194,7 @@ def stored_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def _best_seed(run: Path) -> Path:
-    """The folder of a run's best seed; the run itself if it has one seed."""
+    """Folder of a run's best seed; the run itself if it has one seed."""
     results = {seed: load_results(seed) for seed in runs_of_seeds(run) if seed != run}
     scores = {seed: found.best.score for seed, found in results.items() if found}
     return max(scores, key=scores.get, default=run)

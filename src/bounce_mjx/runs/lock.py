@@ -1,4 +1,4 @@
-"""One writer for a run's folder."""
+"""Lock that gives a run's folder a single writer."""
 
 import contextlib
 import fcntl
@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError
 def lock_run(run: Path) -> Iterator[None]:
     """Holds the lock of a run's folder; the kernel releases it when the process dies.
 
-    A file system without locks of folders, such as NFS, grants it to everyone.
+    On a file system without locks on folders, such as NFS, every process gets the lock.
 
     Raises:
       UserError: another process holds the lock, or the folder cannot be opened.
@@ -23,7 +23,7 @@ def lock_run(run: Path) -> Iterator[None]:
     except OSError as error:
         raise UserError(f"{run} cannot be opened ({error.strerror}); make it readable") from error
     try:
-        # A refusal of any other kind means that there are no locks.
+        # Any other OSError means that the file system has no locks.
         with contextlib.suppress(OSError):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""The evaluations of a run, as its checkpoints and results.json store them."""
+"""Evaluations of a run, as stored in its checkpoints and in results.json."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,13 +16,13 @@ _Steps = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Evaluation(pydantic.BaseModel, extra="allow"):
-    """An evaluation in the list of all: the value of each result by its name."""
+    """One evaluation: the value of each result by its name."""
 
     __pydantic_extra__: dict[str, Figure]
     steps: _Steps
     passed: bool
     screening: bool = False
-    """Whether the policy failed in the few episodes of the screening, and had no others."""
+    """Whether the policy failed the screening, so that no full evaluation followed."""
 
 
 class _Evaluations(pydantic.BaseModel):
@@ -32,15 +32,15 @@ class _Evaluations(pydantic.BaseModel):
 
 
 class Results(_Evaluations):
-    """results.json: the best evaluation, all evaluations, and where the time went. The file has the
-    keys of the best evaluation beside the others."""
+    """results.json: the best evaluation, all evaluations, and the time of each activity. In the
+    file, the keys of the best evaluation are at the top level."""
 
     best: Report
     device: str
     trained_steps: _Steps = 0
     seconds: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = {}
     fresh_resets: bool = False
-    """Whether the five results are of resets that did not select the best checkpoint."""
+    """Whether the five results come from other resets than the selection of the checkpoint."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -56,7 +56,7 @@ class Results(_Evaluations):
 
 
 def load_results(run: Path) -> Results | None:
-    """The run's results; None if there are none yet.
+    """Results of a run; None if there are none yet.
 
     Raises:
       UserError: the file is damaged.
@@ -71,18 +71,18 @@ def load_results(run: Path) -> Results | None:
 
 
 class Progress(_Evaluations):
-    """The evaluations of a training so far."""
+    """Evaluations of a training so far."""
 
     best: Report | None = None
     fault: str | None = None
-    """The first quantity that was not finite, and when, once the training diverged."""
+    """First quantity that was not finite, and its step; None unless the training diverged."""
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any], checkpoint: Path) -> "Progress":
-        """Reads the `model_dump` that the folder of a checkpoint holds.
+        """Reads the `model_dump` stored in a checkpoint.
 
         Raises:
-          UserError: it is damaged.
+          UserError: the data is damaged.
         """
         try:
             return cls.model_validate(plain)
@@ -93,16 +93,16 @@ class Progress(_Evaluations):
             ) from error
 
     def results(self, report: Report, **run: Any) -> dict[str, Any]:
-        """The content of results.json: an evaluation, and the other fields of `Results`."""
+        """Content of results.json: an evaluation, and the other fields of `Results`."""
         return report.to_dict() | self.model_dump(exclude={"best", "fault"}) | run
 
     def has(self, steps: int) -> bool:
-        """Whether the state after so many steps was evaluated."""
+        """Whether the state after this number of steps was evaluated."""
         return any(evaluation.steps == steps for evaluation in self.evaluations)
 
     def improves(self, report: Report, steps: int) -> bool:
-        """Adds an evaluation; whether it is the best so far."""
-        # Not validated: a figure that is not finite is stored as null.
+        """Adds an evaluation; returns whether it is the best so far."""
+        # Built without validation, as a non-finite figure is allowed here and stored as null.
         new = Evaluation.model_construct(
             steps=steps,
             passed=report.passed,

@@ -1,7 +1,8 @@
-"""The content of a checkpoint, read so that a damaged or crafted one is refused in one sentence.
+"""Reading of checkpoints; one sentence refuses a damaged or malicious checkpoint.
 
-Arrays are numbers in OCDBT and zarr, all else is JSON: nothing in a checkpoint can be run. Every
-function raises a `UserError` where the checkpoint is damaged, or of another config than its run.
+Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpoint is executable.
+Every function raises a `UserError` if the checkpoint is damaged or its config differs from the
+run's.
 """
 
 import os
@@ -24,8 +25,8 @@ from bounce_mjx.runs.folders import Checkpoint
 
 RECORD_FILE = "run.json"
 
-# What may differ between a checkpoint and the training that is resumed from it: everything else
-# shapes its state. The MJCF file may have moved, but must describe the same model.
+# Keys that may differ between a checkpoint and the training that resumes from it. All other keys
+# shape the training's state. The MJCF file may have moved, but must describe the same model.
 RESUMABLE_KEYS = frozenset(
     "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
     "num_devices env.mjcf".split()
@@ -33,7 +34,7 @@ RESUMABLE_KEYS = frozenset(
 
 
 class Record(pydantic.BaseModel):
-    """run.json."""
+    """Content of run.json."""
 
     steps: int
     config: TrainConfig
@@ -56,10 +57,10 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
 def load_training_state(
     checkpoint: Checkpoint, template: TrainingState
 ) -> tuple[TrainingState, dict[str, Any]]:
-    """Restores the whole training state of a checkpoint, and the evaluations up to it.
+    """Restores the whole training state of a checkpoint, and the evaluations so far.
 
     Args:
-      template: its shapes and types, as from `jax.eval_shape`.
+      template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
     if not (checkpoint.folder / "training").is_dir():
         raise UserError(
@@ -71,7 +72,7 @@ def load_training_state(
 
 
 def read_record(checkpoint: Checkpoint) -> Record:
-    """The plain data of a checkpoint, once every file of it is found as it was written."""
+    """Verifies every file of a checkpoint and reads its plain data."""
     try:
         check_integrity(checkpoint.folder)
         record = read_json(checkpoint.folder / RECORD_FILE, Record)
@@ -90,24 +91,27 @@ def read_record(checkpoint: Checkpoint) -> Record:
 
 
 def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
-    """An item of a checkpoint in the structure of `template`, whose arrays have exactly its shapes
-    and types."""
+    """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
-    # Not read by orbax, whose readers print tracebacks from their threads where a file is damaged.
+    # Read with tensorstore, as the readers of orbax print tracebacks from their threads for damaged
+    # files.
     try:
         opening = [_open_array(checkpoint.folder / item, path, leaf) for path, leaf in leaves]
         reading = [array.result().read() for array in opening]
         arrays = [jax.numpy.asarray(array.result()) for array in reading]
-    # A damaged file raises many types; all of them mean the same here.
+    # Damaged files raise exceptions of many types.
     except Exception as error:
         raise _damaged(checkpoint, error) from error
     return jax.tree_util.tree_unflatten(tree, arrays)
 
 
 def _open_array(folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct) -> tensorstore.Future:
-    """Opens an array as orbax writes it: in one chunk, whose memory is taken before its bytes are
-    looked at, and in zstd, whose reader stops at the size of the array (blosc's reader takes the
-    memory that the file asks for)."""
+    """Opens an array in orbax's format: one chunk, compressed with zstd.
+
+    A crafted file cannot take more memory than the array: the expected shape fixes the size of the
+    chunk, and the zstd reader stops there. (The blosc reader allocates the size that the file
+    states.)
+    """
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     files = {"driver": "file", "path": f"{os.path.abspath(folder)}/"}
     metadata = {

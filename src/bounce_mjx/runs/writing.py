@@ -1,5 +1,5 @@
-"""Checkpoints are written under another name and brought to the disk; only then they take the place
-of the older ones. A process that is killed leaves one or the other whole."""
+"""Writing of checkpoints. A checkpoint is written under a temporary name and flushed to the disk
+before it replaces the older one, so a killed process always leaves one complete checkpoint."""
 
 import concurrent.futures
 import os
@@ -23,17 +23,17 @@ from bounce_mjx.runs.reading import RECORD_FILE
 
 
 class CheckpointWriter:
-    """Saves the latest and the best checkpoint of a run, each replacing the one before, and the
-    run's results, in a thread while the training goes on.
+    """Saves a run's latest checkpoint, best checkpoint and results in a background thread.
 
-    What cannot be saved is kept until it can, or until something newer takes its place.
+    Each checkpoint replaces its predecessor. Data whose saving failed stays in memory until a retry
+    succeeds or newer data replaces it.
     """
 
     def __init__(self, run: Path, config: TrainConfig):
         self._run = run
         self._config = config.model_dump(mode="json")
-        # By name, the oldest first: no checkpoint on the disk names a best one that is not there
-        # yet, unless it holds that state itself.
+        # Pending writes by name, the oldest first. A checkpoint on the disk thus never refers to
+        # a best checkpoint that is not there yet, unless it holds the best state itself.
         self._pending: dict[str, Callable[[], None]] = {}
         self._pool = concurrent.futures.ThreadPoolExecutor(1)
         self._writing: concurrent.futures.Future | None = None
@@ -48,17 +48,17 @@ class CheckpointWriter:
         progress: dict[str, Any] | None = None,
         results: dict[str, Any] | None = None,
     ) -> None:
-        """Starts to save; waits only for the save before.
+        """Starts a save after waiting for the previous save.
 
         Args:
           names: the checkpoints to write, "latest" before "best".
           steps: environment steps trained.
           training: None for a checkpoint that cannot be resumed.
-          progress: the evaluations up to this checkpoint, plain data.
+          progress: the evaluations so far, plain data.
           results: the run's results, plain data.
         """
         items = {"policy": policy} | ({} if training is None else {"training": training})
-        # A copy, as the training reuses the memory of its state while the writer still writes.
+        # A copy, because the training reuses its buffers while the writer is still busy.
         items = jax.tree.map(np.array, items)
         record = to_json({"steps": steps, "config": self._config, "progress": progress or {}})
         self.problem()
@@ -77,10 +77,10 @@ class CheckpointWriter:
         self._writing = self._pool.submit(self._write)
 
     def problem(self, wait: bool = True) -> str | None:
-        """Why the last save failed, as part of a sentence; None if it did not.
+        """Reason for the last save's failure, as part of a sentence; None if it succeeded.
 
         Args:
-          wait: for a save in progress; otherwise the answer is about the save before.
+          wait: whether to wait for a save in progress; otherwise the result is of the save before.
         """
         if self._writing is not None and (wait or self._writing.done()):
             self._problem = None
@@ -101,14 +101,14 @@ class CheckpointWriter:
 
 
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
-    """Writes a checkpoint in place of all others in its parent folder.
+    """Writes a checkpoint and replaces all others in its parent folder.
 
     Args:
       items: pytrees of numpy arrays by name.
-      record: the text of run.json.
+      record: text of run.json.
 
     Raises:
-      OSError: it could not be written; nothing of it is left, and the others are as they were.
+      OSError: the checkpoint could not be written; the folder is unchanged.
     """
     unfinished = folder.with_name(folder.name + PARTIAL)
     _remove_leftovers(folder.parent)
@@ -137,8 +137,8 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
 
 
 def _save_arrays(folder: Path, tree: Any) -> None:
-    """Writes a pytree with orbax, on this host alone."""
-    # It takes a third of a second to import, and only writing needs it.
+    """Writes a pytree with orbax, on this host only."""
+    # The import takes a third of a second, and only writing needs it.
     import orbax.checkpoint as ocp
 
     host = jax.process_index()
@@ -151,7 +151,7 @@ def _save_arrays(folder: Path, tree: Any) -> None:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Removes the checkpoints in a folder that do not count."""
+    """Removes incomplete and replaced checkpoints from a folder."""
     counting = stored_checkpoints(folder).values()
     for path in folder.glob("*"):
         if path.suffix in (PARTIAL, REPLACED) and path not in counting:
@@ -159,10 +159,10 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _check_room(folder: Path, size: int) -> None:
-    """Raises the OSError of a full disk before orbax meets it, whose threads print tracebacks."""
+    """Raises OSError if the disk is full, before the threads of orbax fail with tracebacks."""
     room = folder / "room"
     with room.open("wb") as file:
         if hasattr(os, "posix_fallocate"):
-            # orbax writes the arrays twice, and some small files.
+            # orbax writes the arrays twice, plus some small files.
             os.posix_fallocate(file.fileno(), 0, 2 * size + 2**20)
     room.unlink()

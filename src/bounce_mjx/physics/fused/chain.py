@@ -145,8 +145,8 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
 
 
 def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3) -> list[Scalar]:
-    """Velocity of a point fixed to the last link along a direction, per unit velocity of each joint;
-    point and direction are in the world."""
+    """Velocity of a point fixed to the last link along a direction, per unit velocity of each
+    joint; point and direction are in the world."""
     return [dot(direction, velocity) for velocity in point_velocities(links, pose, point)]
 
 
