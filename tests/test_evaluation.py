@@ -549,6 +549,22 @@ def test_one_target_height_replaces_the_drawn_ones(random_policy, monkeypatch):
     assert env.config.randomization.terms == ("air_drag",)
 
 
+def test_a_nominal_evaluation_draws_no_worlds(random_policy, monkeypatch):
+    drawn = {"target_height": (0.3, 0.8), "air_drag": (0.1, 0.2)}
+    config = EnvConfig(randomization=drawn, episode_seconds=0.05)
+    worlds = []
+
+    def make_evaluator(env, networks, episodes):
+        worlds.append(env.reset(jax.random.PRNGKey(0)).pipeline_state.world)
+        return lambda policy, key: empty_statistics(episodes)
+
+    monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
+    for nominal in (False, True):
+        evaluate_policy(random_policy, config, PPOConfig(), episodes=2, nominal=nominal)
+    assert 0.1 <= worlds[0]["air_drag"] <= 0.2
+    assert worlds[1] == {}
+
+
 def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     mjcf = tmp_path / "one_iteration.xml"

@@ -35,6 +35,8 @@ class EvalCommand(StrictModel):
     """Seed of the resets."""
     target_height: Positive | None = None
     """One target height for all episodes, m. The default is the range of the run's config."""
+    nominal: bool = False
+    """Whether the worlds are the model's own; else each episode draws one, as in the training."""
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
@@ -68,6 +70,7 @@ def main(args: Sequence[str] | None = None) -> None:
             episodes=command.episodes,
             seed=command.seed,
             target_height=command.target_height,
+            nominal=command.nominal,
             physics=command.physics,
         )
         console.out(
@@ -81,6 +84,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if command.json_file is not None:
             plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
             plain |= {"seed": command.seed, "target_height": command.target_height}
+            plain |= {"nominal": command.nominal}
             try:
                 command.json_file.write_text(to_json(plain), encoding="utf-8")
             except OSError as error:

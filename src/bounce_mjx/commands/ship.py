@@ -6,7 +6,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import jax
 import tyro
@@ -21,7 +21,13 @@ from bounce_mjx.evaluation.results import DEFAULT_SEED
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.folders import PRETRAINED, best_checkpoint, find_checkpoint, save_config
+from bounce_mjx.runs.folders import (
+    PRETRAINED,
+    SHIPPED,
+    best_checkpoint,
+    find_checkpoint,
+    save_config,
+)
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.runs.writing import CheckpointWriter
@@ -33,8 +39,10 @@ class ShipCommand(StrictModel):
 
     run: Annotated[Path, tyro.conf.Positional]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
-    out: Path = Path(PRETRAINED)
-    """Folder to write; an existing one is replaced."""
+    name: Literal["pretrained", "robust"] = PRETRAINED
+    """Name of the policy in the package."""
+    out: Path | None = None
+    """Folder to write, by default the policy's own; an existing one is replaced."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -47,12 +55,13 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Makes the policy that comes with the package from a run.",
         )
         set_up_jax()
-        ship(command.run, command.out, Console())
+        out = command.out or Path(SHIPPED[command.name])
+        ship(command.run, out, Console(), command.name)
 
 
-def ship(run: Path, out: Path, console: Console) -> None:
-    """Evaluates the policy of a run, and writes it with its config, its results and its ONNX file
-    to `out`.
+def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None:
+    """Evaluates the policy of a run in the nominal world, and writes it with its config, its
+    results and its ONNX file to `out`.
 
     Raises:
       UserError: there is no policy, it misses a result, or the folder cannot be written.
@@ -68,7 +77,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
         )
     policy = load_policy(checkpoint, trained_with)
     report, physics, _ = run_interruptible(
-        evaluate_policy, policy, trained_with.env, trained_with.ppo
+        evaluate_policy, policy, trained_with.env, trained_with.ppo, nominal=True
     )
     console.print(results_table(report, f"{checkpoint.folder}, {physics}"))
     console.print(details_line(report), highlight=False)
@@ -79,12 +88,12 @@ def ship(run: Path, out: Path, console: Console) -> None:
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": TrainConfig().log_dir})
     results = {
-        "command": f"python train_jax.py --config {PRETRAINED}/{CONFIG_FILE}",
+        "command": f"python train_jax.py --config {SHIPPED[name]}/{CONFIG_FILE}",
         "seed": config.seed,
         "device": "unknown" if made_by is None else made_by.device,
         "best_steps": checkpoint.steps,
         "evaluation": {
-            "command": f"bounce-mjx eval {PRETRAINED}",
+            "command": f"bounce-mjx eval {name} --nominal",
             "seed": DEFAULT_SEED,
             "physics": physics,
             "device": jax.devices()[0].device_kind,
@@ -94,7 +103,7 @@ def ship(run: Path, out: Path, console: Console) -> None:
     }
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent) as scratch:
-            made = Path(scratch) / PRETRAINED
+            made = Path(scratch) / name
             made.mkdir()
             save_config(made, config)
             writer = CheckpointWriter(made, config)
@@ -103,7 +112,9 @@ def ship(run: Path, out: Path, console: Console) -> None:
             if writer.problem():
                 raise UserError(f"{writer.problem()}; free space or give another --out")
             onnx_file = export_onnx(best_checkpoint(made))
-            (made / f"{PRETRAINED}.onnx").write_bytes(onnx_file)
+            (made / f"{name}.onnx").write_bytes(onnx_file)
+            for other in _policies_inside(out):
+                other.rename(made / other.name)
             shutil.rmtree(out, ignore_errors=True)
             made.rename(out)
     except OSError as error:
@@ -112,6 +123,11 @@ def ship(run: Path, out: Path, console: Console) -> None:
         ) from error
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     console.out(f"written: {out} ({size / 1000:.0f} kB)", highlight=False)
+
+
+def _policies_inside(out: Path) -> list[Path]:
+    """Folders of other policies in the folder of a policy."""
+    return [path.parent for path in out.glob(f"*/{CONFIG_FILE}")]
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@ from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 
-NAMES = ("robust", "pretrained")
-"""Policies that come with the package, in `pretrained/<name>.onnx`."""
+NAMES = {"robust": "pretrained/robust", "pretrained": "pretrained"}
+"""Policies that come with the package, and their folders; each folder holds `<name>.onnx`."""
 
 
 def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
@@ -22,8 +22,8 @@ def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
     Raises:
       UserError: there is no such policy, or the file is damaged.
     """
-    if policy in NAMES:
-        path = resource_path(f"pretrained/{policy}.onnx")
+    if isinstance(policy, str) and policy in NAMES:
+        path = resource_path(f"{NAMES[policy]}/{policy}.onnx")
         if not path.is_file():
             raise UserError(
                 f"the policy {policy} is not in this version of the package; give one of "

@@ -12,6 +12,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.randomization import RandomizationConfig
 
 
 class Evaluation(NamedTuple):
@@ -32,6 +33,7 @@ def evaluate_policy(
     episodes: int = DEFAULT_EPISODES,
     seed: int = DEFAULT_SEED,
     target_height: float | None = None,
+    nominal: bool = False,
     physics: Literal["config", "fused", "mjx", "mujoco"] = "config",
 ) -> Evaluation:
     """Measures the five results of a policy without action noise.
@@ -42,16 +44,20 @@ def evaluate_policy(
       episodes: number of episodes, each from its own reset.
       seed: the seed of the resets.
       target_height: one target height for all episodes, m; None for the config's range.
+      nominal: whether the worlds are the model's own; else they are drawn as in the training.
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
 
     Raises:
       UserError: the engine does not support the model.
     """
     changes = {}
-    if target_height is not None:
-        changes["target_height_range"] = (target_height, target_height)
+    if nominal:
+        changes["randomization"] = RandomizationConfig()
+    elif target_height is not None:
         fixed = {"target_height": None, "target_interval": None}
         changes["randomization"] = env_config.randomization.model_copy(update=fixed)
+    if target_height is not None:
+        changes["target_height_range"] = (target_height, target_height)
     if physics in ("fused", "mjx"):
         changes["physics"] = physics
     env = BounceBall(validate(EnvConfig, dict(env_config) | changes, "evaluation"))
