@@ -1,4 +1,4 @@
-"""The five results of a policy in every condition of a suite."""
+"""Robustness of a policy: its five results in every condition of a suite."""
 
 import json
 from collections import defaultdict
@@ -24,48 +24,48 @@ DEFAULT_EPISODES = 64
 
 Physics = Literal["config", "fused", "mjx", "mujoco"]
 
-# Terms that have no neutral value, or that cost the physics much: only the conditions that need one
-# are simulated with it.
+# Terms without a neutral value, or with a high cost in the physics: only the conditions that need
+# such a term are simulated with it.
 _SEPARATE_TERMS = frozenset(
     ("camera_rate", "contact_friction", "torque_limit", "joint_frictionloss")
 )
-# Episodes of one call: more would not be faster, and fewer would not show the progress.
+# Episodes in one call: larger batches are not faster and would delay the progress report.
 _CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH = 1024, 16_384, 256
 
 
 class Outcome(pydantic.BaseModel):
-    """The five results in one condition."""
+    """Five results of a policy in one condition."""
 
     perturbation: str
     group: str
     unit: str
     strength: float | None
     trained: bool
-    """Whether the ranges of the policy's training contain the condition."""
+    """Whether the training ranges of the policy contain the condition."""
     physics: str
-    """Engine: fused, mjx or mujoco."""
+    """Name of the engine: fused, mjx or mujoco."""
     values: dict[str, float | None]
-    """The five results by name; None where there was nothing to measure."""
+    """The five results by name; None if there was nothing to measure."""
     failed: list[str]
-    """Names of the results that miss their bounds."""
+    """Names of results that miss their bounds."""
     mean_length_s: float
     """Mean length of the episodes, s."""
 
     @property
     def passed(self) -> bool:
-        """Whether no result failed."""
+        """Whether every judged result meets its bound."""
         return not self.failed
 
 
 class RobustnessReport(pydantic.BaseModel):
-    """The results of a policy in all conditions: `robustness.json`."""
+    """Results of a policy in all conditions: the content of `robustness.json`."""
 
     checkpoint: str
     steps: int
-    """Environment steps of the policy's training."""
+    """Number of environment steps in the policy's training."""
     suite: str
     episodes: int
-    """Episodes of each condition."""
+    """Number of episodes in each condition."""
     seed: int
     outcomes: list[Outcome]
 
@@ -76,7 +76,7 @@ class RobustnessReport(pydantic.BaseModel):
 
     @property
     def engines(self) -> dict[str, set[str]]:
-        """The perturbations that each engine simulated."""
+        """Perturbations simulated by each engine."""
         return {
             engine: {o.perturbation for o in self.outcomes if o.physics == engine}
             for engine in {outcome.physics for outcome in self.outcomes}
@@ -84,7 +84,7 @@ class RobustnessReport(pydantic.BaseModel):
 
     @property
     def met(self) -> int:
-        """Number of the conditions that meet all judged results."""
+        """Number of conditions that meet all judged results."""
         return sum(outcome.passed for outcome in self.outcomes)
 
 
@@ -98,17 +98,17 @@ def measure_conditions(
     physics: Physics = "config",
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Outcome]:
-    """Measures the five results of a policy without its noise, in the order of the conditions.
+    """Measures the five results of a deterministic policy, in the order of the conditions.
 
-    Conditions of the same structure are simulated by one compiled program, which takes their ranges
-    as inputs. The episodes of all conditions start from the same keys. Conditions of dry friction
-    are simulated on MuJoCo's C engine, as no other computes it.
+    One compiled program simulates all conditions with the same structure; their ranges are its
+    inputs. The episodes of all conditions start from the same keys. Conditions with dry friction
+    run on MuJoCo's C engine, the only engine that simulates it.
 
     Args:
-      ppo_config: of the policy's training; it gives the networks.
-      episodes: of each condition.
-      physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
-      progress: called with the number of conditions that are done.
+      ppo_config: config of the policy's training; it defines the networks.
+      episodes: number of episodes in each condition.
+      physics: engine; "mujoco" is MuJoCo's C engine, "config" the choice in the config.
+      progress: callback for the number of finished conditions.
 
     Raises:
       UserError: the engine does not support the model.
@@ -129,13 +129,13 @@ def measure_conditions(
         evaluate = make(env, networks, size * episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
-            # The last call has a part of its conditions twice: another shape would be compiled.
+            # Padding the last call with a repeated condition avoids compiling another shape.
             padded = batch + [batch[-1]] * (size - len(batch))
             statistics = evaluate(policy, jax.random.PRNGKey(seed), _stacked_ranges(env, padded))
             for i, condition in enumerate(batch):
                 own = slice(i * episodes, (i + 1) * episodes)
-                of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
-                report = judge(env, of_condition, condition.target_heights)
+                episode_statistics = jax.tree.map(lambda x, own=own: x[own], statistics)
+                report = judge(env, episode_statistics, condition.target_heights)
                 outcomes[indices[start + i]] = Outcome(
                     perturbation=condition.perturbation.name,
                     group=condition.perturbation.group,
@@ -153,7 +153,7 @@ def measure_conditions(
 
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:
-    """The task with all terms of the conditions on, in ranges that contain theirs."""
+    """Task with all terms of the conditions active, in ranges that contain all their ranges."""
     env = conditions[0].env
     spans = {}
     for name in sorted({name for condition in conditions for name in condition.ranges}):
@@ -174,7 +174,7 @@ def _range(condition: Condition, term: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _stacked_ranges(env: BounceBall, conditions: Sequence[Condition]) -> Ranges | None:
-    """The ranges of C conditions, each end [C, ...]; None where no term is on."""
+    """Ranges of C conditions, each end [C, ...]; None if no term is active."""
     terms = env.config.randomization.terms
     return {
         name: tuple(
@@ -186,7 +186,7 @@ def _stacked_ranges(env: BounceBall, conditions: Sequence[Condition]) -> Ranges 
 
 
 def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:
-    """Conditions in one call, about as many in each."""
+    """Number of conditions in one call; calls have about equal sizes."""
     accelerated = jax.default_backend() != "cpu"
     batch = _GPU_BATCH if accelerated else _CPU_BATCH
     if on_c:

@@ -1,4 +1,4 @@
-"""A suite of perturbations: the conditions of a robustness report, from a YAML file.
+"""Suites of perturbations: the conditions of a robustness report, from a YAML file.
 
 `configs/robustness.yaml` explains the format.
 """
@@ -38,13 +38,13 @@ UNITS = {
     "N m": 1.0,
     "N m s/rad": 1.0,
 }
-"""Units of strengths, and their factors to the units of the config."""
+"""Units of strengths, and the factors that convert them to the units of the config."""
 
 NOMINAL = "nominal"
-"""Name of the condition without a perturbation, which is always measured."""
+"""Name of the condition without perturbation, which is always measured."""
 
 _SIGNS = {"strength": 1.0, "-strength": -1.0}
-# Seconds between two changes of a target that does not change.
+# Interval of target changes for a constant target, s.
 _NEVER = 1e9
 
 Bounds = tuple[np.ndarray, np.ndarray]
@@ -55,20 +55,20 @@ class Perturbation(StrictModel):
 
     name: str = ""
     group: str = "others"
-    """Heading in the picture and in the table."""
+    """Heading in the figure and in the table."""
     unit: str = ""
     """Unit of the strengths, one of `UNITS`."""
     strengths: tuple[Finite, ...] = ()
     terms: dict[str, Any] = {}
-    """Values of terms of `env.randomization`: see `configs/robustness.yaml`."""
+    """Values for terms of `env.randomization`: see `configs/robustness.yaml`."""
     settings: dict[str, Any] = {}
-    """Other values of settings of `env`, by dotted names."""
+    """New values for settings of `env`, by dotted names."""
     trained_ranges: bool = False
-    """All ranges of the policy's training at once, in the place of terms."""
+    """Draws from all ranges of the policy's training at once; replaces `terms`."""
 
 
 class Suite(StrictModel):
-    """The file."""
+    """Content of a suite file."""
 
     perturbations: Annotated[tuple[Perturbation, ...], Field(min_length=1)] = ()
 
@@ -78,13 +78,13 @@ class Condition(NamedTuple):
 
     perturbation: Perturbation
     strength: float | None
-    """In the perturbation's unit."""
+    """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: EnvConfig
-    """The task, without randomisation."""
+    """Task of the policy, without randomisation."""
     ranges: dict[str, Bounds]
-    """Lower and upper ends of the perturbed terms, each of the term's shape."""
+    """Lower and upper ends of the perturbed terms' ranges, in the shapes of the terms."""
     trained: bool
-    """Whether the ranges of the policy's training contain it."""
+    """Whether the training ranges of the policy contain the condition."""
 
     @property
     def target_heights(self) -> tuple[float, float]:
@@ -94,13 +94,13 @@ class Condition(NamedTuple):
 
 
 def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
-    """The conditions of a suite file, the nominal one first.
+    """Reads the conditions of a suite file, the nominal condition first.
 
     Args:
-      trained: the task of the policy's training. Each condition replaces its randomisation.
+      trained: task of the policy's training; each condition replaces its randomisation.
 
     Raises:
-      UserError: the file is missing or wrong.
+      UserError: the file is missing or invalid.
     """
     values = read_mapping(path, "suite", "configs/robustness.yaml")
     suite = validate(Suite, values, str(path))
@@ -116,13 +116,13 @@ def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
-            at = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
-            conditions.append(_condition(perturbation, strength, trained, at.rstrip()))
+            place = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
+            conditions.append(_condition(perturbation, strength, trained, place.rstrip()))
     return conditions
 
 
 def neutral_range(term: str, env: EnvConfig) -> Bounds | None:
-    """The range of a term that leaves the world as it is; None where there is none."""
+    """Range of a term without effect on the world; None if the term has no such value."""
     low = high = TERMS[term].nominal
     if term == "push_interval":
         low = high = DEFAULT_PUSH_INTERVAL
@@ -172,7 +172,7 @@ def _condition(
             term: _bounds(term, entry, value, source) for term, entry in perturbation.terms.items()
         }
     spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
-    # Reports values that are out of a term's limits.
+    # Raises an error for values outside a term's limits.
     validate(EnvConfig, dict(env) | {"randomization": spans}, source)
     contained = not differing_keys(env, plain) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
@@ -183,7 +183,7 @@ def _condition(
 def _with_settings(
     env: EnvConfig, settings: dict[str, Any], strength: float | None, source: str
 ) -> EnvConfig:
-    """The task with other settings."""
+    """Task with changed settings."""
     if not settings:
         return env
     values = env.model_dump()
@@ -208,8 +208,8 @@ def _with_settings(
 
 
 def _bounds(term: str, entry: Any, strength: float | None, source: str) -> Bounds:
-    """The range of a term: of a value, of a list with a value for each entry of the term, or of
-    such a {from, to}."""
+    """Range of a term from its entry in the suite: a value, a list with one value for each entry of
+    the term, or a mapping {from, to} of either."""
     size = math.prod(TERMS[term].shape)
     ends = [entry, entry]
     if isinstance(entry, dict):
@@ -241,7 +241,7 @@ def _bounds(term: str, entry: Any, strength: float | None, source: str) -> Bound
 
 
 def _shaped(term: str, low: Any, high: Any) -> Bounds:
-    """Ends of the term's shape; a list of one value serves for a term that is one number."""
+    """Ends of a range in the term's shape; a list of one value also fits a scalar term."""
     shape = TERMS[term].shape
 
     def shaped(end: Any) -> np.ndarray:
@@ -254,7 +254,7 @@ def _shaped(term: str, low: Any, high: Any) -> Bounds:
 
 
 def _contains(trained: EnvConfig, term: str, bounds: Bounds) -> bool:
-    """Whether a policy's training drew a term from a range that contains another."""
+    """Whether the training range of a term contains other bounds."""
     drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
     if drawn is None:
         return False

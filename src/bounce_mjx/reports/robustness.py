@@ -1,4 +1,4 @@
-"""The results of a policy in perturbed worlds, as a table and as a picture."""
+"""Robustness reports as a table and as a figure."""
 
 from collections.abc import Iterable, Sequence
 from itertools import groupby
@@ -23,7 +23,7 @@ from bounce_mjx.runs.files import read_json
 
 ROBUSTNESS_FILE = "robustness.json"
 
-# Names of the results, and their initials in the picture.
+# Names of the results, and their initials in the figure.
 _INITIALS = {
     "consecutive bounces": "B",
     "horizontal position": "X",
@@ -38,19 +38,19 @@ _HEADERS = {
     "height": "height",
     "upward speed": "speed",
 }
-# From vermilion through sand to blue, which colour-blind readers can distinguish.
+# Vermilion, sand and blue, which colour-blind readers can distinguish.
 _COLOURS = LinearSegmentedColormap.from_list("stable", ["#c2451e", "#f4e3c3", "#2b7bba"])
-# Most of the colours are used for the shares that matter, near 100%.
+# Most of the colour range covers the interesting shares near 100%.
 _SCALE = PowerNorm(2.5, 0.0, 100.0)
 _INK, _PAPER = "#222222", "#ffffff"
 
-# Inches.
+# Lengths in inches.
 _WIDTH, _LINE, _LABEL = 10.0, 0.29, 1.95
 _TOP, _BOTTOM = 0.65, 0.95
 
 
 def load_robustness(folder: Path) -> RobustnessReport | None:
-    """The report that `bounce-mjx robustness` wrote into a folder; None if there is none.
+    """Reads the report of `bounce-mjx robustness` from a folder; None if there is none.
 
     Raises:
       UserError: the file is damaged.
@@ -68,7 +68,7 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
 
 
 def summary(report: RobustnessReport) -> str:
-    """One sentence on a report."""
+    """Summary of a report in one sentence."""
     return (
         f"{report.met} of {len(report.outcomes)} conditions meet all judged results, with "
         f"{report.episodes} episodes each"
@@ -76,7 +76,7 @@ def summary(report: RobustnessReport) -> str:
 
 
 def robustness_table(report: RobustnessReport) -> Table:
-    """The five results in each condition; an asterisk marks a figure that misses its bound."""
+    """Table of the five results in each condition; an asterisk marks a missed bound."""
     table = Table(
         title=f"{summary(report)} (shares in %, speed in m/s, * misses its bound)",
         title_justify="left",
@@ -98,8 +98,9 @@ def robustness_table(report: RobustnessReport) -> Table:
 
 
 def robustness_figure(report: RobustnessReport) -> Figure:
-    """Perturbations by strength. The colour of a cell is the share of stable episodes. A cell has a
-    tick or the initials of the missed results, and a frame if the training's ranges contain it."""
+    """Chart of perturbations by strength. The colour of a cell shows the share of stable episodes.
+    A cell has a tick or the initials of the missed results; a frame marks conditions within the
+    training ranges."""
     columns = _columns(report.outcomes)
     lines = max(sum(_lines(group) for group in column) for column in columns)
     height = _LINE * lines + _TOP + _BOTTOM
@@ -128,7 +129,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
 
 
 def _engines_text(report: RobustnessReport) -> str:
-    """The engine of most conditions, and what the others simulated."""
+    """Engine of most perturbations, and the perturbations that other engines simulated."""
     names = {"fused": "the fused engine", "mjx": "MJX", "mujoco": "MuJoCo's C engine"}
     engines = report.engines
     most = max(engines, key=lambda engine: len(engines[engine]))
@@ -140,14 +141,14 @@ def _engines_text(report: RobustnessReport) -> str:
 
 
 def _figures(outcome: Outcome) -> Iterable[str]:
-    """The five results of a table's row."""
+    """Cells of a table row for the five results."""
     for name in _HEADERS:
         text = figure_text(outcome.values[name], ".2f" if name == "upward speed" else ".1f")
         yield f"[red]{text}*" if name in outcome.failed else f"{text} "
 
 
 def _perturbations(outcomes: Sequence[Outcome]) -> list[list[Outcome]]:
-    """The outcomes of each perturbation, in the suite's order."""
+    """Outcomes grouped by perturbation, in the order of the suite."""
     return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
 
 
@@ -155,9 +156,9 @@ Group = tuple[str, list[list[Outcome]]]
 
 
 def _columns(outcomes: Sequence[Outcome]) -> list[list[Group]]:
-    """The groups of perturbations in two columns of about the same length."""
+    """Groups of perturbations in two columns of about equal length."""
     rows = _perturbations(outcomes)
-    groups = [(name, list(of)) for name, of in groupby(rows, lambda row: row[0].group)]
+    groups = [(name, list(members)) for name, members in groupby(rows, lambda row: row[0].group)]
     lengths = [_lines(group) for group in groups]
     splits = range(1, len(groups) + 1)
     split = min(splits, key=lambda i: max(sum(lengths[:i]), sum(lengths[i:])))
@@ -165,7 +166,7 @@ def _columns(outcomes: Sequence[Outcome]) -> list[list[Group]]:
 
 
 def _lines(group: Group) -> float:
-    """Height of a group in lines, with its heading and a gap."""
+    """Height of a group in lines, including its heading and a gap."""
     name, rows = group
     return len(rows) + (0.3 if name == NOMINAL else 1.6)
 
@@ -211,7 +212,7 @@ def _draw_cell(axes: Axes, x: float, y: float, outcome: Outcome) -> None:
 
 
 def _draw_frames(axes: Axes, y: float, trained: Sequence[bool]) -> None:
-    """One frame around neighbouring cells that the training's ranges contain."""
+    """Draws one frame around each row of neighbouring cells within the training ranges."""
     x = 0
     for inside, cells in groupby(trained):
         width = len(list(cells))

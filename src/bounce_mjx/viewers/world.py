@@ -1,4 +1,4 @@
-"""The world's sliders: terms of the randomisation that a viewer sets in place of a draw."""
+"""Sliders of the viewers for terms of the randomisation."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class WorldSlider(NamedTuple):
     label: str
     term: str
     limits: tuple[float, float]
-    """In the slider's unit."""
+    """Ends of the slider, in its unit."""
     step: float
     scale: float = 1.0
     """Factor from the slider's unit to the term's."""
@@ -32,7 +32,7 @@ class WorldSlider(NamedTuple):
         return TERMS[self.term].nominal / self.scale
 
     def world_value(self, position: float) -> tuple[float, ...]:
-        """The entries of the term for a position of the slider, which moves the first one."""
+        """Entries of the term at a slider position; the slider moves the first entry."""
         others = math.prod(TERMS[self.term].shape) - 1
         return (position * self.scale, *(TERMS[self.term].nominal,) * others)
 
@@ -47,9 +47,9 @@ SLIDERS = (
 
 
 def with_sliders(config: EnvConfig) -> EnvConfig:
-    """The task with the terms of the sliders on, in ranges that contain the sliders' and its own.
+    """Task with the sliders' terms active, in ranges that contain both the sliders' and the task's.
 
-    The nominal restitution is that of the project's own model, so another model gets no slider for
+    The nominal restitution holds only for the project's own model; other models get no slider for
     it.
     """
     spans = {}
@@ -63,7 +63,7 @@ def with_sliders(config: EnvConfig) -> EnvConfig:
 
 
 def drawn_ranges(config: EnvConfig) -> Ranges:
-    """The ranges from which a reset of `with_sliders(config)` draws the worlds of `config`."""
+    """Ranges with which a reset of `with_sliders(config)` draws the worlds of `config`."""
     ranges = config.randomization.ranges()
     for name in with_sliders(config).randomization.terms:
         if name not in ranges:
@@ -73,7 +73,7 @@ def drawn_ranges(config: EnvConfig) -> Ranges:
 
 
 def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
-    """The sliders whose limits are in the ranges of the terms that are on."""
+    """Sliders with limits inside the ranges of the active terms."""
     return tuple(
         slider
         for slider in SLIDERS
