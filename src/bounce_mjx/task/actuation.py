@@ -1,5 +1,5 @@
-"""From the policy's action to the inputs of the physics: servo targets with latency and lag, air
-drag and pushes."""
+"""Inputs of the physics from the policy's action: servo targets with latency and lag, air drag and
+pushes."""
 
 import math
 from typing import NamedTuple
@@ -29,7 +29,7 @@ class Actuation(NamedTuple):
 def start_actuation(
     config: RandomizationConfig, control_dt: float, targets: jax.Array
 ) -> Actuation | None:
-    """The memory at a reset, at which the servos hold the targets [nu]."""
+    """Memory at a reset, with the servos at rest at the targets [nu]."""
     queue = filtered = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
@@ -46,7 +46,7 @@ def delayed(
     control_dt: float,
     num_substeps: int,
 ) -> tuple[Control, Actuation | None]:
-    """The control of a control step, given the targets [nu] of its action.
+    """Control of a control step from the targets [nu] of its action.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
     them.
@@ -75,9 +75,9 @@ def delayed(
 
 
 def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
-    """The entry of a queue [K, ...] at an index [], a whole number; beyond the end, the last entry.
+    """Entry of a queue [K, ...] at a whole-number index []; beyond the end, the last entry.
 
-    It is a chain of selections because the GPU kernel has no indexing.
+    The chain of selections replaces indexing, which the GPU kernel lacks.
     """
     entry = queue[0]
     for i in range(1, len(queue)):
@@ -100,7 +100,7 @@ def push(
     steps.
 
     Args:
-      counter: the counter of the random numbers.
+      counter: counter of the random numbers.
       phase: share of an interval that had passed at the reset [].
       step: control steps since the reset [].
     """

@@ -13,7 +13,7 @@ from bounce_mjx.physics.fused.scalars import sine_cosine
 
 
 def next_counter(counter: jax.Array) -> jax.Array:
-    """The counter [] (int32) of the next control step: a linear congruential generator (the
+    """Counter [] (int32) of the next control step: a linear congruential generator (the
     constants of PCG, O'Neill 2014)."""
     return counter * jnp.int32(747796405) + jnp.int32(-1403630843)
 

@@ -1,4 +1,4 @@
-"""Domain randomisation: the world that each episode draws.
+"""Domain randomisation: each episode draws its own world.
 
 A term is a key of the config with a range (low, high), from which a reset draws every entry of the
 term uniformly. A term that is null is inactive and costs nothing.
@@ -20,7 +20,7 @@ from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
 Range = tuple[Finite, Finite]
 
 World = dict[str, jax.Array]
-"""The values that an episode drew, by the names of the active terms."""
+"""Values drawn for one episode, by the names of the active terms."""
 
 Ranges = dict[str, tuple[jax.Array, jax.Array]]
 """Lower and upper ends of the active terms' ranges, each a number [] or an array of the term's
@@ -33,8 +33,8 @@ class Term(NamedTuple):
     shape: tuple[int, ...]
     """Shape of one episode's draw."""
     nominal: float | None
-    """Value without randomisation, from which the range grows; None for a range that does not
-    grow."""
+    """Value without randomisation, from which the range grows during the warm-up; None for a range
+    that does not grow."""
     limits: tuple[float, float]
     """Smallest and largest sensible value."""
 
@@ -80,7 +80,7 @@ TERMS: dict[str, Term] = {
     "ball_start": Term((3,), 0.0, _ANY),
     "joint_start": Term(_J, 0.0, _ANY),
 }
-"""The terms of `RandomizationConfig`."""
+"""All terms of `RandomizationConfig`."""
 
 
 class RandomizationConfig(StrictModel):
@@ -181,7 +181,7 @@ class RandomizationConfig(StrictModel):
         return tuple(name for name in TERMS if getattr(self, name) is not None)
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the active terms.
+        """Ranges of the active terms.
 
         Args:
           progress: share of the warm-up that has passed [], from 0 to 1.
@@ -198,14 +198,14 @@ class RandomizationConfig(StrictModel):
 def draw_world(
     ranges: Ranges, key: jax.Array, dtype: jnp.dtype, share: float | jax.Array = 1.0
 ) -> World:
-    """The world of one episode; consumes the key.
+    """Draws the world of one episode; consumes the key.
 
     Args:
       share: probability [] that each term with a nominal value is drawn.
     """
-    # A fixed order: JAX sorts the keys of a traced dictionary.
+    # The order of TERMS, because JAX sorts the keys of a traced dictionary.
     sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
-    # One draw for all numbers: splitting keys for separate draws would cost more than the draws.
+    # One draw for all numbers, because splitting the key costs more than drawing.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
@@ -220,7 +220,7 @@ def draw_world(
 
 
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The part of the world that changes the physics model, as its parameters."""
+    """Parameters of the physics for a drawn world."""
     m, addresses = mj_model, find_addresses(mj_model)
     servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
     links = m.jnt_bodyid[list(addresses.arm_joints)]

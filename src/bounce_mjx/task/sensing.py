@@ -1,4 +1,4 @@
-"""From the true state to the measured quantities: a camera with latency, noisy sensors, and their
+"""Measured quantities from the true state: a camera with latency, noisy sensors, and their
 history."""
 
 import math
@@ -19,20 +19,20 @@ SENSOR_TERMS = frozenset(
     "ball_velocity_noise ball_velocity_bias joint_angle_noise encoder_bias joint_velocity_noise "
     "joint_velocity_bias paddle_offset paddle_tilt".split()
 )
-"""Terms that make a measurement differ from the truth."""
+"""Terms that make measurements differ from the truth."""
 
 
 class Picture(NamedTuple):
-    """The last picture of the ball that has arrived, and was not lost."""
+    """Last picture of the ball that arrived and was not lost."""
 
     position: jax.Array
     """Measured position [3], m."""
     velocity: jax.Array
-    """Measured velocity, or the difference quotient of the last two pictures [3], m/s."""
+    """Measured velocity or difference quotient of the last two pictures [3], m/s."""
     age: jax.Array
-    """Time since it was taken [], s."""
+    """Time since the picture was taken [], s."""
     number: jax.Array
-    """Number of the last picture since the reset that was due []; negative before the first."""
+    """Number of the last picture due since the reset []; negative before the first picture."""
 
 
 class Sensing(NamedTuple):
@@ -48,13 +48,13 @@ class Sensing(NamedTuple):
     lowest: jax.Array
     """Lowest measured position while the ball is near the paddle [], m."""
     flight_time: jax.Array
-    """Time since the ball was first measured near the paddle for the last bounce [], s."""
+    """Time since the first measurement near the paddle in the last bounce [], s."""
     seen: dict[str, jax.Array]
-    """The last values of each observed quantity [H, size], the newest first."""
+    """Last values of each observed quantity [H, size], the newest first."""
 
 
 def is_needed(randomization: RandomizationConfig, observation: ObservationConfig) -> bool:
-    """Whether the observation is more than one instant's true state."""
+    """Whether the observation differs from the true state of a single instant."""
     return bool(SENSOR_TERMS & set(randomization.terms)) or not observation.is_momentary
 
 
@@ -65,7 +65,7 @@ def start_sensing(
     truth: Kinematics,
     target_height: jax.Array,
 ) -> Sensing:
-    """The memory at a reset: the history repeats the present state, measured without error."""
+    """Memory at a reset: the history repeats the present state, measured without error."""
     dtype = truth.ball_position.dtype
     latest = (randomization.ball_latency or (0.0, 0.0))[1]
     if randomization.camera_rate is not None:
@@ -114,11 +114,11 @@ def take_picture(
     step: jax.Array,
     control_dt: float,
 ) -> Picture:
-    """The last picture that has arrived at a control step.
+    """Last picture that has arrived at a control step.
 
     A camera takes pictures at its own rate, independent of the control steps; between two control
-    steps the ball is assumed to move in a straight line. Each picture arrives after the latency, or
-    not at all.
+    steps the ball is assumed to move in a straight line. Each picture arrives after the latency or
+    is lost.
 
     Args:
       sensing: the memory, including the ball of this control step.
@@ -130,8 +130,7 @@ def take_picture(
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
         interval = 1.0 / (world["camera_rate"] * control_dt)
-        # The 1e-4 ensures that a picture that is due at exactly this instant counts as arrived,
-        # despite rounding.
+        # The 1e-4 lets a picture that is due at exactly this instant arrive despite rounding.
         number = jnp.floor((steps - latency) / interval - phase + 1e-4)
         age = steps - (number + phase) * interval
     else:
@@ -155,7 +154,7 @@ def take_picture(
         velocity = (position - last.position) / elapsed
     velocity = _disturbed(world, "ball_velocity", velocity, noises[3:])
     fresh = Picture(position, velocity, age * control_dt, number)
-    # A lost picture is not looked for again.
+    # A lost picture stays lost.
     held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
     return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
 
@@ -190,13 +189,13 @@ def remember(
     target_height: jax.Array,
     control_dt: float,
 ) -> Sensing:
-    """The memory with the measurements of a control step.
+    """Memory after the measurements of a control step.
 
     A bounce starts when the ball is first measured near the paddle. The values of a bounce are
     taken at the ball's lowest measured point.
 
     Args:
-      measured: a value [size] of each quantity except the quantities of bounces.
+      measured: value [size] of each quantity except the quantities of bounces.
       near_height: height below which the ball counts as near the paddle [], m.
     """
     height = picture.position[2]
