@@ -1,4 +1,4 @@
-"""A policy in the control loop of a robot; here a simulated one, with a late and noisy camera.
+"""A policy in the control loop of a simulated robot with a late and noisy camera.
 
 `python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX.
 """
@@ -27,7 +27,7 @@ class Camera:
             self.pictures.append((time, ball + self.noise * self.random.standard_normal(3)))
 
     def measure(self, time: float) -> dict:
-        """The newest picture that has arrived, and the velocity by the last two."""
+        """Newest picture that has arrived, and the velocity from the last two pictures."""
         arrived = [p for p in self.pictures if p[0] < time - self.delay + 1e-6]
         taken, position = arrived[-1] if arrived else self.pictures[0]
         velocity = np.zeros(3)
@@ -37,7 +37,7 @@ class Camera:
 
 
 def simulate(policy, camera: Camera, seconds: float, target_height: float) -> tuple[int, float]:
-    """The number of bounces, and the time (s) until the ball is lost."""
+    """Number of bounces, and time (s) until the ball is lost."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
