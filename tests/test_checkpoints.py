@@ -1,4 +1,4 @@
-"""A checkpoint is plain data and loads unchanged, or one sentence refuses it."""
+"""Checkpoints are plain data; each loads unchanged or is refused in one sentence."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ def state() -> TrainingState:
 
 
 def write_run(folder: Path, state: TrainingState, steps: int = 64) -> Path:
-    """A run with one checkpoint."""
+    """Writes a run with one checkpoint."""
     run = create_run(CONFIG.model_copy(update={"log_dir": folder}))
     writer = CheckpointWriter(run, CONFIG)
     progress = {"best": None, "best_steps": 0, "solved_steps": None, "evaluations": []}
@@ -58,7 +58,7 @@ def written(tmp_path_factory: pytest.TempPathFactory, state: TrainingState) -> P
 
 @pytest.fixture
 def run(written: Path, tmp_path: Path) -> Path:
-    """A copy of the run that a test may damage."""
+    """Copy of the run for a test to damage."""
     return shutil.copytree(written, tmp_path / "run")
 
 
@@ -67,7 +67,7 @@ def step_of(run: Path) -> Path:
 
 
 def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
-    """As `eval` loads the policy, and `--resume` the whole state."""
+    """Loads the policy like `eval`, and the whole state like `--resume`."""
     checkpoint = find_checkpoint(run)
     policy = load_policy(checkpoint, load_run_config(run))
     template = jax.eval_shape(lambda: state)
@@ -117,7 +117,7 @@ def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingStat
 
 
 def mutate(step: Path, other: Path, draw: random.Random) -> str:
-    """Damages one file of a checkpoint, and names the damage."""
+    """Damages one file of a checkpoint; returns a description of the damage."""
     files = sorted(p for p in step.rglob("*") if p.is_file())
     path = draw.choice(files)
     data = path.read_bytes()
@@ -148,7 +148,7 @@ def mutate(step: Path, other: Path, draw: random.Random) -> str:
 def test_damage_is_refused_or_does_no_harm(
     written: Path, tmp_path: Path, state: TrainingState
 ) -> None:
-    """200 mutations: a checkpoint loads bit for bit as saved, or one sentence refuses it."""
+    """200 mutations: a checkpoint loads bit for bit as saved, or is refused in one sentence."""
     other_state = state._replace(params=jax.tree.map(lambda x: x + 1.0, state.params))
     other = step_of(write_run(tmp_path / "other", other_state))
     draw = random.Random(1)
@@ -168,7 +168,7 @@ def test_damage_is_refused_or_does_no_harm(
 
 
 def test_checkpoint_of_another_place_is_refused(run: Path, state: TrainingState) -> None:
-    # A folder renamed to other steps would go on from a wrong count.
+    # A folder with a changed number of steps would resume from a wrong count.
     step_of(run).rename(step_of(run).with_name("128"))
     assert_refused(run, state, "it was written after 64 steps")
 
@@ -182,12 +182,12 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
     assert_refused(run, state, "another config", "differs in seed;", "restore that file")
 
 
-# What a stranger may send
+# Malicious checkpoints
 
 
 def test_nothing_is_read_that_could_run(run: Path) -> None:
-    """No reader in the package can execute what it reads, and no file is of a format that could
-    hold code."""
+    """No reader in the package can execute its input, and no file has a format that could hold
+    code."""
     banned = (
         r"\b(c?pickle|cloudpickle|dill|joblib|marshal|shelve)\b|\beval\(|\bexec\(|__import__"
         r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)?load\b|yaml\.Loader|Unsafe|FullLoader"
@@ -213,7 +213,7 @@ def test_nothing_is_read_that_could_run(run: Path) -> None:
 
 
 class Payload:
-    """Code that pickle would run."""
+    """Object whose unpickling runs code."""
 
     def __init__(self, target: Path):
         self.target = target
@@ -283,7 +283,7 @@ def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
 
 
 def write_array(run: Path, name: str, **metadata) -> None:
-    """Puts an array of another kind into the policy of a checkpoint, with a valid manifest."""
+    """Puts a crafted array into the policy of a checkpoint, with a valid manifest."""
     item = step_of(run) / "policy"
     database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{item}/"}}
     store = tensorstore.KvStore.open(database).result()

@@ -36,7 +36,7 @@ from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
 
-# The policy sees this much of everything.
+# Length of the history of each quantity.
 ALL = {
     "ball_position": 10,
     "paddle_position": 2,
@@ -48,8 +48,8 @@ ALL = {
     "bounce_joint_angles": 3,
     "bounce_joint_velocities": 2,
 }
-# A level paddle that hardly moves, under a ball that bounces on it for seconds without a policy:
-# servos this stiff let the arm sink by micrometres.
+# A ball bounces for seconds on a level paddle that hardly moves: with such stiff servos the arm
+# sinks only by micrometres.
 STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
 LEVEL = {
     "action_scale": 1e-5,
@@ -81,12 +81,12 @@ ENVS = {
 
 
 def input_name(quantity: str) -> str:
-    """The input of an exported policy that holds a quantity."""
+    """Name of the exported policy's input for a quantity."""
     return "past_actions" if quantity == "action" else quantity
 
 
 def make_run(folder: Path, env: dict) -> Path:
-    """A run whose policy is drawn at random; its first input never varied in the training."""
+    """Writes a run with a random policy; its first input never varied in the training."""
     config = TrainConfig(env=env, ppo={"hidden_layers": (24, 8)})
     size = config.env.observation.layout.size
     rng = np.random.default_rng(0)
@@ -109,7 +109,7 @@ def make_run(folder: Path, env: dict) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A run for each of ENVS, and the policy of the package."""
+    """Runs for each of ENVS, and the run of the package's policy."""
     folder = tmp_path_factory.mktemp("runs")
     made = {name: make_run(folder / name.replace(" ", "_"), env) for name, env in ENVS.items()}
     return made | {"pretrained": resource_path("pretrained")}
@@ -117,13 +117,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def policies(runs: dict[str, Path]) -> dict[str, DeployedPolicy]:
-    """The policies of the runs."""
+    """Policies of the runs."""
     return {name: load_policy(run) for name, run in runs.items()}
 
 
 @pytest.fixture
 def observations(runs: dict[str, Path]):
-    """A function (name) -> 1,000 observations, the actions of JAX, and the parts' inputs."""
+    """Function (name) -> 1,000 observations, the actions of JAX, and the inputs by name."""
 
     def draw(name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         checkpoint = find_checkpoint(runs[name])
@@ -131,7 +131,7 @@ def observations(runs: dict[str, Path]):
         policy = reading.load_policy(checkpoint, config)
         layout = config.env.observation.layout
         rng = np.random.default_rng(3)
-        # Some are farther from the mean than the normaliser's clipping.
+        # Some observations are beyond the clipping range of the normaliser.
         spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
         noise = spread * rng.normal(size=(1000, layout.size))
         mean, std = (np.asarray(array) for array in policy.normalizer)
@@ -155,7 +155,7 @@ def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     (actions,) = session.run(["action"], inputs)
     np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-5)
-    # The comparison sees clipped actions and others.
+    # Some actions are clipped and some are not.
     assert 0.0 < np.mean(np.abs(expected) == 1.0) < 0.9
 
 
@@ -194,7 +194,7 @@ def test_servo_targets_are_those_of_the_environment() -> None:
     rng = np.random.default_rng(0)
     limits = np.array(policy.metadata.joint_ranges)
     for _ in range(20):
-        # Some angles are at the ends of their ranges.
+        # Some angles are at the limits of their ranges.
         angles = np.clip(rng.uniform(1.2 * limits[:, 0], 1.2 * limits[:, 1]), *limits.T)
         state = env.reset(jax.random.PRNGKey(0)).pipeline_state
         physics = state.physics._replace(qpos=state.physics.qpos.at[:6].set(angles))
@@ -239,7 +239,7 @@ def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
 
 
 def measured_by(sensing: Sensing, target_height: float) -> dict[str, np.ndarray]:
-    """The newest measurements in the memory of an environment's sensors."""
+    """Newest measurements in an environment's sensor memory."""
     names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
     measured = {name: np.asarray(sensing.seen[name][0]) for name in names}
     return measured | {
@@ -251,7 +251,7 @@ def measured_by(sensing: Sensing, target_height: float) -> dict[str, np.ndarray]
 
 @pytest.mark.parametrize("name", ["all histories", "sensors"])
 def test_histories_are_those_of_the_environment(name: str, policies) -> None:
-    """The policy and the environment go side by side, in a closed loop."""
+    """Policy and environment run side by side in a closed loop."""
     env, policy = BounceBall(EnvConfig(**ENVS[name])), policies[name]
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
     policy.reset()
@@ -271,7 +271,7 @@ def test_histories_are_those_of_the_environment(name: str, policies) -> None:
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not state.done, i
     assert bounces >= 4 and len(targets) >= (5 if name == "sensors" else 1)
-    # Every entry took part, but for the ball's orientation and spin.
+    # Every entry changed, except the ball's orientation and spin.
     still = range(env.layout["ball_quaternion"].start + 1, env.layout["ball_quaternion"].stop)
     still = {*still, *range(*env.layout["ball_angular_velocity"].indices(env.layout.size))}
     assert set(range(env.layout.size)) - reached <= still
@@ -279,7 +279,7 @@ def test_histories_are_those_of_the_environment(name: str, policies) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: int) -> None:
-    """Random numbers of past values, and a ball on a made-up path over a moving paddle."""
+    """History lengths are random, and the ball follows an invented path over a moving paddle."""
     rng = np.random.default_rng(seed)
     lengths = {quantity.name: int(rng.integers(0, 5)) for quantity in QUANTITIES}
     lengths["bounce_interval"] += 1
@@ -326,13 +326,13 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: i
             for name, values in memory.seen.items():
                 seen = histories.values[input_name(name)]
                 np.testing.assert_allclose(seen, values, atol=1e-9, err_msg=f"{name} at {i}")
-    # The ball came down three times at least.
+    # There were at least three bounces.
     intervals = histories.values["bounce_interval"]
     assert np.count_nonzero(intervals) >= min(3, len(intervals))
 
 
 def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> None:
-    """Without the age of a picture, a picture is new where the ball has moved."""
+    """Without a measured age, a picture is new if the ball has moved."""
     observation = dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
     observation |= {"ball_velocity": 1, "velocity": "differences"}
     policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
@@ -345,7 +345,7 @@ def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> 
 
 
 def measured_once() -> dict:
-    """Measurements that every policy here accepts."""
+    """Valid measurements for every policy of these tests."""
     return {
         "joint_angles": np.array([0.0, 0.7, 1.9, 0.0, -1.0, 0.0]),
         "joint_velocities": np.linspace(-0.1, 0.1, 6),
@@ -356,7 +356,7 @@ def measured_once() -> dict:
 
 
 def falling(time: float) -> dict:
-    """Measurements that change with time (s) along straight lines."""
+    """Measurements that change linearly with time (s)."""
     measured = measured_once()
     return measured | {
         "joint_angles": measured["joint_angles"] + 0.3 * time,
@@ -378,7 +378,7 @@ def test_a_repeated_call_changes_nothing(policies) -> None:
 
 
 def test_histories_stay_in_control_steps(policies) -> None:
-    """A late call leaves the same positions as calls in time, and jitter does not matter."""
+    """A late call leaves the same positions as punctual calls, and jitter does not matter."""
     policy, seen = policies["all histories"], []
     ball = slice(*(policies_layout(policy)["ball_position"]))
     for times in (np.arange(12) * 0.01, np.delete(np.arange(12) * 0.01, [4, 5, 8])):
@@ -399,7 +399,7 @@ def test_histories_stay_in_control_steps(policies) -> None:
 
 
 def policies_layout(policy: DeployedPolicy) -> dict[str, tuple[int, int]]:
-    """Start and end of each part in a policy's observation."""
+    """Start and end of each part of a policy's observation."""
     ends = np.cumsum([part.history * part.size for part in policy.metadata.observation])
     starts = [0, *ends[:-1]]
     names = [part.name for part in policy.metadata.observation]
@@ -497,7 +497,7 @@ def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
         use[package]()
 
 
-# Everything of the project but NumPy and onnxruntime.
+# All dependencies of the project except NumPy and onnxruntime.
 BLOCKED = (
     "jax jaxlib mujoco flax optax orbax pydantic pydantic_core tensorstore yaml rich tyro onnx "
     "matplotlib scipy brax gymnasium torch"
@@ -547,7 +547,7 @@ def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:
     assert len(source.read_text(encoding="utf-8").splitlines()) <= 80
     monkeypatch.setattr(sys, "argv", ["deploy.py", "pretrained", "--seconds", "0.6"])
     runpy.run_path(str(source), run_name="__main__")
-    # The ball falls 0.36 m in 0.27 s, and comes back 0.5 s later.
+    # The ball falls 0.36 m in 0.27 s and returns 0.5 s later.
     assert capsys.readouterr().out == "1 bounces in 0.6 s of 0.6 s\n"
 
 

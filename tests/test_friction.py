@@ -1,4 +1,4 @@
-"""The frictional contact of the fused engine against MuJoCo's C step."""
+"""Frictional contact of the fused engine against MuJoCo's C step."""
 
 from functools import partial
 
@@ -36,7 +36,7 @@ from test_physics import (
 )
 
 CONES = ("pyramidal", "elliptic")
-# One edit each of the MJCF with a frictional pair.
+# Single edits of the MJCF with a frictional pair.
 MODELS = {
     "as it is": ("condim", "condim"),
     "little friction": ('friction="0.3 0.3"', 'friction="0.01 0.01"'),
@@ -53,7 +53,7 @@ MODELS = {
 
 
 def frictional(cone: str, old: str = "condim", new: str = "condim") -> mujoco.MjModel:
-    """The shipped model with friction, one edit, and a C solver that converges to rounding."""
+    """Shipped model with friction, one edit, and a C solver that converges to rounding error."""
     xml = XML.replace('cone="pyramidal"', f'cone="{cone}"')
     xml = xml.replace('condim="1"', 'condim="3" friction="0.3 0.3"')
     assert old in xml
@@ -66,7 +66,7 @@ def converged(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def touching_states(model: mujoco.MjModel, count: int, seed: int) -> States:
-    """`random_states`; every third ball rolls on the paddle, a part of which slips or leaves."""
+    """`random_states`, but every third ball rolls on the paddle; some of these slip or leave."""
     states, _ = random_states(model, count, seed)
     rng = np.random.default_rng(seed)
     at = find_addresses(model)
@@ -94,8 +94,8 @@ def touching_states(model: mujoco.MjModel, count: int, seed: int) -> States:
 
 
 def c_steps(models: list[mujoco.MjModel], states: States) -> tuple[PhysicsState, np.ndarray]:
-    """One mj_step from each state, and the contact's force [N, 3] on the ball in its frame; NaN
-    without a contact."""
+    """One mj_step from each state, and the contact force [N, 3] in the contact's frame; NaN without
+    a contact."""
     after, forces = [], []
     for model, *start in zip(models, *states, strict=True):
         data = mujoco.MjData(model)
@@ -122,11 +122,11 @@ def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: St
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
-    """Each state within ONE_STEP of its largest speed; the largest part."""
+    """Checks each state against ONE_STEP times its largest speed; returns the largest ratio."""
     fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
     error = np.max(np.abs(np.asarray(actual.qvel) - expected.qvel) / fastest)
     assert error < ONE_STEP
-    # An orientation has no unit of length: angles.
+    # The comparison includes the orientation, which has no unit of length.
     assert np.max(np.abs(np.asarray(actual.qpos) - expected.qpos) / fastest) < ONE_STEP * DT + 1e-15
     return float(error)
 
@@ -155,7 +155,7 @@ def test_one_step_of_a_frictional_model_is_mujocos(name, cone, record_property):
 @pytest.mark.parametrize("cone", CONES)
 @pytest.mark.usefixtures("float64")
 def test_one_step_with_a_given_friction_is_mujocos(mj_model, cone):
-    """Alone in a frictionless model, and with every other number; `edited_model` defines it."""
+    """Alone in a frictionless model and with all other parameters, against `edited_model`."""
     model = mujoco.MjModel.from_xml_string(XML.replace('"pyramidal"', f'"{cone}"'))
     states = touching_states(model, 96, seed=1)
     coefficients = 10.0 ** np.random.default_rng(0).uniform(-3.0, 0.5, 96)
@@ -175,8 +175,8 @@ def test_one_step_with_a_given_friction_is_mujocos(mj_model, cone):
 @pytest.mark.parametrize("cone", CONES)
 @pytest.mark.usefixtures("float64")
 def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property):
-    """64 random worlds with servos at their limits, free-running: neither engine ever sees the
-    other's state. A ball that fell is dropped again."""
+    """Both engines run freely in 64 random worlds with servos at their limits; neither sees the
+    other's state. A lost ball is dropped again."""
     count = 64
     base = mujoco.MjModel.from_xml_string(XML.replace('"pyramidal"', f'"{cone}"'))
     base.opt.timestep = DT
@@ -220,7 +220,7 @@ def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property
     record_property("largest_difference", errors.max())
     print(f"{cone}, 2,000 steps x {count}: {contacts} contacts, {drops} drops, {errors.max():.1e}")
     assert contacts >= 1000
-    # A bounce off an edge amplifies rounding: C from an arm turned by 1e-15 rad ends as far from C,
-    # 2e-8 in the worst of these worlds and 1e-10 in nine of ten.
+    # A bounce off an edge amplifies rounding errors. Two runs of C with arms 1e-15 rad apart differ
+    # as much: by 2e-8 in the worst of these worlds, and by 1e-10 in nine of ten.
     assert np.quantile(errors, 0.9) < 1e-9
     assert errors.max() < 1e-6

@@ -1,4 +1,4 @@
-"""The world's numbers as inputs: each engine against MuJoCo's C step with an edited model."""
+"""Physics parameters: each engine against MuJoCo's C step with an edited model."""
 
 from functools import partial
 
@@ -48,14 +48,14 @@ from test_physics import (
 )
 
 MODEL = PhysicsParameters()
-# The numbers that the shipped model has; test_friction.py has the contact's friction.
+# Parameters of the shipped model; test_friction.py covers the contact's friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss")
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
 NUM_WORLDS = 16
 
 
 def world(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
-    """World i of a batch [N, ...]."""
+    """Parameters of world i from a batch [N, ...]."""
     return jax.tree.map(lambda array: array[i], parameters)
 
 
@@ -82,7 +82,7 @@ def c_steps(mj_model, parameters: PhysicsParameters, states: States) -> tuple[Ph
 
 
 def joined(states: list[PhysicsState]) -> PhysicsState:
-    """Batches of states as one."""
+    """Joins batches of states."""
     return PhysicsState(*(np.concatenate(x) for x in zip(*(s[:2] for s in states), strict=True)))
 
 
@@ -95,7 +95,7 @@ def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
 
 @pytest.mark.usefixtures("float64")
 def test_one_step_in_random_worlds_is_mujocos(mj_model):
-    """Every number given, contacts of every kind."""
+    """All parameters are given, with contacts of every kind."""
     states, _ = random_states(mj_model, 128, seed=5)
     parameters = random_parameters(mj_model, 128, seed=6)
     expected, contacts = c_steps(mj_model, parameters, states)
@@ -105,7 +105,7 @@ def test_one_step_in_random_worlds_is_mujocos(mj_model):
 
 @pytest.mark.usefixtures("float64")
 def test_each_number_alone_acts_as_in_mujoco(mj_model):
-    """In one batch: states and numbers are shared, but for one field that is drawn."""
+    """In one batch with shared states and parameters, except for one random field."""
     fields = FIELDS
     count = 8
     states, _ = random_states(mj_model, count, seed=1)
@@ -129,7 +129,7 @@ def test_each_number_alone_acts_as_in_mujoco(mj_model):
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.usefixtures("float64")
 def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
-    """A field alone, the rest None, at a model whose solref has the standard format."""
+    """One field is given and the rest is None, with a solref in the standard format."""
     model = edited('solref="-98696 -31.4"', 'solref="0.02 0.3"')
     states, _ = random_states(model, 4, seed=3)
     drawn = getattr(random_parameters(model, 4, seed=4), field)
@@ -140,7 +140,7 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
 
 @pytest.mark.usefixtures("float64")
 def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property):
-    """Free-running: neither engine ever sees the other's state."""
+    """Both engines run freely; neither sees the other's state."""
     rng = np.random.default_rng(0)
     start = bouncing_states(mj_model, rng)
     state = PhysicsState(*(x[:NUM_WORLDS] for x in start[:2]))
@@ -172,7 +172,7 @@ def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property)
 
 @pytest.mark.usefixtures("float64")
 def test_given_force_limits_are_mujocos(mj_model):
-    """Some servos at their limits, which have no implicit damping there, and some not."""
+    """Some servos are at their limits, where they have no implicit damping, and some are not."""
     states, _ = random_states(mj_model, 128, seed=11)
     limits = 10.0 ** np.random.default_rng(0).uniform(1.0, 3.5, (128, 6))
     alone = PhysicsParameters(force_limit=limits)
@@ -189,7 +189,7 @@ def test_given_force_limits_are_mujocos(mj_model):
 
 
 def test_nothing_given_leaves_the_program_alone(mj_model):
-    """The model's constants fold as before: no further input, and the same model to the bit."""
+    """The model's constants fold: no further input appears, and the model is bitwise the same."""
     model = fused.read_model(mj_model)
     assert in_world(model, MODEL) == model
     state = PhysicsState(jnp.zeros(mj_model.nq), jnp.zeros(mj_model.nv))
@@ -200,12 +200,12 @@ def test_nothing_given_leaves_the_program_alone(mj_model):
     assert not default.consts
     given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, Control(ctrl))
     assert len(given.in_avals) == 4
-    # One field costs the operations that use it, not those of the other fields.
+    # One given field adds only the operations that use it.
     assert 0 < num_operations(given) - num_operations(default) < 20
 
 
 def num_operations(jaxpr) -> int:
-    """Equations of a program, those inside its calls and loops included."""
+    """Number of equations in a program, including its calls and loops."""
     inner = [
         value
         for equation in jaxpr.eqns
@@ -230,8 +230,8 @@ def test_paddle_position_follows_its_parameter(mj_model):
 
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
-    """Filtered servos at their limits in random worlds with friction, free-running over control
-    steps, against C."""
+    """Free run against C over control steps, in random worlds with friction and filtered servos at
+    their limits."""
     count, num_substeps = 4, 5
     model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     assert model.na == 6
@@ -281,12 +281,12 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
 
 
 def heavy_and_light(key: jax.Array) -> PhysicsParameters:
-    """Balls of 1 to 100 times the mass."""
+    """Environment with balls of 1 to 100 times the mass."""
     return PhysicsParameters(ball_mass=0.0027 * 100.0 ** jax.random.uniform(key))
 
 
 def test_each_environment_of_a_batch_has_its_own_ball():
-    """A drawn mass acts, as in C with the edited model, and is in the state."""
+    """A drawn mass acts like in C with the edited model, and is in the state."""
     with jax.enable_x64(True):
         config = EnvConfig(ball_init_pos=(0.58856, 0.0, 0.08))
         env = BounceBall(config, randomize=heavy_and_light)
@@ -328,13 +328,13 @@ def networks():
 
 @pytest.fixture(scope="module")
 def untrained(networks):
-    """A policy before any training."""
+    """Untrained policy."""
     params = networks.policy_network.init(jax.random.PRNGKey(5))
     return policies.Policy(init_normalizer(BounceBall().observation_size), params)
 
 
 def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
-    """As the fused engine does; and not all in the model's."""
+    """C agrees with the fused engine, and not all worlds equal the model's."""
     config = EnvConfig(episode_seconds=0.3, ball_init_pos=(0.58856, 0.0, 0.1))
     key = jax.random.PRNGKey(0)
     env = BounceBall(config, randomize=heavy_and_light)
@@ -361,7 +361,7 @@ STATEFUL = {
 
 @pytest.mark.parametrize("name", STATEFUL)
 def test_c_evaluation_carries_the_whole_state(name):
-    """Control steps of the evaluation are those of mj_step in one go."""
+    """Control steps of the evaluation equal an uninterrupted run of mj_step."""
     model = edited(*STATEFUL[name])
     rng = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (2, 1)) + 0.1
@@ -391,7 +391,7 @@ def test_c_evaluation_carries_the_whole_state(name):
 
 
 def test_c_evaluation_takes_a_delayed_sensor(networks, untrained, tmp_path):
-    """An evaluation of a few steps."""
+    """A short evaluation runs without an error."""
     mjcf = tmp_path / "delayed.xml"
     mjcf.write_text(XML.replace(*STATEFUL["delayed sensor"], 1))
     env = BounceBall(EnvConfig(mjcf=mjcf, episode_seconds=0.1))
@@ -400,7 +400,7 @@ def test_c_evaluation_takes_a_delayed_sensor(networks, untrained, tmp_path):
 
 
 def test_filtered_servos_start_at_rest():
-    """With a gear too: the activations are the actuators' lengths, so that no servo pulls."""
+    """Also with a gear: the activations are the actuators' lengths, so no servo exerts a force."""
     model = edited('<position kp="20000"', '<position timeconst="0.02" gear="-2" kp="20000"')
     data = mujoco.MjData(model)
     data.qpos[:6] = np.linspace(-1.0, 1.0, 6)

@@ -1,4 +1,4 @@
-"""The physics engines: fused against MuJoCo's C step, against MJX, and against its own limits."""
+"""Physics engines: fused against MuJoCo's C step and against MJX, and the limits of fused."""
 
 from functools import partial
 from pathlib import Path
@@ -30,31 +30,31 @@ DT = 1e-3
 BATCH = 32
 MODEL = PhysicsParameters()
 XML = Path(resource_path("mjcf/bounce_ball.xml")).read_text()
-# Largest difference of one step, as a part of the largest speed in the batch: room for the rounding
-# of some thousand operations. (The worst is the ball's spin: MuJoCo's contact turns the ball by the
-# rounding of its lever, the fused one not at all.)
+# Largest difference of one step relative to the largest speed in the batch: room for the rounding
+# errors of some thousand operations. (The ball's spin has the largest error: in MuJoCo, rounding of
+# the contact's lever turns the ball; in the fused engine, nothing turns it.)
 ONE_STEP = 1e-11
 
 
 class States(NamedTuple):
-    """A batch of states and servo targets, in the order of the unedited MJCF."""
+    """Batch of states and servo targets, in the order of the unedited MJCF."""
 
     qpos: np.ndarray
-    """[N, nq]."""
+    """Generalised positions [N, nq]."""
     qvel: np.ndarray
-    """[N, nv]."""
+    """Generalised velocities [N, nv]."""
     ctrl: np.ndarray
-    """[N, nu], rad."""
+    """Servo targets [N, nu], rad."""
 
 
 @pytest.fixture(scope="module")
 def fused_step(mj_model):
-    """The fused step, compiled once for each dtype and number of steps if always given BATCH."""
+    """Fused step for batches of size BATCH, compiled once for each dtype and number of steps."""
     return batched(make_engine(mj_model, "fused").step)
 
 
 def batched(step):
-    """(state, ctrl, number of steps) -> state, compiled over a leading batch axis."""
+    """Compiled function (state, ctrl, number of steps) -> state over a leading batch axis."""
 
     def steps(state: PhysicsState, ctrl: np.ndarray, num_substeps: int) -> PhysicsState:
         return jax.vmap(lambda s, u: step(MODEL, s, Control(u), num_substeps))(state, ctrl)
@@ -63,19 +63,19 @@ def batched(step):
 
 
 def uncompiled_step(mj_model: mujoco.MjModel, states: States) -> PhysicsState:
-    """One fused step from each state, operation by operation: no time goes into compiling."""
+    """One fused step from each state, operation by operation, which saves the compilation."""
     step = partial(fused.step, fused.read_model(mj_model), MODEL, num_substeps=1)
     with jax.disable_jit():
         return jax.vmap(step)(PhysicsState(*as_jax(states[:2])), Control(jnp.asarray(states.ctrl)))
 
 
 def as_jax(arrays):
-    """The arrays as JAX arrays of the dtype that is set."""
+    """Converts arrays to JAX arrays of the default dtype."""
     return tuple(jnp.asarray(array) for array in arrays)
 
 
 def edited(old: str, new: str) -> mujoco.MjModel:
-    """The shipped model with one piece of its MJCF replaced."""
+    """Shipped model with one piece of its MJCF replaced."""
     assert old in XML
     return mujoco.MjModel.from_xml_string(XML.replace(old, new, 1))
 
@@ -89,8 +89,8 @@ def paddle_frame(mj_model: mujoco.MjModel, angles: np.ndarray) -> tuple[np.ndarr
 
 
 def random_states(mj_model: mujoco.MjModel, count: int, seed: int) -> tuple[States, np.ndarray]:
-    """Arm states in a wide range with the ball at the paddle; and the ball's centre [N, 3] in the
-    paddle's frame: in turn around it, inside it, near an edge or a corner, over a face."""
+    """Arm states in a wide range with the ball at the paddle, and the ball's centre [N, 3] in the
+    paddle's frame: in turn around the paddle, inside it, near an edge or a corner, over a face."""
     rng = np.random.default_rng(seed)
     qpos, qvel = np.zeros((count, mj_model.nq)), np.zeros((count, mj_model.nv))
     qpos[:, :6] = rng.uniform(-np.pi, np.pi, (count, 6))
@@ -119,7 +119,7 @@ def random_states(mj_model: mujoco.MjModel, count: int, seed: int) -> tuple[Stat
 
 
 def bouncing_states(mj_model: mujoco.MjModel, rng: np.random.Generator) -> PhysicsState:
-    """BATCH states with the arm around home and a spinning ball about to fall on the paddle."""
+    """BATCH states with the arm near home and a spinning ball just above the paddle."""
     qpos, qvel = np.zeros((BATCH, mj_model.nq)), np.zeros((BATCH, mj_model.nv))
     qpos[:, :6] = HOME + rng.uniform(-0.2, 0.2, (BATCH, 6))
     qvel[:, :6] = rng.uniform(-1.0, 1.0, (BATCH, 6))
@@ -132,7 +132,7 @@ def bouncing_states(mj_model: mujoco.MjModel, rng: np.random.Generator) -> Physi
 def drop_ball(
     mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Puts the ball above the paddle of one state, in place."""
+    """Puts the ball of one state above the paddle, in place."""
     qpos[6:9] = paddle_frame(mj_model, qpos[:6])[0]
     qpos[6:9] += [*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.04, 0.1)]
     qvel[6:9] = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0)]
@@ -140,7 +140,7 @@ def drop_ball(
 
 
 def c_step(mj_model: mujoco.MjModel, states: States) -> tuple[PhysicsState, np.ndarray]:
-    """One mj_step from each state, and its number of contacts [N]."""
+    """One mj_step from each state, and the number of contacts [N]."""
     data = mujoco.MjData(mj_model)
     qpos, qvel, contacts = [], [], []
     for start in zip(*states, strict=True):
@@ -154,7 +154,7 @@ def c_step(mj_model: mujoco.MjModel, states: States) -> tuple[PhysicsState, np.n
 
 
 def reordered(at: Addresses, states):
-    """Addressed as in an edited model: `States`, or a `PhysicsState`."""
+    """Reorders `States` or a `PhysicsState` to the addresses of an edited model."""
     qpos, qvel = np.empty_like(states.qpos), np.empty_like(states.qvel)
     qpos[:, at.arm_qpos + at.ball_qpos] = states.qpos
     qvel[:, at.arm_qvel + at.ball_qvel] = states.qvel
@@ -166,7 +166,7 @@ def reordered(at: Addresses, states):
 
 
 class CEngine:
-    """A batch of MuJoCo simulations that keep their own state."""
+    """Batch of MuJoCo simulations with their own states."""
 
     def __init__(self, mj_model: mujoco.MjModel, start: PhysicsState):
         self.model = mj_model
@@ -175,7 +175,7 @@ class CEngine:
             data.qpos[:], data.qvel[:] = qpos, qvel
 
     def step(self, ctrl: np.ndarray, num_substeps: int) -> int:
-        """Advances all of them; the number of steps with a contact."""
+        """Advances all simulations; returns the number of steps with a contact."""
         contacts = 0
         for data, targets in zip(self.data, ctrl, strict=True):
             data.ctrl[:] = targets
@@ -186,7 +186,7 @@ class CEngine:
 
     @property
     def state(self) -> PhysicsState:
-        """A copy of their state."""
+        """Copy of all states."""
         return PhysicsState(
             np.array([data.qpos for data in self.data]), np.array([data.qvel for data in self.data])
         )
@@ -200,7 +200,7 @@ def difference(a: PhysicsState, b: PhysicsState) -> tuple[float, float]:
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
-    """Both within ONE_STEP; the largest difference of qvel."""
+    """Checks qpos and qvel against ONE_STEP; returns the largest difference of qvel."""
     qpos, qvel = difference(actual, expected)
     fastest = np.max(np.abs(expected.qvel))
     assert qvel < ONE_STEP * fastest
@@ -213,7 +213,7 @@ def test_one_step_from_random_states_is_mujocos(mj_model, record_property):
     """Wide joint angles, contacts of every kind, spin, orientation."""
     states, local = random_states(mj_model, 512, seed=0)
     expected, contacts = c_step(mj_model, states)
-    beyond = np.sum(np.abs(local) > HALF_SIZE, axis=1)  # in how many axes the centre is outside
+    beyond = np.sum(np.abs(local) > HALF_SIZE, axis=1)  # number of axes with the centre outside
     touching = contacts == 1
     assert np.sum(touching) >= 400
     assert np.sum(touching & (beyond == 0)) >= 20
@@ -228,9 +228,10 @@ def test_one_step_from_random_states_is_mujocos(mj_model, record_property):
 
 @pytest.mark.usefixtures("float64")
 def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, record_property):
-    """The engines run freely: neither ever sees the other's state."""
-    # A bounce off an edge of the paddle amplifies rounding, in MuJoCo against itself too (an arm
-    # turned by 1e-14 rad can end 1e-7 m/s away). Seeds 0 to 7 stay below 1e-10, this one lowest.
+    """Both engines run freely; neither sees the other's state."""
+    # A bounce off an edge of the paddle amplifies rounding errors, even between two runs of MuJoCo
+    # (with an arm turned by 1e-14 rad, the ends can differ by 1e-7 m/s). Seeds 0 to 7 stay below
+    # 1e-10; this seed has the smallest difference.
     rng = np.random.default_rng(4)
     state = bouncing_states(mj_model, rng)
     reference = CEngine(mj_model, state)
@@ -256,9 +257,9 @@ def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, record_prope
 
 @pytest.mark.usefixtures("float64")
 def test_ten_substeps_are_ten_steps(mj_model, fused_step):
-    """Also the ball's orientation, which the engine turns once for all the substeps."""
+    """The engine updates the ball's orientation once for all substeps."""
     state = bouncing_states(mj_model, np.random.default_rng(0))
-    state.qpos[:, 8] -= 0.03  # so that many of the ten steps are in contact
+    state.qpos[:, 8] -= 0.03  # many of the ten steps are then in contact
     ctrl = state.qpos[:, :6] + 0.01
     singly = state
     for _ in range(10):
@@ -270,7 +271,7 @@ def test_ten_substeps_are_ten_steps(mj_model, fused_step):
 
 @pytest.mark.usefixtures("float64")
 def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):
-    """Free-running from falling balls, with contacts."""
+    """Both engines run freely from falling balls, with contacts."""
     mjx_step = batched(make_engine(mj_model, "mjx").step)
     rng = np.random.default_rng(0)
     state = bouncing_states(mj_model, rng)
@@ -292,7 +293,7 @@ def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):
 
 
 def test_mjx_multiplies_in_full_precision(mj_model):
-    """A GPU's default, tf32, has three digits: a policy that bounces elsewhere failed with it."""
+    """The default on a GPU, TF32, has three digits, and a policy that bounces elsewhere failed."""
     constants = mjx_engine.read_model(mj_model)
     state = PhysicsState(jnp.array(mj_model.qpos0), jnp.zeros(mj_model.nv))
 
@@ -308,7 +309,7 @@ def test_mjx_multiplies_in_full_precision(mj_model):
 
 @pytest.mark.parametrize("ball", ["bouncing", "falling"])
 def test_float32_drift(mj_model, fused_step, record_property, ball):
-    """Free-running float32 against MuJoCo's float64, 2 s, on the paddle and next to it."""
+    """Free run of 2 s in float32 against MuJoCo's float64, on the paddle and next to it."""
     rng = np.random.default_rng(3)
     start = bouncing_states(mj_model, rng)
     if ball == "falling":
@@ -338,7 +339,7 @@ def test_float32_drift(mj_model, fused_step, record_property, ball):
 
 
 def piece(start: str, end: str) -> str:
-    """The MJCF from the start to before the end."""
+    """Piece of the MJCF from the text `start` to before the text `end`."""
     return XML[XML.index(start) : XML.index(end)]
 
 
@@ -348,7 +349,7 @@ JOINTS_2_AND_3 = piece('"Joint2" axis', '<body name="Link4"')
 PADDLE = piece('<geom name="blocker"', "\n              </body>\n            </body>")
 LINK_6 = piece('<body name="Link6"', PADDLE)
 
-# Models that the fused engine computes, each as one edit of the MJCF.
+# Models that the fused engine supports, each as one edit of the MJCF.
 SUPPORTED = {
     "damping": ('<joint armature="0.02"', '<joint armature="0.02" damping="5"'),
     "no armature": ('<joint armature="0.02"', '<joint armature="0"'),
@@ -379,7 +380,7 @@ SUPPORTED = {
     "heavy ball": ('size="0.019" mass="0.0027"', 'size="0.019" mass="0.3"'),
     "turned paddle": ('quat="0.707107 0 -0.707107 0"', 'quat="0.6 0.1 -0.7 0.2"'),
 }
-# Models that move as the shipped one does.
+# Models that move like the shipped one.
 EQUIVALENT = {
     "pair swapped": ('geom1="blocker" geom2="ball"', 'geom1="ball" geom2="blocker"'),
     "actuators swapped": (
@@ -405,14 +406,14 @@ def test_supported_models_step_as_mujoco_does(mj_model, name):
     assert np.sum(contacts) >= 40
     assert_same_step(uncompiled_step(model, in_order), expected)
 
-    # The edit changes the simulation, or an equivalent one leaves it as it is.
+    # A supported edit changes the simulation; an equivalent edit does not.
     shipped, _ = c_step(mj_model, states)
     change = np.max(np.abs(expected.qvel - reordered(find_addresses(model), shipped).qvel))
     assert (change > 1e-3) == (name in SUPPORTED)
 
 
 UNSUPPORTED = {
-    # edit, what the message must say
+    # edit, required part of the message
     "Euler": ('integrator="implicitfast"', 'integrator="Euler"', "integrator mjINT_EULER"),
     "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator mjINT_RK4"),
     "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator mjINT_IMPLICIT"),
@@ -506,7 +507,7 @@ UNSUPPORTED = {
 }
 
 
-# Features that MJX ignores or refuses too.
+# Features that MJX also ignores or refuses.
 UNSUPPORTED_BY_BOTH = (
     *("implicit", "discrete", "density", "viscosity", "wind", "actuator group"),
     *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solimp width", "flex"),
@@ -517,7 +518,7 @@ UNSUPPORTED_BY_BOTH = (
 
 @pytest.mark.parametrize("name", UNSUPPORTED)
 def test_unsupported_models_are_refused(name):
-    """The error names the feature and what to do; no engine advises another that lacks it too."""
+    """The error names the feature and a remedy; it never advises an engine without the feature."""
     old, new, feature = UNSUPPORTED[name]
     model = edited(old, new)
     with pytest.raises(fused.UnsupportedModelError) as refusal:
@@ -538,7 +539,7 @@ def test_unsupported_models_are_refused(name):
 
 @pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 4"])
 def test_auto_takes_mjx_for_unsupported_models(name):
-    """And says why, in a whole sentence."""
+    """The reason is a whole sentence."""
     old, new, feature = UNSUPPORTED[name]
     engine = make_engine(edited(old, new), "auto")
     assert engine.name == "mjx"
@@ -547,7 +548,7 @@ def test_auto_takes_mjx_for_unsupported_models(name):
 
 
 MJX_ONLY = {
-    # Features that MJX ignores, in models that the fused engine refuses for another reason or not.
+    # Features that MJX ignores; the fused engine refuses some of these models for another reason.
     "early activations": (
         '<position name="act2" joint="Joint2"/>',
         '<general name="act2" joint="Joint2" dyntype="filterexact" dynprm="0.1" gainprm="9" '
@@ -561,14 +562,14 @@ MJX_ONLY = {
 
 @pytest.mark.parametrize("name", MJX_ONLY)
 def test_mjx_refuses_features_that_it_ignores(name):
-    """By name."""
+    """The error names the feature."""
     old, new, feature = MJX_ONLY[name]
     with pytest.raises(UserError, match=feature):
         make_engine(edited(old, new), "mjx")
 
 
 def test_auto_takes_fused_for_the_shipped_model(mj_model):
-    """And an explicit choice is obeyed."""
+    """An explicit choice has priority."""
     assert make_engine(mj_model, "auto").name == "fused"
     assert make_engine(mj_model, "fused").name == "fused"
     assert make_engine(mj_model, "mjx").name == "mjx"
@@ -577,7 +578,8 @@ def test_auto_takes_fused_for_the_shipped_model(mj_model):
 @pytest.mark.parametrize("speed", [1.0, 2.0, 3.0, 4.0])
 @pytest.mark.usefixtures("float64")
 def test_restitution(mj_model, fused_step, record_property, speed):
-    """Speed after an impact on the held paddle by that before, at all phases of the time step."""
+    """Ratio of the speeds after and before an impact on the held paddle, at all phases of the time
+    step."""
     ctrl = np.tile(HOME, (BATCH, 1))
     state = PhysicsState(np.zeros((BATCH, mj_model.nq)), np.zeros((BATCH, mj_model.nv)))
     state.qpos[:, :6] = HOME
@@ -596,11 +598,11 @@ def test_restitution(mj_model, fused_step, record_property, speed):
     for _ in range(40):
         paddle = np.array([paddle_frame(mj_model, q)[0] for q in np.asarray(state.qpos[:, :6])])
         gap = (np.asarray(state.qpos[:, 6:9]) - paddle) @ normal - HALF_SIZE[2] - RADIUS
-        # A step moves by its new velocity: the difference quotient is the paddle's velocity, and in
-        # free flight the velocity belongs to a time half a step before the position.
+        # A step moves the state by its new velocity. So the difference quotient is the paddle's
+        # velocity, and in free flight the velocity holds half a step before the position.
         velocity = np.asarray(state.qvel[:, 6:9]) - (paddle - before) / DT
         relative = velocity @ normal - 0.5 * 9.81 * DT
-        # Gravity's work between the first touch and this position is no part of the impact.
+        # This removes the work of gravity between the first touch and this position.
         speeds.append(np.sign(relative) * np.sqrt(relative**2 + 2.0 * 9.81 * np.maximum(gap, 0.0)))
         gaps.append(gap)
         before = paddle
@@ -634,7 +636,7 @@ def test_the_home_pose_holds_the_paddle_level(mj_model):
 
 
 class Arm(NamedTuple):
-    """Random joint states, MuJoCo's data at each, and the links and their pose there."""
+    """Random joint states with MuJoCo's data, and the links with their poses."""
 
     q: np.ndarray
     """[N, 6]."""
@@ -647,7 +649,7 @@ class Arm(NamedTuple):
 
 @pytest.fixture
 def arm(mj_model, float64) -> Arm:
-    """Eight of them."""
+    """Eight random joint states."""
     rng = np.random.default_rng(0)
     q, v = rng.uniform(-3.0, 3.0, (8, 6)), rng.uniform(-6.0, 6.0, (8, 6))
     data = [mujoco.MjData(mj_model) for _ in q]
@@ -667,7 +669,7 @@ def test_paddle_position_is_mujocos(mj_model, arm):
 
 
 def test_mass_matrix_is_mujocos(mj_model, arm):
-    """Against mj_fullM."""
+    """Reference: mj_fullM."""
     expected = np.zeros((len(arm.data), mj_model.nv, mj_model.nv))
     for matrix, d in zip(expected, arm.data, strict=True):
         mujoco.mj_fullM(mj_model, d, matrix)
@@ -676,14 +678,14 @@ def test_mass_matrix_is_mujocos(mj_model, arm):
 
 
 def test_bias_force_is_mujocos(mj_model, arm):
-    """Against qfrc_bias: gravity, Coriolis and centrifugal effects."""
+    """Reference: qfrc_bias, with gravity, Coriolis and centrifugal effects."""
     bias = chain.bias_force(arm.links, arm.pose, as_jax(arm.v.T), tuple(mj_model.opt.gravity))
     expected = [d.qfrc_bias[:6] for d in arm.data]
     np.testing.assert_allclose(np.transpose(bias), expected, rtol=1e-10, atol=1e-12)
 
 
 def test_point_jacobian_is_mujocos(mj_model, arm):
-    """Against mj_jac of a random point of the last link."""
+    """Reference: mj_jac at a random point of the last link."""
     rng = np.random.default_rng(1)
     point, direction = rng.uniform(-1.0, 1.0, (2, len(arm.data), 3))
     row = chain.point_jacobian(arm.links, arm.pose, as_jax(point.T), as_jax(direction.T))
@@ -696,7 +698,7 @@ def test_point_jacobian_is_mujocos(mj_model, arm):
 
 
 def test_sine_and_cosine_are_numpys():
-    """In float32, of every angle that an arm comes to and far beyond."""
+    """In float32, over all angles of an arm and far beyond."""
     angle = np.linspace(-1000.0, 1000.0, 1_000_001, dtype=np.float32)
     sine, cosine = jax.jit(scalars.sine_cosine)(angle)
     # Two units in the last place of a number just below 1.
@@ -727,6 +729,6 @@ def test_cholesky_and_its_solves_are_numpys():
 
 
 def stacked(matrix: chain.SquareMatrix) -> np.ndarray:
-    """A matrix of batched scalars as one array [N, n, n]."""
+    """Stacks a matrix of batched scalars into one array [N, n, n]."""
     entries = np.broadcast_arrays(*(np.asarray(x) for row in matrix for x in row))
     return np.moveaxis(np.reshape(entries, (len(matrix), len(matrix), -1)), -1, 0)

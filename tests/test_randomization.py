@@ -1,4 +1,4 @@
-"""Randomised worlds: their draws, late actions, late and noisy sensors, pushes and targets."""
+"""Randomised worlds: draws, late actions, late and noisy sensors, pushes and targets."""
 
 import functools
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from bounce_mjx.task.randomization import (
 )
 from test_physics import difference
 
-# Terms that leave the frictionless physics of the fused engine.
+# Terms outside the frictionless physics of the fused engine.
 _OTHER_PHYSICS = {"contact_friction", "torque_limit", "joint_frictionloss"}
 
 
@@ -55,7 +55,7 @@ def test_draws_are_uniform_in_their_ranges() -> None:
         shares += list((np.asarray(values, float).reshape(2000, -1).T - low) / (high - low))
     shares = np.array(shares)
     assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
-    # Of all entries of all terms; each draw of them is independent of the others.
+    # Each entry of each term is drawn independently.
     p_values = [stats.kstest(entry, "uniform").pvalue for entry in shares]
     assert min(p_values) > 1e-3 / len(shares)
     correlation = np.corrcoef(shares) - np.eye(len(shares))
@@ -63,7 +63,7 @@ def test_draws_are_uniform_in_their_ranges() -> None:
 
 
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
-    """JAX sorts the keys of a dictionary that it traces."""
+    """JAX sorts the keys of a traced dictionary."""
     ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
     draw = functools.partial(draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"))
     expected = draw(ranges)
@@ -85,7 +85,7 @@ def test_ranges_grow_from_the_nominal_values() -> None:
     assert ends(0.5)["restitution"] == pytest.approx([0.80, 0.90])
     assert ends(1.0)["restitution"] == pytest.approx([0.75, 0.95])
     assert ends(0.25)["action_latency"] == pytest.approx([0.0, 0.01])
-    # No camera at all is no rate from which to grow.
+    # A camera has no nominal rate from which to grow.
     assert ends(0.0)["camera_rate"] == ends(1.0)["camera_rate"] == [60.0, 120.0]
 
 
@@ -105,7 +105,7 @@ def test_bad_range(values: dict, words: str) -> None:
 
 
 def test_off_is_the_program_without_randomisation() -> None:
-    """Whatever the settings of a warm-up; and a term that is on is in the program."""
+    """The warm-up's settings do not matter; an active term changes the program."""
 
     def program(**settings) -> tuple[str, int]:
         env = BounceBall(EnvConfig(randomization=settings))
@@ -122,8 +122,8 @@ def test_off_is_the_program_without_randomisation() -> None:
 
 @pytest.mark.parametrize("restitution", [0.72, 0.8, 0.9, 0.96])
 def test_drops_bounce_as_asked(mj_model, restitution: float) -> None:
-    """On MuJoCo's C engine: speed after by speed before the impact on the held paddle, without
-    gravity, at several phases of the time step."""
+    """On MuJoCo's C engine: ratio of the speeds after and before an impact on the held paddle,
+    without gravity, at several phases of the time step."""
     parameters = physics_parameters({"restitution": jnp.asarray(restitution)}, mj_model)
     model = edited_model(mj_model, jax.tree.map(np.asarray, parameters))
     model.opt.gravity[:] = 0.0
@@ -150,9 +150,9 @@ def test_drops_bounce_as_asked(mj_model, restitution: float) -> None:
 
 
 def simulated_targets(asked: np.ndarray, delay: int, lag: float, n: int) -> np.ndarray:
-    """Servo targets of each physics step, brute force: targets [T] of control steps of n physics
-    steps arrive `delay` physics steps late, through a filter with the time constant `lag` in
-    physics steps."""
+    """Servo targets of each physics step by brute force: the targets [T] of control steps with n
+    physics steps arrive `delay` physics steps late and pass a filter with the time constant `lag`,
+    in physics steps."""
     inputs = np.concatenate([np.full(delay, asked[0]), np.repeat(asked[1:], n)])
     outputs, y = [], asked[0]
     for x in inputs[: n * (len(asked) - 1)]:
@@ -197,7 +197,7 @@ def test_a_latency_is_rounded_to_a_physics_step() -> None:
 
 
 class Run(NamedTuple):
-    """A free run of the fused engine in many worlds: arrays [T + 1 or T, ..., N]."""
+    """Free run of the fused engine in many worlds: arrays [T + 1 or T, ..., N]."""
 
     env: BounceBall
     starts: object
@@ -213,8 +213,8 @@ WORLDS, CONTROL_STEPS = 64, 200
 
 @pytest.fixture(scope="module")
 def free_run() -> Run:
-    """64 worlds, all terms of the physics, the actuation and the task drawn; low balls, so that
-    they bounce, and small actions, so that they go on bouncing."""
+    """64 worlds with draws of all terms of the physics, the actuation and the task. The balls start
+    low and the actions are small, so that the balls bounce and keep bouncing."""
     terms = {
         "restitution": (0.7, 0.95), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
         "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
@@ -253,8 +253,8 @@ def free_run() -> Run:
 
 
 def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]:
-    """World w on MuJoCo's C engine [T, ...] and its steps with a contact; latency, lag, drag and
-    push are simulated here. The ball starts higher by `shift`."""
+    """States [T, ...] of world w on MuJoCo's C engine, and the number of steps with a contact. This
+    function simulates latency, lag, drag and pushes itself. The ball starts higher by `shift`."""
     start = free_run.starts.pipeline_state
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
@@ -269,7 +269,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     after, contacts = [], 0
     for t in range(CONTROL_STEPS):
         asked.append(np.clip(data.qpos[:6] + 0.02 * free_run.actions[t, :, w], low, high))
-        # The drag is of the velocity before the push, and constant in a control step.
+        # The drag uses the velocity before the push, and is constant during a control step.
         velocity = data.qvel[6:9].copy()
         drag = world["air_drag"] * ball.mass[0] * np.linalg.norm(velocity) * velocity
         data.xfrc_applied[ball.id, :3] = -drag
@@ -286,8 +286,9 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
 
 @pytest.mark.usefixtures("float64")
 def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property) -> None:
-    """Each engine runs freely. Contacts multiply a difference, in a few worlds a millionfold; there
-    the engines are as close as two runs of C whose balls start a picometre apart."""
+    """Each engine runs freely. Contacts amplify differences, in a few worlds by a factor of a
+    million; in these worlds the engines are as close as two runs of C with balls that start a
+    picometre apart."""
     errors, apart, contacts = np.zeros((3, WORLDS)), np.zeros((3, WORLDS)), 0
     for w in range(WORLDS):
         ours = PhysicsState(*(x[..., w] for x in free_run.physics[:2]))
@@ -315,14 +316,14 @@ def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
         times = np.flatnonzero(size[:, w])
         np.testing.assert_allclose(size[times, w], world["push_speed"][w])
         interval = float(world["push_interval"][w]) / 0.01
-        # They recur exactly, but for the control step in which they fall.
+        # They recur at exact intervals, rounded to control steps.
         grid = times[0] + interval * np.arange(len(times))
         assert np.abs(times - grid).max() <= 1.0 + 1e-6
         assert len(times) >= int(CONTROL_STEPS / interval) - 1
         angles += list(np.arctan2(pushes[times, 1, w], pushes[times, 0, w]))
         first.append(times[0] / interval)
     assert stats.kstest((np.array(angles) + np.pi) / (2 * np.pi), "uniform").pvalue > 1e-3
-    # A reset falls anywhere into an interval.
+    # The reset is at a random time within an interval.
     assert stats.kstest(first, "uniform").pvalue > 1e-3
 
 
@@ -338,7 +339,7 @@ def test_targets_change_at_their_interval(free_run: Run) -> None:
         grid = changed[0] + interval * np.arange(len(changed))
         assert np.abs(changed - grid).max() <= 1.0 + 1e-6
         assert len(changed) >= int(CONTROL_STEPS / interval) - 1
-        # The age after the step in which it changed is one step.
+        # The age after the step of the change is one step.
         since = np.arange(CONTROL_STEPS) - changed[:, None]
         age = 1 + np.where(since >= 0, since, np.arange(CONTROL_STEPS)).min(axis=0)
         np.testing.assert_allclose(free_run.target_age[:, w], 0.01 * age, atol=1e-9)
@@ -365,7 +366,7 @@ EPISODES, STEPS, DT = 32, 150, 0.01
 
 
 def trajectory() -> tuple[np.ndarray, np.ndarray]:
-    """A ball that bounces on the home paddle, and an arm that sways: qpos and qvel [T + 1]."""
+    """Trajectory of a bouncing ball over a swaying arm: qpos and qvel [T + 1]."""
     time = DT * np.arange(STEPS + 1)
     qpos, qvel = np.zeros((STEPS + 1, 13)), np.zeros((STEPS + 1, 12))
     qpos[:, 9] = 1.0
@@ -384,7 +385,7 @@ def trajectory() -> tuple[np.ndarray, np.ndarray]:
 
 
 class Watch(NamedTuple):
-    """What the sensors made of the trajectory: [N, T, ...]."""
+    """Observations of the trajectory: [N, T, ...]."""
 
     world: dict
     phase: np.ndarray
@@ -395,7 +396,7 @@ class Watch(NamedTuple):
 
 @functools.cache
 def watching(camera: bool, velocity: str):
-    """A compiled (ranges, keys) -> what an environment with these sensors sees."""
+    """Compiled function (ranges) -> `Watch` of an environment with these sensors."""
     sensors = {name: r for name, r in SENSORS.items() if camera or name != "camera_rate"}
     observation = PARTS | {"velocity": velocity}
     env = BounceBall(EnvConfig(randomization=sensors, observation=observation))
@@ -408,7 +409,7 @@ def watching(camera: bool, velocity: str):
             start = env.reset(key, ranges)
             physics = PhysicsState(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
             pipeline = start.pipeline_state._replace(physics=physics)
-            # The first memory has the ball of the trajectory too.
+            # The first memory must also have the ball of the trajectory.
             memory = env._first_memory(pipeline, env.kinematics(pipeline), key)
             start = start.replace(pipeline_state=pipeline._replace(memory=memory))
 
@@ -446,8 +447,8 @@ def watch(float64):
 
 
 def pictures(world: dict, phase: float, w: int):
-    """Measured position, velocity and age of each control step, simulated frame by frame: the
-    camera takes picture n at (n + phase) / rate; it arrives after the latency."""
+    """Measured position, velocity and age at each control step, simulated frame by frame: the
+    camera takes picture n at (n + phase) / rate, and the picture arrives after the latency."""
     qpos, qvel = trajectory()
     time = DT * np.arange(STEPS + 1)
     rate, latency = float(world["camera_rate"][w]), float(world["ball_latency"][w])
@@ -482,7 +483,7 @@ def test_camera_is_that_of_a_simulation(watch) -> None:
 
 
 def test_lost_pictures_do_not_come_later(watch) -> None:
-    """At 60 Hz, a control step has one new picture or none; of the new ones, a share is lost."""
+    """At 60 Hz, a control step has at most one new picture; a share of the pictures is lost."""
     seen = watch(frame_drop=(0.3, 0.3), camera_rate=(60.0, 60.0))
     new, lost = 0, 0
     for w in range(EPISODES):
@@ -494,7 +495,7 @@ def test_lost_pictures_do_not_come_later(watch) -> None:
             is_new = due and np.abs(position[t] - now[1]).max() < 2e-5
             last = now[1] if is_new else last
             np.testing.assert_allclose(position[t], last, atol=2e-5)
-            # At first the ball is at rest, and looks the same in all pictures.
+            # At first the ball is at rest and looks the same in all pictures.
             if t >= 10:
                 new, lost = new + due, lost + (due and not is_new)
                 assert not is_new or age[t] == pytest.approx(now[3], abs=2e-6)
@@ -525,7 +526,7 @@ def test_noise_has_its_size_and_is_held_with_the_picture(watch) -> None:
         assert stats.kstest(error.ravel(), "norm").pvalue > 1e-4
         correlation = np.corrcoef(error.T) - np.eye(error.shape[1])
         assert np.abs(correlation).max() < 6 / np.sqrt(len(error))
-    # The paddle is where the wrong angles say.
+    # The paddle's measured position follows from the wrong angles.
     assert np.abs(seen.parts["paddle_position"] - clean.parts["paddle_position"]).max() > 1e-3
 
 
@@ -555,7 +556,7 @@ def test_histories_have_the_newest_first(watch) -> None:
 
 
 def test_bounces_are_those_of_the_measurements(watch) -> None:
-    """Against a pass over the measured heights with whole segments at hand."""
+    """Against an offline evaluation of all measured heights at once."""
     seen = watch(ball_position_noise=(0.002, 0.002), camera_rate=(120.0, 120.0))
     for w in range(4):
         part = {name: values[w] for name, values in seen.parts.items()}
@@ -577,7 +578,7 @@ def test_bounces_are_those_of_the_measurements(watch) -> None:
                     speeds = part["joint_velocities"][lowest, 0]
                     np.testing.assert_array_equal(part["bounce_joint_velocities"][t, i], speeds)
                 before = [r for r in starts if r < s]
-                # Times since the reset count from 0, those of the rows from one step.
+                # Times since the reset start at 0; the first row is one step later.
                 interval = DT * (s - before[-1] if before else s + 1)
                 assert part["bounce_interval"][t, i, 0] == pytest.approx(interval, abs=1e-9)
                 flown = np.flatnonzero(low[:s])
@@ -588,7 +589,7 @@ def test_bounces_are_those_of_the_measurements(watch) -> None:
 
 @pytest.mark.usefixtures("float64")
 def test_latency_without_a_camera_and_velocity_by_differences() -> None:
-    """A picture at every control step; its velocity is that between it and the one before."""
+    """A picture at every control step; the velocity is the difference from the previous picture."""
     run = watching(camera=False, velocity="differences")
     seen = run(ball_latency=(0.0, 0.03))
     qpos, _ = trajectory()
@@ -604,7 +605,7 @@ def test_latency_without_a_camera_and_velocity_by_differences() -> None:
 
 
 def test_results_are_of_the_truth() -> None:
-    """A policy that ignores its observation has the same results, however absurd the sensors."""
+    """A policy that ignores its observation has the same results even with absurd sensor errors."""
     sensors = {
         "ball_position_noise": (0.0, 5.0), "ball_velocity_noise": (0.0, 50.0),
         "ball_position_bias": (0.0, 3.0), "ball_latency": (0.0, 0.05),
@@ -654,7 +655,7 @@ def test_random_numbers_have_their_distribution(counters, kind: str) -> None:
     assert np.all(np.isfinite(columns))
     for column in columns:
         assert stats.kstest(column, kind).pvalue > 1e-4
-        # Nor do neighbouring control steps know of each other.
+        # Neighbouring control steps are uncorrelated.
         for lag in (1, 2, 3):
             assert abs(np.corrcoef(column[:-lag], column[lag:])[0, 1]) < 5 / np.sqrt(COUNT)
     correlation = np.corrcoef(columns) - np.eye(len(columns))
@@ -662,7 +663,7 @@ def test_random_numbers_have_their_distribution(counters, kind: str) -> None:
 
 
 def test_neighbouring_counters_give_unrelated_numbers() -> None:
-    """Environments whose first counters are close, and the pairs of numbers of one counter."""
+    """Environments with neighbouring first counters, and pairs of numbers from one counter."""
     numbers = jax.vmap(lambda c: noise.uniform(c, 0, (4,), jnp.dtype("float32")))(
         jnp.arange(COUNT, dtype=jnp.int32)
     )

@@ -1,4 +1,4 @@
-"""The robustness report: its suite, the episodes behind it, and the ways to show it."""
+"""Robustness report: its suite, its episodes, and its table and figure."""
 
 import io
 import json
@@ -33,7 +33,7 @@ RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed
 
 
 def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = None):
-    """The conditions of a suite file, without the nominal one."""
+    """Conditions of a suite file, without the nominal condition."""
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump({"perturbations": list(perturbations)}), encoding="utf-8")
     nominal, *others = load_suite(path, trained or EnvConfig())
@@ -50,7 +50,7 @@ def test_the_shipped_suite_has_every_term() -> None:
     assert {term for condition in conditions for term in condition.ranges} == TERMS.keys()
 
     def values(term: str) -> set[float]:
-        """The values of the conditions that perturb this term alone."""
+        """Values of all conditions that perturb only this term."""
         alone = [c.ranges[term] for c in conditions if c.ranges.keys() == {term}]
         return {round(float(np.ravel(high)[i]), 6) for _, high in alone for i in range(high.size)}
 
@@ -114,7 +114,7 @@ def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     assert [c.trained for c in conditions] == [True, True, False, True, False, False, True]
     np.testing.assert_allclose(conditions[-1].ranges["gravity_tilt"], [[-0.02] * 2, [0.02] * 2])
     assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt"}
-    # Without any randomisation, only what leaves the world as it is.
+    # Without randomisation, a training contains only conditions that leave the world unchanged.
     conditions = suite(tmp_path, late, tilt, both, everything)
     assert [c.trained for c in conditions] == [True, *[False] * 5]
 
@@ -195,7 +195,7 @@ def test_a_suite_that_is_no_file(tmp_path: Path) -> None:
 def shipped() -> tuple[Policy, PPOConfig, EnvConfig]:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    # Long enough for a bounce that is settled.
+    # Long enough for a settled bounce.
     return (
         load_policy(checkpoint, config),
         config.ppo,
@@ -204,7 +204,8 @@ def shipped() -> tuple[Policy, PPOConfig, EnvConfig]:
 
 
 def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
-    """The nominal one, one that the shipped policy masters, and one that it does not."""
+    """Nominal condition, a condition that the shipped policy masters, and a condition that is too
+    hard for it."""
     drag = dict(name="drag", strengths=[0.1], terms={"air_drag": "strength"})
     tilt = dict(name="tilt", unit="deg", strengths=[3], terms={"paddle_tilt": [0, "strength"]})
     path = tmp_path / "suite.yaml"
@@ -227,7 +228,7 @@ def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
         )
     nominal, drag, tilt = fused
     assert nominal.passed and drag.passed and "stable" in tilt.failed
-    # The worlds are not one and the same.
+    # The worlds differ.
     assert drag.values["upward speed"] < nominal.values["upward speed"] - 0.005
 
 
@@ -249,7 +250,7 @@ def test_a_policy_that_ignores_the_ball_fails(shipped, tmp_path: Path) -> None:
 
 
 def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeypatch) -> None:
-    """In whatever program and call it is simulated: with statistics that tell of the ranges."""
+    """In every program and call; the statistics of this fake evaluator depend on the ranges."""
     conditions = suite(
         tmp_path,
         LATE | dict(unit="ms", strengths=[0, 5, 10, 15, 20]),
@@ -269,7 +270,7 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
             given = {name: np.repeat(low, 4) for name, (low, _) in (ranges or {}).items()}
             late = given.get("action_latency", np.zeros(count))
             rate = given.get("camera_rate", np.zeros(count))
-            # 100 steps of a second: a sum of speeds is a number of a condition.
+            # 100 steps are one second; the mean length and the speed identify the condition.
             return statistics._replace(
                 steps=100.0 + 1000.0 * late + rate,
                 rising_steps=np.ones(count),
@@ -290,7 +291,7 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     assert [o.physics for o in outcomes] == ["fused"] * 9 + ["mujoco"]
     lengths = [1.0, 1.05, 1.1, 1.15, 1.2, 1.6, 2.2, 1.0, 2.0, 1.0]
     np.testing.assert_allclose([o.mean_length_s for o in outcomes], lengths, rtol=1e-6)
-    # The neutral target is the task's own; at 0.8 m the speed is not judged.
+    # The neutral target height is the task's own; at 0.8 m the speed is not judged.
     speeds = [0.4, 0.405, 0.41, 0.415, 0.42, 0.5, 0.5, 0.8, 0.5, 0.5]
     np.testing.assert_allclose([o.values["upward speed"] for o in outcomes], speeds, rtol=1e-6)
     assert done == sorted(done) and done[-1] == 10
@@ -312,7 +313,7 @@ def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
     assert neutral_range("camera_rate", env) is None
 
 
-# Its shape
+# Table and figure
 
 
 def outcome(name: str, strength: float | None = None, **changes) -> Outcome:
@@ -377,7 +378,7 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
     assert len(cells) == 5
     stable, unstable = cells[0].get_facecolor(), cells[3].get_facecolor()
     assert stable[2] > stable[0] and unstable[0] > unstable[2], "blue is stable, red is not"
-    # Around the nominal world, and around both latencies that were trained.
+    # One frame around the nominal condition, one around both trained latencies.
     frames = [patch.get_width() for patch in patches if not patch.get_fill()]
     np.testing.assert_allclose(frames, [0.94, 1.94])
     words = [text.get_text() for ax in axes for text in ax.texts]
@@ -392,7 +393,7 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
 
 @pytest.fixture
 def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
-    """The command has this report's outcomes without simulating."""
+    """Makes the command return this report's outcomes without a simulation."""
     monkeypatch.setattr(robustness_command, "measure_conditions", lambda *_, **__: report.outcomes)
     return report
 
@@ -450,7 +451,7 @@ def test_report_page_shows_the_picture(
 
 
 def test_trained_share_is_not_of_the_suite() -> None:
-    """A condition draws its terms in every episode, however rarely the training drew them."""
+    """A condition draws its terms in every episode, even if the training drew them rarely."""
     trained = EnvConfig(randomization=RandomizationConfig(air_drag=(0.0, 0.2), share=0.3))
     conditions = load_suite(resource_path("configs/robustness.yaml"), trained)
     config = robustness._spanning_config(conditions[:3], "config")

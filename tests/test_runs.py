@@ -1,4 +1,4 @@
-"""Files of a run from elsewhere: each is valid, or one sentence refuses it."""
+"""Files of a run from elsewhere; each is valid or is refused in one sentence."""
 
 import concurrent.futures
 import json
