@@ -70,7 +70,7 @@ def step(
         pushed = vadd(motion.ball_velocity, tuple(control.ball_push[i] for i in range(3)))
         motion = motion._replace(ball_velocity=pushed)
     leaves, tree = jax.tree.flatten(motion)
-    inputs = (_of_servos(control, addresses.actuators), parameters)
+    inputs = (_arm_control(control, addresses.actuators), parameters)
     numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
@@ -111,7 +111,7 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
 
 
-def _of_servos(control: Control, actuators: tuple[int, ...]) -> Control:
+def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     """Control of the arm's servos in the order of the joints, without the push."""
 
     def chosen(ctrl: jax.Array | None) -> jax.Array | None:
