@@ -148,7 +148,7 @@ def test_one_step_of_a_frictional_model_is_mujocos(name, cone, record_property):
         assert np.sum(force[:, 0] == 0.0) >= 20
         assert np.sum(np.isnan(force[:, 0])) >= 5
     error = assert_same_step(fused_steps(model, MODEL, states), expected)
-    record_property("largest_difference", error)
+    record_property("largest_difference", float(error))
     print(f"{cone}, {name}: {error:.1e} of the largest speed")
 
 
@@ -217,7 +217,7 @@ def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property
         for j, c in enumerate(reference):
             here = PhysicsState(*(x[j : j + 1] for x in state[:2]))
             errors[j] = max(errors[j], *difference(here, c.state))
-    record_property("largest_difference", errors.max())
+    record_property("largest_difference", float(errors.max()))
     print(f"{cone}, 2,000 steps x {count}: {contacts} contacts, {drops} drops, {errors.max():.1e}")
     assert contacts >= 1000
     # A bounce off an edge amplifies rounding errors. Two runs of C with arms 1e-15 rad apart differ

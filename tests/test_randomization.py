@@ -299,7 +299,7 @@ def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property
             until = [PhysicsState(*(x[steps] for x in s[:2])) for s in (reference, ours, shifted)]
             errors[i, w] = max(difference(until[1], until[0]))
             apart[i, w] = max(difference(until[2], until[0]))
-    record_property("largest_difference", errors.max())
+    record_property("largest_difference", float(errors.max()))
     print(f"{contacts} contact steps, differences after 500, 1000, 2000 steps {errors.max(axis=1)}")
     assert contacts > 20 * WORLDS
     assert errors[0].max() < 1e-9
