@@ -198,7 +198,7 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
 
 def brax_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
     """This project's networks, with its normalisation, for brax's trainer."""
-    networks = make_networks(config, observation_size, action_size)
+    networks = make_networks(config, observation_size, action_size, len(config.critic_metrics))
 
     def adapt(network: Network, key: str) -> FeedForwardNetwork:
         return FeedForwardNetwork(

@@ -118,7 +118,7 @@ def brax_networks(config):
 @pytest.mark.parametrize("which", ["policy_network", "value_network"])
 def test_networks_equal_brax(which, config, brax_networks, seen):
     """The same key gives the same parameters, by name and value, and the same outputs."""
-    ours, theirs = getattr(make_networks(config, N, 6), which), getattr(brax_networks, which)
+    ours, theirs = getattr(make_networks(config, N, 6, 2), which), getattr(brax_networks, which)
     key = jax.random.PRNGKey(3)
     params, expected = ours.init(key), theirs.init(key)
     assert jax.tree.structure(params) == jax.tree.structure(expected)

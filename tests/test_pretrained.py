@@ -118,7 +118,7 @@ def measure(monkeypatch, measured: Report):
 
     def replace(report: Report) -> None:
         evaluation = Evaluation(report, "fused", ())
-        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_: evaluation)
+        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_, **__: evaluation)
 
     replace(measured)
     return replace
