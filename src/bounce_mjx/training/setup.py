@@ -7,13 +7,15 @@ import jax
 
 
 def set_up_jax() -> None:
-    """Sets JAX up for a command; the user's environment variables have priority.
-
-    Compiled programs are cached in the user's cache folder, so that a second start is quick
-    (`JAX_COMPILATION_CACHE_DIR` names another folder).
-    """
+    """Sets JAX up for a command; the user's environment variables have priority."""
     set_up_gpu()
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    cache_compilations()
+
+
+def cache_compilations() -> None:
+    """Caches compiled programs in the user's cache folder, so that a second start is quick; a
+    folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority."""
+    if jax.config.jax_compilation_cache_dir is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
 
