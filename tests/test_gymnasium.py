@@ -272,14 +272,34 @@ def test_wrappers_work_on_the_vector(vectorised):
         assert_same(left, right, 1e-2)
 
 
-def test_arrays_become_tensors():
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("array_api_compat")
+def test_arrays_become_tensors(need):
+    torch = need("torch")
+    need("array_api_compat")
     env = gymnasium.wrappers.vector.NumpyToTorch(make_vec())
     observation, _ = env.reset(seed=0)
     following, reward, *_ = env.step(torch.zeros(NUM_ENVS, 6))
     assert all(isinstance(x, torch.Tensor) for x in (observation, following, reward))
     assert following.shape == (NUM_ENVS, 29)
+
+
+def test_torchrl_wraps_single_and_vectorised_environments(need):
+    """TorchRL's own checks pass, and the next observation is the last one of an ended episode."""
+    torchrl = need("torchrl.envs")
+    torch = need("torch")
+    torchrl.utils.check_env_specs(torchrl.GymEnv(ENV_ID))
+    actions = torch.tensor(falling_actions(LIMIT))
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+        envs = torchrl.GymWrapper(make_vec(mode))
+        data = envs.reset(seed=[5, 6, 9])
+        for action in actions:
+            data = envs.step(data.set("action", action))
+            last, data = data["next"], torchrl.utils.step_mdp(data)
+            if last["done"].any():
+                target = last["observation"][:, TARGET]
+                data = envs.maybe_reset(data)
+                ended = last["done"].squeeze(-1)
+                assert (last["observation"][ended, 8] < 0.05).any() or last["truncated"].any()
+                assert torch.equal(data["observation"][:, TARGET] != target, ended)
 
 
 def test_returned_arrays_belong_to_the_user(vectorised):
