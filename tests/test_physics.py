@@ -345,7 +345,6 @@ def piece(start: str, end: str) -> str:
 
 ARM_BODY = piece('    <body name="Link1"', '\n    <body name="ball_link"')
 BALL_BODY = piece('\n    <body name="ball_link"', "  </worldbody>")
-JOINTS_2_AND_3 = piece('"Joint2" axis', '<body name="Link4"')
 PADDLE = piece('<geom name="blocker"', "\n              </body>\n            </body>")
 LINK_6 = piece('<body name="Link6"', PADDLE)
 
@@ -462,13 +461,6 @@ UNSUPPORTED = {
         '<joint name="Joint3"',
         '<joint name="more" axis="1 0 0"/><joint name="Joint3"',
         "joints other",
-    ),
-    "another chain": (
-        JOINTS_2_AND_3,
-        JOINTS_2_AND_3.replace('"Joint3"', '"x"')
-        .replace("Joint2", "Joint3")
-        .replace('"x"', '"Joint2"'),
-        "one serial chain",
     ),
     "paddle on another link": (LINK_6 + PADDLE, PADDLE + LINK_6, "last link"),
     "cylinder paddle": (

@@ -75,9 +75,9 @@ def _flags(bits: int, kind: type) -> set[str]:
 def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     bodies = [int(m.jnt_bodyid[joint]) for joint in addresses.arm_joints]
     _require(
-        m.njnt == len(addresses.arm_joints) + 1, "joints other than Joint1..Joint6 and the ball's"
+        m.njnt == len(addresses.arm_joints) + 1, "joints other than the acting ones and the ball's"
     )
-    _require(m.nbody == len(bodies) + 2, "bodies other than the six links and the ball")
+    _require(m.nbody == len(bodies) + 2, "bodies other than the links and the ball")
     hinge = mujoco.mjtJoint.mjJNT_HINGE
     _require(
         all(m.jnt_type[j] == hinge for j in addresses.arm_joints), "arm joints that are not hinges"
@@ -88,7 +88,7 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     parents = [0, *bodies[:-1]]
     _require(
         all(m.body_parentid[b] == p for b, p in zip(bodies, parents, strict=True)),
-        "an arm that is not one serial chain of Joint1..Joint6",
+        "an arm that is not one serial chain",
     )
     _require(
         m.geom_bodyid[addresses.paddle_geom] == bodies[-1], "a paddle that is not on the last link"
