@@ -47,7 +47,9 @@ def make_recording_evaluator(
             recording = record(env, recording, states, statistics.running, step)
             return states, accumulate(env, statistics, states, step), recording, step + 1
 
-        recording = empty_recording(env.config.episode_steps, min(recorded, episodes))
+        recording = empty_recording(
+            env.config.episode_steps, env.action_size, min(recorded, episodes)
+        )
         carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
         _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
         return statistics, recording

@@ -14,7 +14,6 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 
-JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
 
@@ -39,13 +38,14 @@ class Addresses(NamedTuple):
     """Indices of the named parts in the arrays of the model."""
 
     arm_joints: tuple[int, ...]
-    """Ids of Joint1..Joint6."""
+    """Ids of the acting joints, the joints with an actuator, in the model's order: the base comes
+    first."""
     arm_qpos: tuple[int, ...]
-    """Joint angles in qpos."""
+    """Positions of the acting joints in qpos."""
     arm_qvel: tuple[int, ...]
-    """Joint velocities in qvel."""
+    """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Servos of Joint1..Joint6 in ctrl."""
+    """Servos of the acting joints in ctrl."""
     ball_body: int
     ball_geom: int
     ball_qpos: tuple[int, ...]
@@ -109,7 +109,7 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
         mujoco.mjtDyn.mjDYN_FILTER,
         mujoco.mjtDyn.mjDYN_FILTEREXACT,
     )
-    for name, actuator in zip(JOINT_NAMES, addresses.actuators, strict=True):
+    for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
         is_position_servo = (
             mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
             and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -118,6 +118,7 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
             and mj_model.actuator_biasprm[actuator, 1] < 0.0
         )
         if not is_position_servo:
+            name = joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is no position servo; drive it by "
                 f'<position joint="{name}"/>'
@@ -130,7 +131,6 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
-    joints = tuple(_find(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in JOINT_NAMES)
     ball_body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, BALL_BODY_NAME)
     paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
 
@@ -139,31 +139,49 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
         raise UserError(f"no free joint on the body {BALL_BODY_NAME}; add <freejoint/> to it")
     if mj_model.body_geomnum[ball_body] < 1:
         raise UserError(f"no geom on the body {BALL_BODY_NAME}; add the ball's sphere to it")
-    actuators = []
-    for joint, name in zip(joints, JOINT_NAMES, strict=True):
-        driving = [
-            i
-            for i in range(len(mj_model.actuator_trntype))
-            if mj_model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-            and mj_model.actuator_trnid[i, 0] == joint
-        ]
-        if len(driving) != 1:
-            raise UserError(
-                f"{len(driving)} actuators on {name}; give it exactly one position servo"
-            )
-        actuators.append(driving[0])
+    servos = _servos(mj_model)
+    joints = tuple(servos)
     ball_qpos, ball_qvel = mj_model.jnt_qposadr[ball_joint], mj_model.jnt_dofadr[ball_joint]
     return Addresses(
         arm_joints=joints,
         arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
         arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
-        actuators=tuple(actuators),
+        actuators=tuple(servos.values()),
         ball_body=ball_body,
         ball_geom=_ball_geom(mj_model, ball_body),
         ball_qpos=tuple(range(ball_qpos, ball_qpos + 7)),
         ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
         paddle_geom=paddle_geom,
     )
+
+
+def joint_name(mj_model: mujoco.MjModel, joint: int) -> str:
+    """Name of a joint; an unnamed joint has its index for a name."""
+    return mj_model.joint(joint).name or f"joint{joint}"
+
+
+def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the acting joints."""
+    return tuple(joint_name(mj_model, j) for j in find_addresses(mj_model).arm_joints)
+
+
+def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
+    """The actuator of each hinge and slide that has one, in the order of the joints."""
+    acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    servos: dict[int, int] = {}
+    for actuator in range(mj_model.nu):
+        joint = int(mj_model.actuator_trnid[actuator, 0])
+        if mj_model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        if int(mj_model.jnt_type[joint]) not in acting:
+            continue
+        if joint in servos:
+            name = joint_name(mj_model, joint)
+            raise UserError(f"several actuators on {name}; give it exactly one position servo")
+        servos[joint] = actuator
+    if not servos:
+        raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
+    return dict(sorted(servos.items()))
 
 
 def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> jax.Array | None:
@@ -228,6 +246,6 @@ def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     index = mujoco.mj_name2id(mj_model, kind, name)
     if index < 0:
         noun = kind.name.removeprefix("mjOBJ_").lower()
-        needed = ", ".join((*JOINT_NAMES, BALL_BODY_NAME, PADDLE_GEOM_NAME))
+        needed = f"{BALL_BODY_NAME} and {PADDLE_GEOM_NAME}"
         raise UserError(f"no {noun} named {name}; the task needs the names {needed}")
     return index

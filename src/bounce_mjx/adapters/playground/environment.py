@@ -73,7 +73,7 @@ class PlaygroundBounceBall(MjxEnv):
         return _to_playground(self.task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [6]."""
+        """Advances one control step under the action [n]."""
         return _to_playground(self.task.step(_from_playground(state), action))
 
     @property
