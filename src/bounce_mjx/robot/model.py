@@ -1,7 +1,6 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,9 +12,15 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-
-BALL_BODY_NAME = "ball_link"
-PADDLE_GEOM_NAME = "blocker"
+from bounce_mjx.robot.arm import (
+    BALL_BODY_NAME,
+    PADDLE_GEOM_NAME,
+    build_arm,
+    compile_spec,
+    locate,
+    read_spec,
+)
+from bounce_mjx.robot.config import RobotConfig
 
 # Fields that MuJoCo's compiler can compute from others.
 _DERIVED_FIELDS = frozenset(
@@ -55,34 +60,57 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
+def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
+    """Spec of the whole scene, and the path of its MJCF file.
+
+    Args:
+      mjcf: the file, as for `locate`; None for the project's own robot.
+      robot: the adoption of an arm; without a site, the file is the whole scene.
+
+    Raises:
+      UserError: the file is missing, is no MJCF, or holds no arm that can do the task.
+    """
+    path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf)
+    if robot.site is None:
+        return read_spec(path), path
+    try:
+        return build_arm(path, robot).spec, path
+    except UserError as error:
+        raise named(path, error) from error
+
+
+def named(path: Path, error: UserError) -> UserError:
+    """The error with the file's name, if it is missing."""
+    return error if str(path) in str(error) else UserError(f"the MJCF file {path} has {error}")
+
+
+def load_model(
+    mjcf: Path | None,
+    physics_dt: float,
+    visual: bool = True,
+    robot: RobotConfig | None = None,
+) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
-      mjcf: the file; None for the project's own robot.
+      mjcf: the file, as for `locate`; None for the project's own robot.
       physics_dt: physics time step, s.
       visual: False drops the textures and geoms that only pictures need; they take most of a
         model's memory.
+      robot: the adoption of an arm; None for an MJCF file that is a whole scene.
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
         without a position servo, or has a number that cannot be simulated.
     """
-    path = mjcf or resource_path("mjcf/bounce_ball.xml")
-    if not os.path.isfile(path):
-        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
-        mj_model = spec.compile()
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
+    spec, path = scene_spec(mjcf, robot or RobotConfig())
+    spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+    mj_model = compile_spec(spec, path)
     try:
         _check_numbers(mj_model)
         _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
-        raise UserError(f"the MJCF file {path} has {error}") from error
+        raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
     return mj_model
 
