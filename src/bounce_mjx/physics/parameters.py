@@ -52,9 +52,9 @@ class PhysicsParameters(NamedTuple):
     """Masses [n] of the links, kg; first moment and inertia scale in proportion, the centre of mass
     stays in place."""
     paddle_position: Array | None = None
-    """Centre [3] of the paddle in the frame of the last link, m."""
+    """Centre [3] of the paddle in the frame of its body, m."""
     paddle_rotation: Array | None = None
-    """Orientation [4] of the paddle in the frame of the last link: a unit quaternion w, x, y, z."""
+    """Orientation [4] of the paddle in the frame of its body: a unit quaternion w, x, y, z."""
     gravity: Array | None = None
     """Gravitational acceleration [3] in the world, m/s^2."""
 
@@ -110,11 +110,7 @@ def edited_fields(
     link's share of the softness, a thousandth of the sum, keeps its value of the unedited model.
     """
     m, addresses, p = mj_model, find_addresses(mj_model), parameters
-    links, dofs, servos = (
-        m.jnt_bodyid[addresses.arm_joints,],
-        np.array(addresses.arm_qvel),
-        np.array(addresses.actuators),
-    )
+    dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
     ball, ball_geom, paddle = addresses.ball_body, addresses.ball_geom, addresses.paddle_geom
     fields: dict[str, Array] = {}
 
@@ -167,9 +163,15 @@ def edited_fields(
     if p.frictionloss is not None:
         put("dof_frictionloss", dofs, p.frictionloss)
     if p.link_mass is not None:
-        ratio = p.link_mass / m.body_mass[links]
-        put("body_mass", links, p.link_mass)
-        put("body_inertia", links, current("body_inertia")[links] * ratio[:, None])
+        links = link_bodies(m)
+        bodies = np.concatenate(links)
+        joints = np.repeat(np.arange(len(links)), [len(link) for link in links])
+        moved = m.body_mass[bodies] > 0.0
+        bodies, joints = bodies[moved], joints[moved]
+        mass, old_mass = p.link_mass[joints], link_masses(m)[joints]
+        ratio = (mass / old_mass)[:, None]
+        put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
+        put("body_inertia", bodies, current("body_inertia")[bodies] * ratio)
     if p.ball_mass is not None or p.link_mass is not None:
         fields["body_subtreemass"] = _subtree_masses(m, current("body_mass"))
     if p.paddle_position is not None:
@@ -195,6 +197,19 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     _assign(model, fields)
     _assign(model.opt, options)
     return model
+
+
+def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
+    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. Where a body
+    has several joints, it is the link of the last one, and the others have no bodies."""
+    m = mj_model
+    last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
+    return tuple(np.flatnonzero(last_joint == j) for j in find_addresses(m).arm_joints)
+
+
+def link_masses(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Masses [n] of the acting joints' links, kg."""
+    return np.array([np.sum(mj_model.body_mass[bodies]) for bodies in link_bodies(mj_model)])
 
 
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
-from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
+from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
 from bounce_mjx.robot.model import find_addresses
 
 Range = tuple[Finite, Finite]
@@ -233,7 +233,6 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     """Parameters of the physics for a drawn world."""
     m, addresses = mj_model, find_addresses(mj_model)
     servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
-    links = m.jnt_bodyid[list(addresses.arm_joints)]
     paddle = addresses.paddle_geom
     given = {}
     if "restitution" in world:
@@ -245,7 +244,7 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         "servo_gain": ("servo_gain", m.actuator_gainprm[servos, 0]),
         "servo_damping": ("servo_damping", -m.actuator_biasprm[servos, 2]),
         "armature": ("armature", m.dof_armature[dofs]),
-        "link_mass": ("link_mass", m.body_mass[links]),
+        "link_mass": ("link_mass", link_masses(m)),
     }
     for term, (parameter, model_value) in scaled.items():
         if term in world:

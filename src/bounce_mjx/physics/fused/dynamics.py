@@ -227,15 +227,12 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
 def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
     """Force of MuJoCo's affine actuator at its joint (N m, N) for the servo target, and the force's
     derivative with respect to the velocity; the derivative is 0 at the force limit."""
-    damping = servo.damping
-    if servo.gain_damping:
-        # MuJoCo's derivative takes the control before `ctrlrange` clips it.
-        damping = damping + servo.gain_damping * target
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    gain = servo.gain
+    gain, damping = servo.gain, servo.damping
     if servo.gain_stiffness or servo.gain_damping:
         gain = gain + servo.gain_stiffness * q + servo.gain_damping * v
+        damping = damping + servo.gain_damping * target
     force = gain * target + servo.stiffness * q + servo.damping * v + servo.bias
     if servo.force_range is None:
         return force, damping
