@@ -17,6 +17,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
@@ -120,7 +121,14 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     """
     arm = read_spec(path)
     model = compile_spec(arm, path)
-    return _Builder(arm, model, config).build()
+    check_numbers(model)
+    try:
+        return _Builder(arm, model, config).build()
+    except (ValueError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"the arm of {path} cannot be put into the task's scene ({reason}); simplify the MJCF"
+        ) from error
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -299,9 +307,9 @@ class _Builder:
                 beside.append(_name(model, joint))
         if beside:
             raise UserError(
-                f"{len(beside)} driven joints beside the arm ({_listed(beside)}), which is "
-                f"{_listed(_name(model, j) for j in joints)}; give an MJCF with one arm on "
-                "the floor"
+                f"{len(beside)} driven joints ({_listed(beside)}) beside the arm "
+                f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
+                "arm on a fixed base"
             )
         return sorted(set(gripper))
 

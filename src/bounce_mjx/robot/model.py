@@ -21,22 +21,7 @@ from bounce_mjx.robot.arm import (
     read_spec,
 )
 from bounce_mjx.robot.config import RobotConfig
-
-# Fields that MuJoCo's compiler can compute from others.
-_DERIVED_FIELDS = frozenset(
-    (
-        "actuator_acc0",
-        "actuator_length0",
-        "body_inertia",
-        "body_invweight0",
-        "body_subtreemass",
-        "dof_M0",
-        "dof_invweight0",
-        "dof_length",
-        "geom_aabb",
-        "geom_rbound",
-    )
-)
+from bounce_mjx.robot.numbers import check_numbers, physical_fields
 
 
 class Addresses(NamedTuple):
@@ -107,27 +92,12 @@ def load_model(
     spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
     mj_model = compile_spec(spec, path)
     try:
-        _check_numbers(mj_model)
+        check_numbers(mj_model)
         _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
         raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
     return mj_model
-
-
-def _check_numbers(mj_model: mujoco.MjModel) -> None:
-    """Refuses a time step that is not positive, and numbers that are not finite."""
-    step = mj_model.opt.timestep
-    if not 0.0 < step < np.inf:
-        raise UserError(f"the timestep {step}; give a positive number of seconds")
-    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
-    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
-    # Derived fields come last: the message must name a number that is in the file.
-    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
-        values = np.asarray(getattr(owner, name))
-        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
-            value = values[~np.isfinite(values)][0]
-            raise UserError(f"the number {value} in {name}; give finite numbers")
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -232,7 +202,7 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
     """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
     for owner, names in (
-        (mj_model, _physical_fields(mj_model)),
+        (mj_model, physical_fields(mj_model)),
         (mj_model.opt, [name for name in dir(mj_model.opt) if not name.startswith("_")]),
     ):
         for name in names:
@@ -251,12 +221,6 @@ def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
             "env.mj_model was edited after the environment had been built, and the physics would "
             "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
         )
-
-
-def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
-    kinds = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
-    pictured = ("geom_rgba", "geom_matid", "geom_group")
-    return [name for name in dir(mj_model) if name.startswith(kinds) and name not in pictured]
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
