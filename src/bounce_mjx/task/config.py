@@ -7,7 +7,7 @@ from typing import Literal
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
-from bounce_mjx.task.observation import ObservationConfig
+from bounce_mjx.task.observation import EstimatorConfig, ObservationConfig
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig
 
@@ -59,6 +59,8 @@ class EnvConfig(StrictModel):
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
+    estimator: EstimatorConfig = EstimatorConfig()
+    """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
     reward: RewardConfig = RewardConfig()
