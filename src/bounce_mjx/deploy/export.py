@@ -4,6 +4,7 @@ Both have a separate input for each part of the observation. The runtime checks 
 of the inputs; a single vector would hide a wrong order.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.estimator import filter_constants, paddle_normal
 from bounce_mjx.task.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
@@ -88,7 +90,8 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
     env = config.env
     m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
-    chain, paddle = _chain(m)
+    chain, paddle, normal = _chain(m, env.default_joint_angles)
+    filtered = env.observation.is_filtered
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
     limited = m.actuator_forcelimited[servos]
@@ -97,7 +100,9 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         steps=steps,
         joint_names=joint_names(m),
         observation=_parts(env),
+        position=env.observation.position,
         velocity=env.observation.velocity,
+        estimator=filter_constants(env, m)._asdict() if filtered else None,
         control_dt=env.control_dt,
         action=_ACTION,
         action_scale=env.action_scale,
@@ -119,6 +124,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         bounce_max_distance=env.bounce_max_distance,
         chain=chain,
         paddle=paddle,
+        paddle_normal=normal,
     )
 
 
@@ -134,8 +140,11 @@ def _plain(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, float]]:
-    """Hinges from the world to the paddle, and the paddle's centre in the last hinge's frame."""
+def _chain(
+    m: mujoco.MjModel, default_joint_angles: Sequence[float]
+) -> tuple[tuple[Link, ...], tuple[float, ...], tuple[float, ...]]:
+    """Hinges from the world to the paddle, and in the last hinge's frame the paddle's centre and
+    the normal of the face that is the upper one at the default joint angles."""
     addresses = find_addresses(m)
     body = m.geom_bodyid[addresses.paddle_geom]
     bodies = [body]
@@ -164,7 +173,9 @@ def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, flo
                 )
             )
             position, quaternion = -anchor, np.array([1.0, 0.0, 0.0, 0.0])
-    return tuple(links), _plain(position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion))
+    centre = position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion)
+    normal = _rotated(paddle_normal(m, default_joint_angles), quaternion)
+    return tuple(links), _plain(centre), _plain(normal)
 
 
 def _rotated(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
