@@ -14,21 +14,26 @@ try:
     # brax imports MJX, which prints a line for each optional part that is not installed.
     with contextlib.redirect_stdout(io.StringIO()):
         import brax.envs
-        from brax.training import networks
 except ImportError as error:
     raise UserError(
         f"brax cannot be imported ({error}); install it with pip install 'bounce_mjx[brax]'"
     ) from error
 
+from bounce_mjx.adapters.brax.checkpoints import load_policy
 from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
 from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
+from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
 from bounce_mjx.task.env import BounceBall
 
-__all__ = ["ENV_NAME", "BraxBounceBall", "device_put_replicated"]
+__all__ = [
+    "ENV_NAME",
+    "BraxBounceBall",
+    "device_put_replicated",
+    "load_policy",
+    "network_settings",
+    "ppo_settings",
+]
 
 # BounceBall has the interface of brax's Env; this lets it pass brax's isinstance checks.
 brax.envs.Env.register(BounceBall)
 brax.envs.register_environment(ENV_NAME, BraxBounceBall)
-
-# brax 0.14.2 saves the lack of an initialiser in a checkpoint, but its `load_policy` cannot read it.
-networks.KERNEL_INITIALIZER.setdefault(None, None)

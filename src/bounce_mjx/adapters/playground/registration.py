@@ -7,14 +7,13 @@ from mujoco_playground import manipulation, registry
 from mujoco_playground.config import manipulation_params
 
 from bounce_mjx.adapters import randomization
+from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
 from bounce_mjx.adapters.playground.environment import (
     ENV_NAME,
     PlaygroundBounceBall,
     default_config,
 )
-from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.runs.config import load_config
 
 
 def register() -> None:
@@ -53,41 +52,12 @@ def domain_randomize(model: Any, rng: Any) -> tuple[Any, Any]:
 
 
 def brax_ppo_config() -> config_dict.ConfigDict:
-    """brax's PPO parameters, from the project's tuned settings for an accelerator
-    (`configs/default.yaml`)."""
-    config = load_config(resource_path("configs/default.yaml"))
-    ppo = config.ppo
+    """brax's PPO parameters, from the project's tuned settings (`adapters/brax/ppo.py`)."""
     return config_dict.create(
-        num_timesteps=config.total_steps,
         num_evals=10,
-        num_resets_per_eval=1,
-        episode_length=config.env.episode_steps,
-        action_repeat=1,
-        normalize_observations=True,
-        num_envs=ppo.num_envs,
         num_eval_envs=128,
-        unroll_length=ppo.rollout_length,
-        batch_size=ppo.num_envs // ppo.num_minibatches,
-        num_minibatches=ppo.num_minibatches,
-        num_updates_per_batch=ppo.num_epochs,
-        learning_rate=ppo.learning_rate,
-        learning_rate_schedule="ADAPTIVE_KL",
-        learning_rate_schedule_min_lr=ppo.min_learning_rate,
-        learning_rate_schedule_max_lr=ppo.max_learning_rate,
-        desired_kl=ppo.target_kl,
-        discounting=ppo.discount,
-        gae_lambda=ppo.gae_lambda,
-        clipping_epsilon=ppo.clip_epsilon,
-        entropy_cost=ppo.entropy_cost,
-        max_grad_norm=ppo.max_grad_norm,
-        reward_scaling=ppo.reward_scale,
         network_factory=config_dict.create(
-            policy_hidden_layer_sizes=ppo.hidden_layers,
-            value_hidden_layer_sizes=ppo.hidden_layers,
-            policy_obs_key="state",
-            value_obs_key="state",
-            distribution_type="normal",
-            noise_std_type="log",
-            init_noise_std=ppo.init_noise_std,
+            policy_obs_key="state", value_obs_key="state", **network_settings()
         ),
+        **ppo_settings(),
     )
