@@ -11,6 +11,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, 
 from bounce_mjx.config.validation import validate
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import is_packaged
 from bounce_mjx.runs.robot import check_robot
 from bounce_mjx.task.config import EnvConfig
 
@@ -112,6 +113,6 @@ def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
     """A config's values with an absolute path of the MJCF file."""
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
-    if not isinstance(mjcf, str) or mjcf.startswith("~"):
+    if not isinstance(mjcf, str) or mjcf.startswith("~") or is_packaged(Path(mjcf)):
         return values
     return values | {"env": env | {"mjcf": str(folder / mjcf)}}
