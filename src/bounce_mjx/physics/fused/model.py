@@ -264,11 +264,11 @@ def _read_links(
     the frame of the world. Welded bodies belong to the link of the last joint above them."""
     m = mj_model
     links: list[chain.Link] = []
-    frames = {0: Frame()}
+    frames, link_of = {0: Frame()}, {0: -1}
     for body in range(1, m.nbody):  # parents come before their children
         if m.body_weldid[body] == addresses.ball_body:
             continue
-        parent = frames[int(m.body_parentid[body])]
+        parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
         origin = vadd(parent.origin, matvec(parent.rotation, _floats(m.body_pos[body])))
         rotation = _exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
         frame = Frame(origin, rotation)
@@ -276,11 +276,12 @@ def _read_links(
             slides = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
             anchor = ZERO3 if slides else _floats(m.jnt_pos[joint])
             origin = vadd(frame.origin, matvec(frame.rotation, anchor))
+            link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
             frame = Frame(scale(anchor, -1.0))
         frames[body] = frame
-        if m.body_weldid[body] != 0:
-            links[-1] = _with_body(m, links[-1], body, frame)
+        if link_of[body] >= 0:
+            links[link_of[body]] = _with_body(m, links[link_of[body]], body, frame)
     return links, frames
 
 
