@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import Ranges
 from bounce_mjx.task.state import State
@@ -37,19 +37,21 @@ def make_recording_evaluator(
         states = reset_episodes(env, key, episodes, ranges)
 
         def unfinished(carry):
-            _, statistics, _, step = carry
+            _, _, statistics, _, step = carry
             return jnp.any(statistics.running) & (step < env.config.episode_steps)
 
         def advance(carry):
-            states, statistics, recording, step = carry
-            actions = act(networks, policy, states.obs.T)
+            states, memory, statistics, recording, step = carry
+            actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
             states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
             recording = record(env, recording, states, statistics.running, step)
-            return states, accumulate(env, statistics, states, step), recording, step + 1
+            statistics = accumulate(env, statistics, states, step)
+            return states, memory, statistics, recording, step + 1
 
         recording = empty_recording(env.config.episode_steps, min(recorded, episodes))
-        carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
-        _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
+        memory = networks.policy_network.start_memory((episodes,))
+        carry = (states, memory, empty_statistics(episodes), recording, jnp.int32(0))
+        _, _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
         return statistics, recording
 
     return jax.jit(evaluate)
