@@ -22,7 +22,6 @@ from bounce_mjx.learning.policy import (
     respond_in_sequence,
 )
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import find_checkpoint, save_config
 from bounce_mjx.runs.writing import CheckpointWriter
@@ -180,8 +179,8 @@ def test_exported_memory_is_that_of_jax(tmp_path: Path) -> None:
         env={"observation": observation},
         ppo={"network": "gru", "gru_size": 12, "hidden_layers": (10,)},
     )
-    size = config.env.observation.layout.size
-    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints)
     params = networks.policy_network.init(jax.random.PRNGKey(1))
     params["params"]["Dense_0"]["kernel"] *= 50.0
     weights = Policy(init_normalizer(size), params)

@@ -17,13 +17,13 @@ from bounce_mjx.deploy.metadata import FORMAT, Link, Metadata, Part
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, act_with_memory, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses, load_model
+from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.estimator import filter_constants, paddle_normal
-from bounce_mjx.task.observation import QUANTITIES
+from bounce_mjx.task.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
@@ -41,7 +41,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping and metadata.
 
     The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
-    action); the output is `action`, float32 [N, 6]. A gru also has the input `memory` and the
+    action); the output is `action`, float32 [N, n]. A gru also has the input `memory` and the
     output `next_memory`, float32 [N, H]; at the start of an episode the memory is zero.
 
     Raises:
@@ -58,7 +58,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 def export_jax(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
 
-    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, 6] for any N; `inputs` is
+    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, n] for any N; `inputs` is
     a dict with the names and shapes of `export_onnx`. For a gru it gives the actions and the next
     memory.
 
@@ -68,7 +68,7 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     parts = _parts(config.env)
-    networks = make_networks(config.ppo, config.env.observation.layout.size, len(JOINT_NAMES))
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
 
     memory_size = _memory_size(config)
 
@@ -93,10 +93,11 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, or its arm is not a chain of hinges Joint1..Joint6.
+      UserError: the MJCF file is missing, or its paddle hangs on a joint that is no hinge
+        with a servo.
     """
     env = config.env
-    m = load_model(env.mjcf, env.physics_dt, visual=False)
+    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
     chain, paddle, normal = _chain(m, env.default_joint_angles)
     filtered = env.observation.is_filtered
@@ -106,7 +107,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
     return Metadata(
         format=FORMAT,
         steps=steps,
-        joint_names=JOINT_NAMES,
+        joint_names=joint_names(m),
         observation=_parts(env),
         position=env.observation.position,
         velocity=env.observation.velocity,
@@ -145,7 +146,7 @@ def _memory_size(config: TrainConfig) -> int:
 def _parts(env: EnvConfig) -> tuple[Part, ...]:
     return tuple(
         Part(_INPUT_NAMES.get(q.name, q.name), history, q.size, q.unit)
-        for q in QUANTITIES
+        for q in parts(env.num_joints)
         if (history := getattr(env.observation, q.name))
     )
 
@@ -173,9 +174,8 @@ def _chain(
             is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
             if joint not in addresses.arm_joints or not is_hinge:
                 raise UserError(
-                    f"the paddle hangs on the joint {m.joint(joint).name!r}, and a policy can be "
-                    f"exported for hinges {JOINT_NAMES[0]} to {JOINT_NAMES[-1]} only; remove the "
-                    "joint from the MJCF"
+                    f"the paddle hangs on the joint {joint_name(m, joint)!r}, and a policy can be "
+                    "exported for hinges with servos only; remove the joint from the MJCF"
                 )
             anchor = m.jnt_pos[joint]
             links.append(

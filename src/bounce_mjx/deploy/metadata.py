@@ -48,7 +48,7 @@ class Metadata(NamedTuple):
     steps: int
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
-    """Order of the joints in every array of J = 6 joints."""
+    """Order of the joints in every array of J joints."""
     observation: tuple[Part, ...]
     """The inputs of the network, each [N, history, size]."""
     position: str

@@ -17,10 +17,10 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import (
-    JOINT_NAMES,
     check_unedited,
     find_addresses,
     fingerprint,
+    joint_names,
     load_model,
     resting_activations,
 )
@@ -49,7 +49,7 @@ class TaskState(NamedTuple):
     target_height: jax.Array
     """Target height of the bounces [], m."""
     last_action: jax.Array
-    """Clipped action of the last step [6]."""
+    """Clipped action of the last step [n]."""
     rising: jax.Array
     """Whether the ball moved upward after the last step [], bool."""
     n_bounces: jax.Array
@@ -110,17 +110,29 @@ class BounceBall:
           UserError: the MJCF file or the engine does not fit the task.
         """
         self.config = config or EnvConfig()
-        self.mj_model: mujoco.MjModel = load_model(self.config.mjcf, self.config.physics_dt)
+        self.mj_model: mujoco.MjModel = load_model(
+            self.config.mjcf, self.config.physics_dt, robot=self.config.robot
+        )
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
+        self._check_joints()
         self._randomize = randomize
-        self.layout = self.config.observation.layout
+        self.layout = self.config.layout
         self._fingerprint = fingerprint(self.mj_model)
         self._estimator = (
             Estimator(self.config, self.mj_model, self.engine)
             if self.config.observation.is_filtered
             else None
         )
+
+    def _check_joints(self) -> None:
+        given, acting = self.config.num_joints, joint_names(self.mj_model)
+        if given != len(acting):
+            model = f"the MJCF file {self.config.mjcf}" if self.config.mjcf else "the model"
+            raise UserError(
+                f"default_joint_angles has {given} numbers, but {model} has {len(acting)} joints "
+                f"with an actuator ({', '.join(acting)}); give one number for each"
+            )
 
     @property
     def dt(self) -> float:
@@ -135,7 +147,7 @@ class BounceBall:
     @property
     def action_size(self) -> int:
         """Length of the action vector."""
-        return len(JOINT_NAMES)
+        return self.config.num_joints
 
     @property
     def backend(self) -> str:
@@ -187,7 +199,7 @@ class BounceBall:
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
             share = config.randomization.share if share is None else share
-            world = draw_world(ranges, world_rng, jnp.result_type(float), share)
+            world = draw_world(ranges, world_rng, jnp.result_type(float), self.action_size, share)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
@@ -195,9 +207,10 @@ class BounceBall:
             parameters = PhysicsParameters(
                 *(b if a is None else a for a, b in zip(given, parameters, strict=True))
             )
+        n = self.action_size
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
-        draws = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
+        draws = jax.random.uniform(rng, (2 * n + 4,), minval=-1.0, maxval=1.0)
         dtype = draws.dtype
         zero = jnp.zeros((), dtype)
         low, high = config.target_height_range
@@ -206,9 +219,11 @@ class BounceBall:
         qvel = [zero] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
             qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
-            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[6 + i]
+            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[n + i]
         for i, coordinate in enumerate(config.ball_init_pos):
-            qpos[addresses.ball_qpos[i]] = coordinate + config.ball_position_noise * draws[12 + i]
+            qpos[addresses.ball_qpos[i]] = (
+                coordinate + config.ball_position_noise * draws[2 * n + i]
+            )
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
             qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, dtype)
         for term, entries in (
@@ -222,7 +237,9 @@ class BounceBall:
         )
 
         task = TaskState(
-            target_height=world.get("target_height", low + (high - low) * 0.5 * (draws[15] + 1.0)),
+            target_height=world.get(
+                "target_height", low + (high - low) * 0.5 * (draws[2 * n + 3] + 1.0)
+            ),
             last_action=jnp.zeros(self.action_size, dtype),
             rising=jnp.zeros((), bool),
             n_bounces=zero,
@@ -250,7 +267,7 @@ class BounceBall:
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [6], clipped to [-1, 1]."""
+        """Advances one control step under the action [n], clipped to [-1, 1]."""
         check_unedited(self.mj_model, self._fingerprint)
         action = jnp.clip(action, -1.0, 1.0)
         state, control = self.begin_step(state, action)
@@ -261,13 +278,13 @@ class BounceBall:
         return self.finish_step(state, action, physics)
 
     def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
-        """The task's part of a step before the physics: the control of a clipped action [6]."""
+        """The task's part of a step before the physics: the control of a clipped action [n]."""
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
             return state, Control(self.servo_targets(before.physics, action))
         # The same noise as in the observation from which the policy chose the action.
-        error = sensing.joint_angle_noise(world, memory.counter, action.dtype)
+        error = sensing.joint_angle_noise(world, memory.counter, self.action_size, action.dtype)
         targets = self.servo_targets(before.physics, action, error)
         control, queue = actuation.delayed(
             world, memory.actuation, targets, config.control_dt, config.num_substeps
@@ -307,11 +324,11 @@ class BounceBall:
     def servo_targets(
         self, physics: PhysicsState, action: jax.Array, error: jax.Array | None = None
     ) -> jax.Array:
-        """Servo targets ctrl [nu] of a clipped action [6]: the measured joint angles plus the
+        """Servo targets ctrl [nu] of a clipped action [n]: the measured joint angles plus the
         scaled action (rad), clipped to the range of each joint that has one, times the gear.
 
         Args:
-          error: error of the measured angles [6], rad, without the offset of the encoders' zeros,
+          error: error of the measured angles [n], rad, without the offset of the encoders' zeros,
             which the servo shares.
         """
         model, addresses = self.mj_model, self._addresses
@@ -339,7 +356,7 @@ class BounceBall:
 
         Args:
           state: before the step.
-          action: clipped [6].
+          action: clipped [n].
           physics: after the step, from any engine.
         """
         config = self.config
@@ -574,7 +591,7 @@ def update_task(
 
     Args:
       ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
-      action: clipped action [6] of the step.
+      action: clipped action [n] of the step.
 
     Returns:
       The new task state, and whether this step is a bounce [] (bool).

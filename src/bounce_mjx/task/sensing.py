@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.task import noise
 from bounce_mjx.task.actuation import taken
-from bounce_mjx.task.observation import BOUNCE_QUANTITIES, QUANTITIES, Kinematics, ObservationConfig
+from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics, ObservationConfig, parts
 from bounce_mjx.task.randomization import RandomizationConfig, World
 
 SENSOR_TERMS = frozenset(
@@ -87,7 +87,7 @@ def start_sensing(
         flight_time=zero,
         seen={
             part.name: jnp.broadcast_to(values[part.name], (n, part.size))
-            for part in QUANTITIES
+            for part in parts(len(truth.joint_angles))
             if (n := getattr(observation, part.name))
         },
     )
@@ -100,11 +100,14 @@ def oldest_picture(randomization: RandomizationConfig) -> float:
     return latency if rate is None else latency + 1.0 / rate[0]
 
 
-def joint_angle_noise(world: World, counter: jax.Array, dtype: jnp.dtype) -> jax.Array | None:
-    """Noise [6] of the measured joint angles of a control step, rad; None if there is no noise."""
+def joint_angle_noise(
+    world: World, counter: jax.Array, num_joints: int, dtype: jnp.dtype
+) -> jax.Array | None:
+    """Noise [n] of the measured joint angles of a control step, rad; None if there is no noise."""
     if "joint_angle_noise" not in world:
         return None
-    return world["joint_angle_noise"] * noise.normal(counter, noise.Stream.JOINTS, (12,), dtype)[:6]
+    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)
+    return world["joint_angle_noise"] * noises[:num_joints]
 
 
 def take_picture(
@@ -189,14 +192,14 @@ def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> 
 def measured_joints(
     world: World, counter: jax.Array, truth: Kinematics
 ) -> tuple[jax.Array, jax.Array]:
-    """Measured joint angles [6] (rad) and joint velocities [6] (rad/s)."""
-    dtype = truth.joint_angles.dtype
-    angles, error = truth.joint_angles, joint_angle_noise(world, counter, dtype)
+    """Measured joint angles [n] (rad) and joint velocities [n] (rad/s)."""
+    dtype, num_joints = truth.joint_angles.dtype, len(truth.joint_angles)
+    angles, error = truth.joint_angles, joint_angle_noise(world, counter, num_joints, dtype)
     if error is not None:
         angles = angles + error
     if "encoder_bias" in world:
         angles = angles + world["encoder_bias"]
-    noises = noise.normal(counter, noise.Stream.JOINTS, (12,), dtype)[6:]
+    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)[num_joints:]
     return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, noises)
 
 

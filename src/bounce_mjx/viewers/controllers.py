@@ -14,8 +14,9 @@ from bounce_mjx.task.state import State
 class Controller(NamedTuple):
     """A controller of N environments."""
 
-    act: Callable[[State, jax.Array, Memory], tuple[jax.Array, Memory]]
-    """(states, batch last; key, which is consumed; memory) -> actions [6, N], memory."""
+    act: Callable[[Policy | None, State, jax.Array, Memory], tuple[jax.Array, Memory]]
+    """(policy if it is exchangeable; states, batch last; key, which is consumed; memory) ->
+    actions [n, N], memory."""
     start_memory: Callable[[tuple[int, ...]], Memory]
     """Shape of the batch -> memory at the start of an episode."""
 
@@ -34,8 +35,16 @@ _FALLING_WIDTH = 0.2
 
 def make_policy_controller(networks: Networks, policy: Policy) -> Controller:
     """The policy's most likely action."""
+    exchangeable = make_exchangeable_controller(networks)
+    return exchangeable._replace(act=lambda _, *args: exchangeable.act(policy, *args))
 
-    def control(states: State, key: jax.Array, memory: Memory) -> tuple[jax.Array, Memory]:
+
+def make_exchangeable_controller(networks: Networks) -> Controller:
+    """The most likely action of a policy that is an argument."""
+
+    def control(
+        policy: Policy, states: State, key: jax.Array, memory: Memory
+    ) -> tuple[jax.Array, Memory]:
         actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
         return actions.T, memory
 
@@ -89,6 +98,6 @@ def make_scripted_controller(env: BounceBall) -> Controller:
 
 def _without_memory(control: Callable[[State, jax.Array], jax.Array]) -> Controller:
     return Controller(
-        act=lambda states, key, memory: (control(states, key), memory),
+        act=lambda _, states, key, memory: (control(states, key), memory),
         start_memory=lambda batch: (),
     )
