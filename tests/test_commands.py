@@ -420,7 +420,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
     for result in report["results"]:
         value = result["value"]
         assert value is None or isinstance(value, float)
-        figure = "none" if value is None else f"{value:.2f}"
+        figure = "-" if value is None else f"{value:.2f}"
         assert f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown
 
@@ -481,6 +481,7 @@ def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
         "2026-01-04/checkpoints/latest",
     ):
         (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder.split("/")[0] / "config.yaml").touch()
     assert newest_run(tmp_path) == tmp_path / "2026-01-02"
     with pytest.raises(UserError, match="no run with a checkpoint"):
         newest_run(tmp_path / "2026-01-04")

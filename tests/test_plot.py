@@ -95,6 +95,16 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
 
 
+def test_two_runs_of_one_seed_are_two_runs(tmp_path: Path) -> None:
+    logs = {"episode/return": {1: 1.0}}
+    runs = [
+        write_run(tmp_path / name, TrainConfig(seed=seed), logs)
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    ]
+    assert [group.label for group in group_runs(runs[:2])] == ["2 runs of one seed"]
+    assert [group.label for group in group_runs(runs)] == ["3 runs of 2 seeds"]
+
+
 def test_a_label_names_few_settings(tmp_path: Path) -> None:
     many = {"num_envs": 64, "rollout_length": 16, "num_epochs": 2, "num_minibatches": 2}
     logs = {"episode/return": {1: 1.0}}
@@ -274,7 +284,7 @@ def check_report(run: Path) -> str:
 
 def as_shown(value: float | None) -> str:
     """A figure as the tables show it."""
-    return "none" if value is None else f"{value:.2f}"
+    return "-" if value is None else f"{value:.2f}"
 
 
 def test_training_leaves_a_report(trained: Path) -> None:
@@ -282,13 +292,13 @@ def test_training_leaves_a_report(trained: Path) -> None:
     page = check_report(trained)
     height = load_results(trained).best.results[2]
     assert (height.value, height.passed) == (None, False)
-    assert "none" in re.search(r"<td[^>]*>height</td>.*", page)[0]
-    assert "|apex error| none, " in page
+    assert ">-</td>" in re.search(r"<td[^>]*>height</td>.*", page)[0]
+    assert "|apex error| -, " in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
     assert not {"results/height", "results/mean_apex_error_m"} & set(log)
-    met = sum(r.passed is not False for r in load_results(trained).best.results)
+    met = sum(r.passed for r in load_results(trained).best.results)
     assert f"<h1>{met} of 5 results met</h1>" in page
 
 

@@ -20,7 +20,7 @@ from bounce_mjx.viewers.controllers import (
     make_scripted_controller,
     make_zero_controller,
 )
-from bounce_mjx.viewers.show import ViewerOptions, show
+from bounce_mjx.viewers.show import Shown, ViewerOptions, show
 
 _CONTROLLERS = {
     "random": make_random_controller,
@@ -53,11 +53,11 @@ def main(args: Sequence[str] | None = None) -> None:
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
         set_up_jax()
+        title = f"{command.actions} actions"
         show(
-            command.env,
-            _CONTROLLERS[command.actions],
+            [Shown(command.env, _CONTROLLERS[command.actions], title)],
             command.viewing,
-            title=f"{command.actions} actions",
+            title=title,
             target_height=None,
             console=Console(),
         )

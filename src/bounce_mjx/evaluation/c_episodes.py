@@ -29,11 +29,17 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 
 def make_mujoco_evaluator(
-    env: BounceBall, networks: Networks, episodes: int
+    env: BounceBall,
+    networks: Networks,
+    episodes: int,
+    progress: Callable[[float], None] | None = None,
 ) -> Callable[..., Statistics]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
+
+    Args:
+      progress: called every 100 control steps with the share of the time limit that is simulated.
     """
     num_threads = os.cpu_count() or 1
 
@@ -69,8 +75,12 @@ def make_mujoco_evaluator(
                 simulated = trajectory[:, -1]
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
-                if step % 100 == 99 and not np.any(statistics.running):
+                if step % 100 < 99:
+                    continue
+                if not np.any(statistics.running):
                     break
+                if progress is not None:
+                    progress((step + 1) / env.config.episode_steps)
         return statistics
 
     return evaluate

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
@@ -85,3 +86,40 @@ def reset_episodes(
     keys = jax.random.split(key, each)[index % each]
     ranges = jax.tree.map(lambda end: jnp.asarray(end)[index // each], ranges)
     return jax.vmap(env.reset, out_axes=-1)(keys, ranges)
+
+
+def make_reporting_evaluator(
+    env: BounceBall, networks: Networks, episodes: int, progress: Callable[[float], None]
+) -> Callable[[Policy, jax.Array], Statistics]:
+    """Like `make_evaluator`, but calls `progress` every second of simulated time with the share of
+    the time limit that is simulated."""
+
+    @jax.jit
+    def start(key: jax.Array):
+        return reset_episodes(env, key, episodes), empty_statistics(episodes), jnp.int32(0)
+
+    @jax.jit
+    def go_on(policy: Policy, carry, until: jax.Array):
+        def unfinished(carry):
+            _, statistics, step = carry
+            return jnp.any(statistics.running) & (step < until)
+
+        def advance(carry):
+            states, statistics, step = carry
+            actions = act(networks, policy, states.obs.T)
+            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
+            return states, accumulate(env, statistics, states, step), step + 1
+
+        return jax.lax.while_loop(unfinished, advance, carry)
+
+    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
+        carry, limit = start(key), env.config.episode_steps
+        second = max(1, round(1.0 / env.dt))
+        for done in range(0, limit, second):
+            carry = go_on(policy, carry, np.int32(min(done + second, limit)))
+            if not np.any(carry[1].running):
+                break
+            progress(min(1.0, (done + second) / limit))
+        return carry[1]
+
+    return evaluate

@@ -12,6 +12,9 @@ from bounce_mjx.task.state import State
 Controller = Callable[[State, jax.Array], jax.Array]
 """(states of N environments, batch last; key, which is consumed) -> actions [6, N]."""
 
+PolicyController = Callable[[Policy, State, jax.Array], jax.Array]
+"""(policy, states of N environments, batch last; key, which is consumed) -> actions."""
+
 # Gains of the scripted controller, found by a scan: it keeps 64 of 64 balls up for 10 s, with
 # a mean apex error of 8 cm.
 _LIFT = 0.03
@@ -27,6 +30,11 @@ _FALLING_WIDTH = 0.2
 def make_policy_controller(networks: Networks, policy: Policy) -> Controller:
     """The policy's most likely action."""
     return lambda states, key: act(networks, policy, states.obs.T).T
+
+
+def make_exchangeable_controller(networks: Networks) -> PolicyController:
+    """The most likely action of a policy that is an argument."""
+    return lambda policy, states, key: act(networks, policy, states.obs.T).T
 
 
 def make_random_controller(env: BounceBall) -> Controller:

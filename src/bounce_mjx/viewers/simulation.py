@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.randomization import TERMS, Ranges, World, physics_parameters
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.task.state import State
-from bounce_mjx.viewers.controllers import Controller
+from bounce_mjx.viewers.controllers import Controller, PolicyController
 
 
 class Frame(NamedTuple):
@@ -36,6 +37,9 @@ class Frame(NamedTuple):
     over: np.ndarray
     """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
     episode."""
+    lost: np.ndarray
+    """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
+    fast."""
 
 
 class Simulation:
@@ -44,24 +48,28 @@ class Simulation:
     def __init__(
         self,
         env: BounceBall,
-        controller: Controller,
+        controller: Controller | PolicyController,
         num_envs: int,
         seed: int,
         ranges: Ranges | None = None,
+        policy: Policy | None = None,
     ):
         """Compiles the programs, which takes seconds, and resets all environments.
 
         Args:
+          controller: with a policy, it takes the policy as its first argument.
           ranges: from which the resets draw the worlds, see `BounceBall.reset`.
+          policy: the first value of `policy`.
         """
         self.env = env
         self.num_envs = num_envs
-        self.target_height: float | None = None
-        """Target height of all environments, m; None for the height drawn at each reset."""
+        self.policy = policy
+        """The policy that acts; another one of the same shapes may replace it between two steps."""
+        self._target_height: float | None = None
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for the world drawn at each reset."""
-        self._controller = controller
+        self._control = controller if policy is not None else lambda _, *args: controller(*args)
         self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
         self._push = np.zeros(3, np.float32)
@@ -79,6 +87,22 @@ class Simulation:
                 lambda program: program.compile(), programs
             )
         self.reset()
+
+    @property
+    def target_height(self) -> float | None:
+        """Target height of all environments, m; None for the height drawn at each reset."""
+        return self._target_height
+
+    @target_height.setter
+    def target_height(self, height: float | None) -> None:
+        self._target_height = height
+        self.frame = self._with_target(self.frame)
+
+    def _with_target(self, frame: Frame) -> Frame:
+        """A frame that already shows the target height that the next step sets."""
+        if self._target_height is None:
+            return frame
+        return frame._replace(target_height=np.full_like(frame.target_height, self._target_height))
 
     def reset(self) -> Frame:
         """Starts a new episode in every environment; returns the first frame."""
@@ -105,7 +129,7 @@ class Simulation:
         return Frame(*(np.stack(values) for values in zip(*frames, strict=True)))
 
     def _target(self) -> np.float32:
-        return np.float32(np.nan if self.target_height is None else self.target_height)
+        return np.float32(np.nan if self._target_height is None else self._target_height)
 
     def _world(self) -> World:
         """The terms that have a nominal value; nan where the drawn ones stay."""
@@ -120,13 +144,13 @@ class Simulation:
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
         changes = self._target(), self._push, self._world()
-        return self._key, self._states, self._steps, *changes
+        return self.policy, self._key, self._states, self._steps, *changes
 
     def _reset(self, over: np.ndarray) -> Frame:
         """Starts a new episode in some environments [N]; the frame of all."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
-        return jax.device_get(frame)
+        return self._with_target(jax.device_get(frame))
 
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
@@ -139,14 +163,70 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, key, states, steps, target, push, world):
+    def _advance(self, policy, key, states, steps, target, push, world):
         key, action_key = jax.random.split(key)
         states = _influence(self.env, states, target, push, world)
-        actions = self._controller(states, action_key)
+        actions = self._control(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
         return key, after, steps, _view(self.env, after, steps, over)
+
+
+class SideBySide:
+    """Several simulations of one robot, shown as one; the environments of the first come first."""
+
+    def __init__(self, simulations: Sequence[Simulation]):
+        self._simulations = simulations
+        self.env = simulations[0].env
+        self.num_envs = sum(simulation.num_envs for simulation in simulations)
+
+    @property
+    def frame(self) -> Frame:
+        """The current frame of all environments."""
+        frames = [simulation.frame for simulation in self._simulations]
+        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+
+    @property
+    def target_height(self) -> float | None:
+        """See `Simulation.target_height`."""
+        return self._simulations[0].target_height
+
+    @target_height.setter
+    def target_height(self, height: float | None) -> None:
+        for simulation in self._simulations:
+            simulation.target_height = height
+
+    @property
+    def world(self) -> dict[str, Sequence[float]] | None:
+        """See `Simulation.world`."""
+        return self._simulations[0].world
+
+    @world.setter
+    def world(self, world: dict[str, Sequence[float]] | None) -> None:
+        for simulation in self._simulations:
+            simulation.world = world
+
+    def reset(self) -> Frame:
+        """See `Simulation.reset`."""
+        for simulation in self._simulations:
+            simulation.reset()
+        return self.frame
+
+    def push(self, velocity: tuple[float, float, float]) -> None:
+        """See `Simulation.push`."""
+        for simulation in self._simulations:
+            simulation.push(velocity)
+
+    def step(self) -> Frame:
+        """See `Simulation.step`."""
+        frames = [simulation.step() for simulation in self._simulations]
+        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+
+    def record(self, seconds: float) -> Frame:
+        """See `Simulation.record`."""
+        recordings = [simulation.record(seconds) for simulation in self._simulations]
+        return Frame(*(np.concatenate(values, axis=1) for values in zip(*recordings, strict=True)))
 
 
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
@@ -220,4 +300,5 @@ def _view(env: BounceBall, states: State, steps: jax.Array, over: jax.Array) -> 
         n_bounces=task.n_bounces,
         reward_terms=jnp.stack(terms, axis=-1),
         over=over,
+        lost=over & (states.done > 0),
     )
