@@ -45,11 +45,10 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
         )
         set_up_jax()
-        title = f"{command.actions} actions"
+        controller = _CONTROLLERS[command.actions]
         show(
-            [Shown(command.env, _CONTROLLERS[command.actions], title)],
+            [Shown(command.env, controller, f"{command.actions} actions")],
             command.viewing,
-            title=title,
             target_height=None,
             console=Console(),
         )
