@@ -185,6 +185,11 @@ BAD_MJCF = {
         "0 actuators on Joint2",
         "give it exactly one position servo",
     ),
+    "motor": (
+        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
+        "an actuator on Joint2 that is no position servo",
+        '<position joint="Joint2"/>',
+    ),
 }
 
 

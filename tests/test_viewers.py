@@ -28,9 +28,10 @@ from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, view
+from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.randomization import RandomizationConfig
@@ -57,6 +58,7 @@ from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
+from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
 
 GRAVITY = 9.81
@@ -389,9 +391,9 @@ class Client:
             props = message.get("props", {})
             if "label" in props:
                 self._controls[props["label"]] = message["uuid"]
-            if "content" in props:
-                self.texts.append(props["content"])
-            if "text" in (updates := message.get("updates", {})):
+            updates = message.get("updates", {})
+            self.texts += [part["content"] for part in (props, updates) if "content" in part]
+            if "text" in updates:
                 self._labels.append(updates["text"])
 
     def set(self, label: str, value: object, name: str = "value") -> None:
@@ -520,6 +522,7 @@ def test_keys_act_as_in_the_window(page) -> None:
     np.testing.assert_allclose(did["push"][-1], (0.0, 0.0, 0.2))
     client.press("pause")
     wait_until(lambda: len(did["target"]) == (time.sleep(0.3), len(did["target"]))[1])
+    client.press("pause")
 
 
 def test_a_lost_ball_is_announced(page, scripted: Simulation) -> None:
@@ -527,6 +530,53 @@ def test_a_lost_ball_is_announced(page, scripted: Simulation) -> None:
     client.control("robots")
     scripted.push((2.0, 0.0, 0.0))
     wait_until(lambda: any("BALL LOST" in text for text in client.labels()))
+
+
+def evaluated(*passed: bool | None) -> Report:
+    return Report(tuple(Result(f"r{i}", "%", 1.0, ">= 1", p) for i, p in enumerate(passed)), {})
+
+
+def test_results_are_shown_as_they_are_met() -> None:
+    """Each with the step since which it is met without a break."""
+    met_at: dict[str, int] = {}
+    for steps, *passed in (
+        (1_000_000, True, True, None),
+        (2_000_000, True, False, None),
+        (3_000_000, True, True, None),
+    ):
+        text = results_list(evaluated(*passed), steps, met_at)
+    assert met_at == {"r0": 1_000_000, "r1": 3_000_000}
+    assert "evaluation at 3,000,000 steps" in text and "2 of 2 judged results met" in text
+    assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
+
+
+def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, monkeypatch) -> None:
+    """The training only puts the news into a queue."""
+    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: scripted)
+    stop = threading.Event()
+
+    def step(simulation) -> None:
+        if stop.is_set():
+            raise RuntimeError("the\nend")
+
+    watch(monkeypatch, Simulation, "step", step)
+    printed = io.StringIO()
+    training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
+    wait_until(lambda: "watch: " in printed.getvalue())
+    client = Client(re.search(r"http://\S+", printed.getvalue())[0])
+    means = {"episode/return": 1.0, "episode/bounces": NAN, "speed/steps_per_second": 2e6}
+    training.block(500_000, means)
+    training.evaluation(500_000, evaluated(True, False), policy := ("newest",))
+    wait_until(lambda: scripted.policy == policy)
+    while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
+        client._receive()
+    assert any("1 of 2 results met" in text for text in client.texts)
+    # A page that fails leaves the training alone.
+    stop.set()
+    wait_until(
+        lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
+    )
+    training.wait()
 
 
 def test_a_title_is_not_markup(page) -> None:

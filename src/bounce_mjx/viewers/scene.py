@@ -26,11 +26,11 @@ _LOOK_AT = np.array([0.34, 0.0, 0.44])
 _VIEW = np.array([1.06, -1.17, 0.42])
 _FIELD_OF_VIEW = math.radians(40.0)
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
-_FULL_ASPECT = 0.8
-# On a page with fewer pixels across, viser's controls cover the lower part: the camera moves down
-# by this share of the picture's height.
+_FULL_ASPECT = 0.9
+# On a page with fewer pixels across, viser's controls cover the lower part: the camera looks down
+# by this share of its field of view.
 _PHONE_WIDTH = 576
-_PHONE_SHIFT = 0.31
+_PHONE_SHIFT = 0.27
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
 _FOLLOWING = 0.1
@@ -174,11 +174,12 @@ class Scene:
         name = "" if self._num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
+        short = self._num_envs > _MAX_LONG_LABELS
         if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
-            return f"{name}BALL LOST"
+            return f"{name}LOST" if short else f"{name}BALL LOST"
         count, height = frame.n_bounces[index], frame.target_height[index]
-        if self._num_envs > _MAX_LONG_LABELS:
-            return f"{name}{count:.0f} at {height:.2f} m"
+        if short:
+            return f"{name}{count:.0f}"
         return f"{name}bounces {count:.0f}   target {height:.2f} m"
 
     def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
@@ -220,12 +221,10 @@ def camera_pose(
       aspect: width / height of the picture.
       width: width of the picture in pixels.
     """
-    extent = 1.0 + 0.95 * np.linalg.norm(np.ptp(offsets, axis=0))
+    extent = 1.0 + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
-    height = 2.0 * np.linalg.norm(view) * math.tan(_FIELD_OF_VIEW / 2.0)
-    shift = _PHONE_SHIFT * height if width < _PHONE_WIDTH else 0.0
-    gaze = _LOOK_AT - (0.0, 0.0, shift)
-    return gaze + view, gaze
+    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if width < _PHONE_WIDTH else 0.0
+    return _LOOK_AT + view, _LOOK_AT - (0.0, 0.0, down * np.linalg.norm(view))
 
 
 def _grid(number: int) -> np.ndarray:
