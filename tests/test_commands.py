@@ -177,13 +177,12 @@ def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Pat
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 BAD_MJCF = {
     "text": ("hello", "does not compile", "correct it"),
-    "joint": (MJCF.replace('"Joint3"', '"Elbow"'), "no joint named Joint3", "needs the names"),
     "paddle": (MJCF.replace('"blocker"', '"bat"'), "no geom named blocker", "needs the names"),
     "ball": (MJCF.replace('"ball_link"', '"ball"'), "no body named ball_link", "needs the names"),
     "actuator": (
         re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', "", MJCF),
-        "0 actuators on Joint2",
-        "give it exactly one position servo",
+        "default_joint_angles has 6 numbers",
+        "5 joints with an actuator (Joint1, Joint3",
     ),
     "motor": (
         re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),

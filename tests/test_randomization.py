@@ -45,13 +45,13 @@ RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
 def test_draws_are_uniform_in_their_ranges() -> None:
     config = RandomizationConfig(**RANGES)
     keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"))
+    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6)
     worlds = jax.jit(jax.vmap(draw))(keys)
     assert tuple(worlds) == tuple(sorted(TERMS)) and set(config.terms) == set(TERMS)
     shares = []
     for name, values in worlds.items():
         low, high = RANGES[name]
-        assert values.shape == (2000, *TERMS[name].shape)
+        assert values.shape == (2000, *TERMS[name].shape(6))
         shares += list((np.asarray(values, float).reshape(2000, -1).T - low) / (high - low))
     shares = np.array(shares)
     assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
@@ -65,7 +65,9 @@ def test_draws_are_uniform_in_their_ranges() -> None:
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
     """JAX sorts the keys of a traced dictionary."""
     ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
-    draw = functools.partial(draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"))
+    draw = functools.partial(
+        draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"), num_joints=6
+    )
     expected = draw(ranges)
     for world in (jax.jit(draw)(ranges), draw(dict(reversed(ranges.items())))):
         assert world.keys() == expected.keys()

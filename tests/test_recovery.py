@@ -46,6 +46,7 @@ from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training.command import config_of
 from bounce_mjx.training.console import Reporter
+from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.signals import StopRequest
@@ -57,22 +58,22 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keeps compiled programs: in this process by config, and for other processes in a cache."""
     compile_training, compile_evaluator, kept = PPOTrainer.compile, Evaluators._compile, {}
 
-    def key(config: TrainConfig, *rest: object) -> str:
-        varied = {"total_steps": 0, "eval_every": 0, "log_dir": None, "screening_episodes": 0}
-        return repr((config.model_copy(update=varied), *rest))
+    def key(config: TrainConfig, **varied: object) -> str:
+        varied |= {"total_steps": 0, "eval_every": 0, "log_dir": None}
+        return repr(config.model_copy(update=varied))
 
     def compile_training_once(trainer: PPOTrainer, pool: concurrent.futures.Executor):
-        name = key(trainer._config)
+        name = key(trainer._config, screening_episodes=0)
         if name not in kept:
             compile_training(trainer, pool).result()
             kept[name] = trainer._run, trainer._init
         trainer._run, trainer._init = kept[name]
         return trainer._run
 
-    def compile_evaluator_once(evaluators: Evaluators, *args: int):
-        name = key(evaluators._config, *args)
+    def compile_evaluator_once(evaluators: Evaluators):
+        name = "evaluator", key(evaluators._config)
         if name not in kept:
-            kept[name] = compile_evaluator(evaluators, *args)
+            kept[name] = compile_evaluator(evaluators)
         return kept[name]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -486,6 +487,31 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
     fresh = mean_return(config.eval_seed + 2**31)
     assert results["details"]["mean_return"] == pytest.approx(fresh)
     assert fresh != pytest.approx(mean_return(config.eval_seed))
+
+
+def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
+    """The program of a screening of three episodes also runs a full evaluation of four, on the
+    resets that one program of four episodes uses."""
+    config = load_run_config(straight).model_copy(update={"screening_episodes": 3})
+    env, policy = BounceBall(config.env), load_policy(best_checkpoint(straight), config)
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        chunked, whole = (
+            Evaluators(each, env, make_mesh(1, config.ppo), pool)
+            for each in (config, config.model_copy(update={"screening_episodes": 0}))
+        )
+    (expected,) = whole.final(policy)
+    (report,) = chunked.final(policy)
+    assert report.details == pytest.approx(expected.details)
+    for ours, theirs in zip(report.recording, expected.recording, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+    (screening,) = chunked.select(policy)
+    _, key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed)))
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    evaluate = make_evaluator(env, networks, config.eval_episodes)
+    first_three = jax.tree.map(lambda x: x[:3], evaluate(policy, key))
+    assert screening.screening
+    assert screening.details == pytest.approx(judge(env, first_three).details)
 
 
 def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:

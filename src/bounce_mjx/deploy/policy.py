@@ -118,7 +118,8 @@ class DeployedPolicy:
                     for name, value in measured.items()
                     if name in self._measured
                 }
-                self._histories.add(measured | between if i < steps else measured, self._action)
+                last = i == steps
+                self._histories.add(measured if last else measured | between, self._action, last)
         self._measured, self._time = measured, time
         inputs = {
             name: values[None].astype(np.float32) for name, values in self._histories.values.items()
@@ -165,7 +166,6 @@ class DeployedPolicy:
 
     def _needs(self) -> tuple[str, ...]:
         seen = {part.name for part in self.metadata.observation}
-        differences = self.metadata.velocity == "differences"
         needs = {
             "joint_angles": {"joint_angles", "paddle_position"} | OF_BOUNCES,
             "joint_velocities": {"joint_velocities", "bounce_joint_velocities"},
@@ -174,8 +174,10 @@ class DeployedPolicy:
             "ball_age": {"ball_age"},
             "target_height": {"target_height", "apex_error"},
         }
-        if differences:
+        if self.metadata.velocity != "measured":
             needs["ball_position"] |= needs.pop("ball_velocity")
+        if self.metadata.estimator is not None:
+            needs["joint_angles"] |= needs["ball_position"]
         return tuple(name for name, users in needs.items() if users & seen)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
@@ -193,7 +195,7 @@ class DeployedPolicy:
         checked["ball_angular_velocity"] = np.zeros(3)
         for name, value in measurements.items():
             checked[name] = self._array(name, value)
-        if self.metadata.velocity == "differences":
+        if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
 

@@ -36,24 +36,36 @@ def make_recording_evaluator(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None
     ) -> tuple[Statistics, Recording]:
         states = reset_episodes(env, key, episodes, ranges)
-
-        def unfinished(carry):
-            _, statistics, _, step = carry
-            return jnp.any(statistics.running) & (step < env.config.episode_steps)
-
-        def advance(carry):
-            states, statistics, recording, step = carry
-            actions = act(networks, policy, states.obs.T)
-            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
-            recording = record(env, recording, states, statistics.running, step)
-            return states, accumulate(env, statistics, states, step), recording, step + 1
-
-        recording = empty_recording(env.config.episode_steps, min(recorded, episodes))
-        carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
-        _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
-        return statistics, recording
+        return run_episodes(env, networks, policy, states, recorded)
 
     return jax.jit(evaluate)
+
+
+def run_episodes(
+    env: BounceBall, networks: Networks, policy: Policy, states: State, recorded: int
+) -> tuple[Statistics, Recording]:
+    """Runs one deterministic episode from each of E initial states (batch last), until all have
+    ended or their time limit is reached.
+
+    Returns: The statistics of all episodes, and a recording of the first `recorded`.
+    """
+
+    def unfinished(carry):
+        _, statistics, _, step = carry
+        return jnp.any(statistics.running) & (step < env.config.episode_steps)
+
+    def advance(carry):
+        states, statistics, recording, step = carry
+        actions = act(networks, policy, states.obs.T)
+        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
+        recording = record(env, recording, states, statistics.running, step)
+        return states, accumulate(env, statistics, states, step), recording, step + 1
+
+    episodes = states.done.shape[-1]
+    recording = empty_recording(env.config.episode_steps, env.action_size, min(recorded, episodes))
+    carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
+    _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
+    return statistics, recording
 
 
 def reset_episodes(

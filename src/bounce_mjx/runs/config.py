@@ -62,20 +62,41 @@ def load_run_config(run: Path) -> TrainConfig:
     return config
 
 
-def load_config(path: Path) -> TrainConfig:
+def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
     MJCF file starts at the folder of the YAML file.
+
+    Args:
+      robot: config of a robot, whose keys win over those of the file.
 
     Raises:
       UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
-    return validate(TrainConfig, _with_mjcf_from(path.parent, values), str(path))
+    values = _with_mjcf_from(path.parent, values)
+    if robot is None:
+        return validate(TrainConfig, values, str(path))
+    own = read_mapping(robot, "robot's config file", "configs/robots/ur5e.yaml")
+    own = _with_mjcf_from(robot.parent, own)
+    validate(TrainConfig, own, str(robot))
+    return validate(TrainConfig, _merged(values, own), f"{path} with {robot}")
 
 
-def read_preset(path: Path | None) -> TrainConfig:
+def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    """Nested mappings in which the others' keys win."""
+    merged = dict(values)
+    for key, value in others.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged
+
+
+def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
     """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
     this machine.
+
+    Args:
+      robot: config of a robot, whose keys win over the preset's.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -84,7 +105,7 @@ def read_preset(path: Path | None) -> TrainConfig:
         path = Path("cpu" if jax.default_backend() == "cpu" else "default")
     named = resource_path(f"configs/{path.name}.yaml")
     is_name = str(path) == path.name and not os.path.exists(path)
-    return load_config(named if is_name and os.path.isfile(named) else path)
+    return load_config(named if is_name and os.path.isfile(named) else path, robot)
 
 
 def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:

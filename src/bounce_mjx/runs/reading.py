@@ -18,7 +18,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, read_json
 from bounce_mjx.runs.folders import Checkpoint
@@ -45,8 +44,8 @@ class Record(pydantic.BaseModel):
 
 def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
-    size = config.env.observation.layout.size
-    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints)
 
     def initial_policy() -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))

@@ -37,6 +37,9 @@ class TrainingCommand(TrainConfig):
     config: Path | None = None
     """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
     The default is default on an accelerator, and cpu on a CPU."""
+    robot: Path | None = None
+    """Config of a robot, such as configs/robots/ur5e.yaml or the file that bounce-mjx adopt wrote,
+    on top of the preset."""
     resume: Path | None = None
     """Folder of a run, or latest for the newest run, to continue in place from its latest
     checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
@@ -64,12 +67,14 @@ def read_command(
         stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
-    if config_path and resume:
-        raise UserError("--config and --resume exclude each other; a resumed run has its config")
+    robot = path_flag(args, "--robot")
+    for given, flag in ((config_path, "--config"), (robot, "--robot")):
+        if given and resume:
+            raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
     if resume:
         log_dir = path_flag(args, "--log-dir") or TrainConfig().log_dir
         resume = find_run(named_run(resume, log_dir))
-    base = load_run_config(resume) if resume else read_preset(config_path)
+    base = load_run_config(resume) if resume else read_preset(config_path, robot)
     start = base
     if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
         start = base.model_copy(update={"stop_when_solved": False})
@@ -78,7 +83,9 @@ def read_command(
         args,
         prog=prog,
         description=description,
-        default=command_class(**dict(start), config=config_path, resume=resume, **defaults),
+        default=command_class(
+            **dict(start), config=config_path, robot=robot, resume=resume, **defaults
+        ),
     )
     if resume:
         command = command.model_copy(update={"resume": resume})

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 
@@ -49,7 +49,7 @@ class Display:
 
 def _with_markers(config: EnvConfig) -> mujoco.MjModel:
     """The config's model, with the two marker sites added if it lacks them."""
-    spec = mujoco.MjSpec.from_file(str(config.mjcf or resource_path("mjcf/bounce_ball.xml")))
+    spec, _ = scene_spec(config.mjcf, config.robot)
     sites = {site.name for site in spec.sites}
     reward = config.reward
     if TARGET_SITE not in sites:

@@ -135,7 +135,7 @@ class Simulation:
         """The terms that have a nominal value; nan where the drawn ones stay."""
         values = {}
         for name in self.env.config.randomization.terms:
-            shape, nominal, _ = TERMS[name]
+            shape, nominal = TERMS[name].shape(self.env.action_size), TERMS[name].nominal
             if nominal is not None:
                 entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
                 values[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
