@@ -53,11 +53,10 @@ def main(args: Sequence[str] | None = None) -> None:
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
         set_up_jax()
-        title = f"{command.actions} actions"
+        controller = _CONTROLLERS[command.actions]
         show(
-            [Shown(command.env, _CONTROLLERS[command.actions], title)],
+            [Shown(command.env, controller, f"{command.actions} actions")],
             command.viewing,
-            title=title,
             target_height=None,
             console=Console(),
         )

@@ -75,7 +75,8 @@ def _with_markers(config: EnvConfig) -> mujoco.MjModel:
 def _add_outline(spec: mujoco.MjSpec) -> None:
     """Replaces the plate of the paddle's home by the four edges around it."""
     home = spec.site(HOME_SITE)
-    (x, y, z), rgba = home.size, home.rgba.copy()
+    (x, y, z), material = home.size, spec.material(home.material)
+    rgba = home.rgba.copy() if material is None else material.rgba.copy()
     home.rgba = [*rgba[:3], 0.0]
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, home.quat)

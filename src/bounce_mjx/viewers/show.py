@@ -1,6 +1,7 @@
 """The viewing options that `view` and `play` share, and the viewers that they start."""
 
 import contextlib
+import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -61,22 +62,21 @@ class Shown(NamedTuple):
 
     config: EnvConfig
     make_controller: Callable[[BounceBall], Controller]
-    name: str
-    """Name for the label where several are shown."""
+    title: str
 
 
 def show(
     shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    title: str,
     target_height: float | None,
     console: Console,
 ) -> None:
     """Shows or records environments under their controllers; Ctrl-C closes a viewer.
 
     Args:
-      shown: one, or several with the same robot side by side, on the page or in its recording.
+      shown: one, or several with the same robot side by side, on the page or in its recording. The
+        labels of several are A, B, ...
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
@@ -113,10 +113,13 @@ def show(
         port = free_port(options.host, options.port)
 
     on_page = not recorded and viewer == "browser"
-    names = None
+    title, names = shown[0].title, None
     if several:
         each = max(1, options.num_envs // len(shown))
-        names = [one.name for one in shown for _ in range(each)]
+        letters = string.ascii_uppercase[: len(shown)]
+        names = [letter for letter in letters for _ in range(each)]
+        titles = zip(letters, shown, strict=True)
+        title = ", ".join(f"{letter}: {one.title}" for letter, one in titles)
 
     def simulate(one: Shown) -> Simulation:
         config, num_envs = one.config, each if several else options.num_envs
