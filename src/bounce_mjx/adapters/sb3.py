@@ -7,7 +7,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from bounce_mjx.adapters.gymnasium.batch import ACTION_SPACE, Batch, observation_space
+from bounce_mjx.adapters.gymnasium.batch import Batch, action_space, observation_space
 from bounce_mjx.adapters.gymnasium.environments import (
     EpisodeStatistics,
     checked_height,
@@ -68,7 +68,9 @@ class Sb3VecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self.render_mode = render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
-        super().__init__(self._batch.num_envs, observation_space(self.task), ACTION_SPACE)
+        super().__init__(
+            self._batch.num_envs, observation_space(self.task), action_space(self.task)
+        )
         self.metadata["render_fps"] = round(1.0 / self.dt)
 
     @property
@@ -95,7 +97,7 @@ class Sb3VecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Takes the actions [B, 6] of the next `step_wait`."""
+        """Takes the actions [B, n] of the next `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:

@@ -19,13 +19,11 @@ from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.elementwise import in_one_kernel
-from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
-from bounce_mjx.training.setup import cache_compilations
+from bounce_mjx.training.setup import cache_compilations, set_up_cpu
 
-ACTION_SPACE = gymnasium.spaces.Box(-1.0, 1.0, (len(JOINT_NAMES),), np.float32)
 _NO_LIMIT = 2**31 - 1
 # The process in which a program has run. JAX's threads are lost when this process forks.
 _jax_process: int | None = None
@@ -38,6 +36,11 @@ class UnexpectedArgument(UserError, TypeError):
 
 class ResetNeeded(UserError, gymnasium.error.ResetNeeded):
     """A step or a picture before the first reset."""
+
+
+def action_space(task: BounceBall) -> gymnasium.spaces.Box:
+    """The space of the actions of one environment."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 
 def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
@@ -134,14 +137,14 @@ class Batch:
         """Advances every environment.
 
         Args:
-          actions: [B, 6], clipped to [-1, 1].
+          actions: [B, n], clipped to [-1, 1].
           reset_before: environments that start a new episode instead of a step [B], bool.
           reset_after: whether an ended episode is followed by a new one in the same step.
 
         Raises:
           UserError: the actions have another shape, or `restart` was never called.
         """
-        actions = checked_actions(actions, (self.num_envs, *ACTION_SPACE.shape))
+        actions = checked_actions(actions, (self.num_envs, self.task.action_size))
         self._check_started()
         self._check_process()
         if reset_before is None:
@@ -218,6 +221,7 @@ def _programs_for(config: EnvConfig, num_envs: int) -> _Programs:
 @functools.lru_cache(maxsize=32)
 def _programs(config: EnvConfig, num_envs: int, edited: int | None) -> _Programs:
     del edited
+    set_up_cpu()
     cache_compilations()
     task = BounceBall(config)
     return _Programs(

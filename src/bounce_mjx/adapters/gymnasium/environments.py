@@ -16,10 +16,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from bounce_mjx.adapters.gymnasium.batch import (
-    ACTION_SPACE,
     Batch,
     StepArrays,
     UnexpectedArgument,
+    action_space,
     checked_actions,
     observation_space,
 )
@@ -63,7 +63,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._batch = Batch(settings, 1, None)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
         self.render_mode = render_mode
-        self.action_space = ACTION_SPACE
+        self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
         self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
 
@@ -91,7 +91,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           options: {"target_height": h} sets the target height of this episode, m.
 
         Returns:
-          The first observation [29] and an empty info.
+          The first observation [N] and an empty info.
         """
         super().reset(seed=seed)
         options = checked_options(options, "target_height")
@@ -99,12 +99,12 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._batch.restart([seed], self.np_random, target_heights=target)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances one control step under the action [6].
+        """Advances one control step under the action [n].
 
         Returns:
-          Observation [29], reward, terminated, truncated, and the environment's metrics.
+          Observation [N], reward, terminated, truncated, and the environment's metrics.
         """
-        action = checked_actions(action, ACTION_SPACE.shape)
+        action = checked_actions(action, self.action_space.shape)
         result = self._batch.step(action[None])
         metrics = {name: float(value[0]) for name, value in result.metrics.items()}
         return (
@@ -168,9 +168,9 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         }
         self.num_envs = self._batch.num_envs
         self.render_mode = render_mode
-        self.single_action_space = ACTION_SPACE
+        self.single_action_space = action_space(self.task)
         self.single_observation_space = observation_space(self.task)
-        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
@@ -194,7 +194,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
             bool, chooses the environments.
 
         Returns:
-          The observations of all environments [B, 29] and an empty info.
+          The observations of all environments [B, N] and an empty info.
         """
         options = checked_options(options, "target_height", "reset_mask")
         target = checked_height(options.get("target_height"))
@@ -210,10 +210,10 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances every environment under the actions [B, 6].
+        """Advances every environment under the actions [B, n].
 
         Returns:
-          Observations [B, 29], rewards [B], terminated [B], truncated [B], and an info of the
+          Observations [B, N], rewards [B], terminated [B], truncated [B], and an info of the
           environments' metrics.
         """
         mode, before = self.autoreset_mode, self._ended

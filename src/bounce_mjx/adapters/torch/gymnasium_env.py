@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.batch import ACTION_SPACE, observation_space
+from bounce_mjx.adapters.gymnasium.batch import action_space, observation_space
 from bounce_mjx.adapters.gymnasium.environments import checked_options
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
@@ -26,9 +26,11 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
         self.env = env
         self.num_envs = env.num_envs
         self.device = env.device
-        self.single_action_space = ACTION_SPACE
+        self.single_action_space = action_space(env.env)
         self.single_observation_space = observation_space(env.env)
-        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, env.num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(
+            self.single_action_space, env.num_envs
+        )
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, env.num_envs
         )
