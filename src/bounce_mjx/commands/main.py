@@ -1,6 +1,6 @@
 """The console script.
 
-`bounce-mjx train|eval|robustness|play|view|plot|report|export|train-torch`
+`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|train-torch`
 """
 
 import contextlib
@@ -20,6 +20,7 @@ COMMANDS = {
     "robustness": "measure the five results in perturbed worlds",
     "play": "show a trained policy",
     "view": "show the environment under random, zero or scripted actions",
+    "adopt": "write the config of another robot arm",
     "plot": "draw the learning curves of runs, and an evaluation",
     "report": "write the report of a run, report.html",
     "export": "write a trained policy as an ONNX file",

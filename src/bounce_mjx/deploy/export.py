@@ -86,7 +86,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         with a servo.
     """
     env = config.env
-    m = load_model(env.mjcf, env.physics_dt, visual=False)
+    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
     chain, paddle = _chain(m)
     servos = list(addresses.actuators)

@@ -102,7 +102,7 @@ def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoc
     given = jax.tree.leaves(parameters)
     if not given:
         return [env.mj_model]
-    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False)
+    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False, robot=env.config.robot)
     return [
         edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
         for i in range(given[0].shape[-1])

@@ -1,7 +1,6 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,25 +12,16 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-
-BALL_BODY_NAME = "ball_link"
-PADDLE_GEOM_NAME = "blocker"
-
-# Fields that MuJoCo's compiler can compute from others.
-_DERIVED_FIELDS = frozenset(
-    (
-        "actuator_acc0",
-        "actuator_length0",
-        "body_inertia",
-        "body_invweight0",
-        "body_subtreemass",
-        "dof_M0",
-        "dof_invweight0",
-        "dof_length",
-        "geom_aabb",
-        "geom_rbound",
-    )
+from bounce_mjx.robot.arm import (
+    BALL_BODY_NAME,
+    PADDLE_GEOM_NAME,
+    build_arm,
+    compile_spec,
+    locate,
+    read_spec,
 )
+from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers, physical_fields
 
 
 class Addresses(NamedTuple):
@@ -55,51 +45,59 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
+def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
+    """Spec of the whole scene, and the path of its MJCF file.
+
+    Args:
+      mjcf: the file, as for `locate`; None for the project's own robot.
+      robot: the adoption of an arm; without a site, the file is the whole scene.
+
+    Raises:
+      UserError: the file is missing, is no MJCF, or holds no arm that can do the task.
+    """
+    path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf)
+    if robot.site is None:
+        return read_spec(path), path
+    try:
+        return build_arm(path, robot).spec, path
+    except UserError as error:
+        raise named(path, error) from error
+
+
+def named(path: Path, error: UserError) -> UserError:
+    """The error with the file's name, if it is missing."""
+    return error if str(path) in str(error) else UserError(f"the MJCF file {path} has {error}")
+
+
+def load_model(
+    mjcf: Path | None,
+    physics_dt: float,
+    visual: bool = True,
+    robot: RobotConfig | None = None,
+) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
-      mjcf: the file; None for the project's own robot.
+      mjcf: the file, as for `locate`; None for the project's own robot.
       physics_dt: physics time step, s.
       visual: False drops the textures and geoms that only pictures need; they take most of a
         model's memory.
+      robot: the adoption of an arm; None for an MJCF file that is a whole scene.
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
         without a position servo, or has a number that cannot be simulated.
     """
-    path = mjcf or resource_path("mjcf/bounce_ball.xml")
-    if not os.path.isfile(path):
-        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+    spec, path = scene_spec(mjcf, robot or RobotConfig())
+    spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+    mj_model = compile_spec(spec, path)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
-        mj_model = spec.compile()
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
-    try:
-        _check_numbers(mj_model)
+        check_numbers(mj_model)
         _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
-        raise UserError(f"the MJCF file {path} has {error}") from error
+        raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
     return mj_model
-
-
-def _check_numbers(mj_model: mujoco.MjModel) -> None:
-    """Refuses a time step that is not positive, and numbers that are not finite."""
-    step = mj_model.opt.timestep
-    if not 0.0 < step < np.inf:
-        raise UserError(f"the timestep {step}; give a positive number of seconds")
-    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
-    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
-    # Derived fields come last: the message must name a number that is in the file.
-    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
-        values = np.asarray(getattr(owner, name))
-        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
-            value = values[~np.isfinite(values)][0]
-            raise UserError(f"the number {value} in {name}; give finite numbers")
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -204,7 +202,7 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
     """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
     for owner, names in (
-        (mj_model, _physical_fields(mj_model)),
+        (mj_model, physical_fields(mj_model)),
         (mj_model.opt, [name for name in dir(mj_model.opt) if not name.startswith("_")]),
     ):
         for name in names:
@@ -223,12 +221,6 @@ def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
             "env.mj_model was edited after the environment had been built, and the physics would "
             "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
         )
-
-
-def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
-    kinds = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
-    pictured = ("geom_rgba", "geom_matid", "geom_group")
-    return [name for name in dir(mj_model) if name.startswith(kinds) and name not in pictured]
 
 
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:

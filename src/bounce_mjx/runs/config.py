@@ -1,6 +1,7 @@
 """The settings of a training run, and their YAML file."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -56,18 +57,37 @@ def load_run_config(run: Path) -> TrainConfig:
     return load_config(run / CONFIG_FILE)
 
 
-def load_config(path: Path) -> TrainConfig:
+def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys.
+
+    Args:
+      robot: config of a robot, whose keys win over those of the file.
 
     Raises:
       UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
-    return validate(TrainConfig, values, str(path))
+    if robot is None:
+        return validate(TrainConfig, values, str(path))
+    own = read_mapping(robot, "robot's config file", "configs/robots/ur5e.yaml")
+    validate(TrainConfig, own, str(robot))
+    return validate(TrainConfig, _merged(values, own), f"{path} with {robot}")
 
 
-def read_preset(path: Path | None) -> TrainConfig:
+def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    """Nested mappings in which the others' keys win."""
+    merged = dict(values)
+    for key, value in others.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged
+
+
+def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
     """Reads a preset from configs/; without a path, the preset for this machine.
+
+    Args:
+      robot: config of a robot, whose keys win over the preset's.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -75,4 +95,4 @@ def read_preset(path: Path | None) -> TrainConfig:
     if path is None:
         preset = "cpu" if jax.default_backend() == "cpu" else "default"
         path = resource_path(f"configs/{preset}.yaml")
-    return load_config(path)
+    return load_config(path, robot)

@@ -8,6 +8,8 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.robot.arm import is_packaged
+from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.task.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig
@@ -21,7 +23,10 @@ class EnvConfig(StrictModel):
     """Physics engine: fused (fast, for one kind of model), mjx (any MJCF), auto (fused if it
     supports the model)."""
     mjcf: PlainPath | None = None
-    """MJCF file to simulate; null for the project's own robot."""
+    """MJCF file to simulate; null for the project's own robot. package:NAME/FILE is a file of an
+    installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
+    robot: RobotConfig = RobotConfig()
+    """Adoption of an arm."""
     physics_dt: Positive = 0.001
     """Physics time step, s."""
     control_dt: Positive = 0.01
@@ -96,7 +101,9 @@ class EnvConfig(StrictModel):
     def _make_absolute(cls, path: Path | None) -> Path | None:
         """A run's config is read from other folders too."""
         try:
-            return None if path is None else path.expanduser().absolute()
+            if path is None or is_packaged(path):
+                return path
+            return path.expanduser().absolute()
         except RuntimeError as error:
             raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
 

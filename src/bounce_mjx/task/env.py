@@ -110,7 +110,9 @@ class BounceBall:
           UserError: the MJCF file or the engine does not fit the task.
         """
         self.config = config or EnvConfig()
-        self.mj_model: mujoco.MjModel = load_model(self.config.mjcf, self.config.physics_dt)
+        self.mj_model: mujoco.MjModel = load_model(
+            self.config.mjcf, self.config.physics_dt, robot=self.config.robot
+        )
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._check_joints()

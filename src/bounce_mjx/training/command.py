@@ -35,6 +35,9 @@ class TrainingCommand(TrainConfig):
     config: Path | None = None
     """Preset: a YAML file such as configs/seed.yaml. The default is configs/default.yaml on an
     accelerator, and configs/cpu.yaml on a CPU."""
+    robot: Path | None = None
+    """Config of a robot, such as configs/robots/ur5e.yaml or the file that bounce-mjx adopt wrote,
+    on top of the preset."""
     resume: Path | None = None
     """Folder of a run to continue, in place, from its latest checkpoint. The other flags may then
     change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
@@ -59,15 +62,19 @@ def read_command(
         stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
-    if config_path and resume:
-        raise UserError("--config and --resume exclude each other; a resumed run has its config")
-    base = load_run_config(find_run(resume)) if resume else read_preset(config_path)
+    robot = path_flag(args, "--robot")
+    for given, flag in ((config_path, "--config"), (robot, "--robot")):
+        if given and resume:
+            raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
+    base = load_run_config(find_run(resume)) if resume else read_preset(config_path, robot)
     command = parse(
         command_class,
         args,
         prog=prog,
         description=description,
-        default=command_class(**dict(base), config=config_path, resume=resume, **defaults),
+        default=command_class(
+            **dict(base), config=config_path, robot=robot, resume=resume, **defaults
+        ),
     )
     if resume:
         changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS

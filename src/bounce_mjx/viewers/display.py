@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import trimesh
 
-from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import compile_spec
+from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 
@@ -44,7 +45,7 @@ class Display:
 
 def _with_markers(config: EnvConfig) -> mujoco.MjModel:
     """The config's model, with the two marker sites added if it lacks them."""
-    spec = mujoco.MjSpec.from_file(str(config.mjcf or resource_path("mjcf/bounce_ball.xml")))
+    spec, path = scene_spec(config.mjcf, config.robot)
     sites = {site.name for site in spec.sites}
     reward = config.reward
     if TARGET_SITE not in sites:
@@ -62,7 +63,7 @@ def _with_markers(config: EnvConfig) -> mujoco.MjModel:
             pos=[reward.target_x, reward.target_y, reward.paddle_home_height],
             rgba=[0.15, 0.45, 1.0, 0.45],
         )
-    return spec.compile()
+    return compile_spec(spec, path)
 
 
 def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
