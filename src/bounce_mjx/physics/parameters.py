@@ -200,8 +200,8 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 
 
 def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
-    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. Where a body
-    has several joints, it is the link of the last one, and the others have no bodies."""
+    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body with
+    several joints belongs to the last one, and the others have no bodies."""
     m = mj_model
     last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
     return tuple(np.flatnonzero(last_joint == j) for j in find_addresses(m).arm_joints)
