@@ -16,7 +16,6 @@ import pytest
 from rich.console import Console
 from tensorboardX import SummaryWriter
 
-from arms import ur5e
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
@@ -172,15 +171,19 @@ def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypa
     assert load_config(moved / "config.yaml").env.mjcf == env.mjcf
 
 
-def test_a_robot_of_a_package_is_copied(tmp_path: Path) -> None:
-    """The copy makes the same scene as the file in the package."""
-    ur5e()
-    config = read_preset(Path("cpu"), Path("ur5e"))
-    assert str(config.env.mjcf).startswith("package:")
-    env = load_run_config(create_run(config.model_copy(update={"log_dir": tmp_path}))).env
-    assert env.mjcf.is_relative_to(tmp_path)
-    models = [load_model(e.mjcf, 0.001, robot=e.robot) for e in (config.env, env)]
-    assert fingerprint(models[0]) == fingerprint(models[1])
+def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "some_robots").mkdir()
+    (tmp_path / "some_robots/__init__.py").touch()
+    shutil.copy(resource_path("mjcf/bounce_ball.xml"), tmp_path / "some_robots")
+    monkeypatch.syspath_prepend(tmp_path)
+    packaged = Path("package:some_robots/bounce_ball.xml")
+    (tmp_path / "my.yaml").write_text(f"env: {{mjcf: '{packaged}'}}")
+    config = load_config(tmp_path / "my.yaml")
+    assert config.env.mjcf == packaged
+    run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
+    assert load_run_config(run).env.mjcf == run / "robot/bounce_ball.xml"
+    copy = load_model(run / "robot/bounce_ball.xml", 0.001)
+    assert fingerprint(copy) == fingerprint(load_model(packaged, 0.001))
 
 
 @pytest.mark.parametrize("name", ["mjcf/my robot.xml", "mjcf/more.xml", "meshes/m.obj"])

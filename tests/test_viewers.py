@@ -555,7 +555,9 @@ def test_results_are_shown_as_they_are_met() -> None:
     assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
 
 
-def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, monkeypatch) -> None:
+def test_the_page_of_a_training_shows_its_newest_policy(
+    exchangeable: Simulation, monkeypatch
+) -> None:
     """The training only puts the news into a queue."""
     monkeypatch.setattr(TrainingPage, "_simulate", lambda page: exchangeable)
     stop = threading.Event()
