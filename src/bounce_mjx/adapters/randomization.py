@@ -63,8 +63,10 @@ def domain_randomize(
       The model with a batch axis in the changed fields, and the axes for `jax.vmap`.
     """
 
+    num_joints = len(find_addresses(mj_model).arm_joints)
+
     def draw(key: jax.Array) -> Fields:
-        world = draw_world(config.ranges(), key, jnp.result_type(float))
+        world = draw_world(config.ranges(), key, jnp.result_type(float), num_joints)
         fields, options = edited_fields(mj_model, physics_parameters(world, mj_model))
         return fields | {f"opt.{name}": value for name, value in options.items()}
 
