@@ -4,6 +4,7 @@ scene with a level paddle and stable servos."""
 import re
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import HOME_HEIGHT, _speed_result
+from bounce_mjx.learning import ppo
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt
 from bounce_mjx.robot.arm import locate
@@ -339,3 +342,24 @@ def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     own = load_config(written["small"]).env
     assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
     assert own.action_scale != 0.5
+
+
+def test_a_short_training_of_the_ur5e_rises(written) -> None:
+    env = BounceBall(
+        load_config(written["ur5e"]).env.model_copy(
+            update={"episode_seconds": 4.0, "physics_dt": 0.002}
+        )
+    )
+    config = PPOConfig(
+        num_envs=128,
+        rollout_length=32,
+        num_minibatches=4,
+        hidden_layers=(64, 64),
+        learning_rate=1e-3,
+    )
+    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    state = jax.jit(trainer.init)(jax.random.key(0))
+    _, metrics = jax.jit(trainer.run, static_argnums=1)(state, 140)
+    rewards = np.asarray(metrics["reward"])
+    print(f"reward of a step: {rewards[10:30].mean():.2f}, then {rewards[-20:].mean():.2f}")
+    assert rewards[-20:].mean() > 1.2 * rewards[10:30].mean()
