@@ -184,6 +184,11 @@ BAD_MJCF = {
         "default_joint_angles has 6 numbers",
         "5 joints with an actuator (Joint1, Joint3",
     ),
+    "motor": (
+        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
+        "an actuator on Joint2 that is no position servo",
+        '<position joint="Joint2"/>',
+    ),
 }
 
 
@@ -420,7 +425,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
     for result in report["results"]:
         value = result["value"]
         assert value is None or isinstance(value, float)
-        figure = "none" if value is None else f"{value:.2f}"
+        figure = "-" if value is None else f"{value:.2f}"
         assert f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown
 
@@ -481,6 +486,7 @@ def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
         "2026-01-04/checkpoints/latest",
     ):
         (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder.split("/")[0] / "config.yaml").touch()
     assert newest_run(tmp_path) == tmp_path / "2026-01-02"
     with pytest.raises(UserError, match="no run with a checkpoint"):
         newest_run(tmp_path / "2026-01-04")

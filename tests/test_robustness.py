@@ -349,7 +349,7 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     lines = stream.getvalue().splitlines()
     assert "4 of 5 conditions meet all judged results" in lines[0]
     (row,) = [line.split() for line in lines if "10 ms" in line]
-    assert row == ["10", "ms", "25.0*", "50.0*", "none", "none*", "1.80", "FAIL"]
+    assert row == ["10", "ms", "25.0*", "50.0*", "-", "-*", "1.80", "FAIL"]
     (row,) = [line.split() for line in lines if "1 ms" in line]
     assert row == ["other", "1", "ms", "100.0", "100.0", "99.0", "98.0", "1.40", "pass"]
 

@@ -10,7 +10,9 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from types import ModuleType
 
+import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import INTERRUPTED
 
@@ -32,7 +34,7 @@ A robot arm learns to bounce a ball.
 
 {commands}
 
-bounce-mjx COMMAND --help lists the arguments of a command.
+bounce-mjx COMMAND --help lists the arguments of a command. bounce-mjx --version prints the version.
 """
 
 
@@ -47,13 +49,33 @@ def main(args: Sequence[str] | None = None) -> None:
             lines = (f"  {command:<13}{meaning}" for command, meaning in COMMANDS.items())
             print(_HELP.format(commands="\n".join(lines)), end="")
             return
+        if name == "--version":
+            print(f"bounce_mjx {bounce_mjx.__version__}")
+            return
         if name not in COMMANDS:
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
         with _interruptible():
-            module = importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}")
+            module = _import(f"bounce_mjx.commands.{name.replace('-', '_')}")
         module.main(rest)
+
+
+def _import(name: str) -> ModuleType:
+    """Imports a command's module.
+
+    Raises:
+      UserError: a package that it needs is missing.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("bounce_mjx"):
+            raise
+        raise UserError(
+            f"the package {error.name} is not installed for {sys.executable}; in the folder of "
+            "bounce_mjx run: pip install -e . (or start the command with uv run)"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.page import record_checkpoint
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import find_checkpoint, newest_run, runs_of_seeds
+from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
 from bounce_mjx.task.env import BounceBall
 
 
@@ -24,9 +24,9 @@ class PlotCommand(StrictModel):
     """The command line."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs. Runs that differ only in the seed become one curve with a band, as do the
-    seeds of one run. The default is the newest run. For a run of one seed, or one checkpoint in it,
-    the evaluation is drawn too."""
+    """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
+    become one curve with a band, as do the seeds of one run. For a run of one seed, or one
+    checkpoint in it, the evaluation is drawn too."""
     out: Path = Path("plots")
     """Folder for the pictures: curves, rewards and, for one run, evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
@@ -44,7 +44,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx plot",
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
-        runs = command.runs or (newest_run(command.log_dir),)
+        runs = [named_run(run, command.log_dir) for run in command.runs or (None,)]
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
         checkpoints = [find_checkpoint(seed) for seed in seeds]
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])

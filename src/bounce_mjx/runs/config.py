@@ -1,5 +1,6 @@
 """The settings of a training run, and their YAML file."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,13 @@ from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, 
 from bounce_mjx.config.validation import validate
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import is_packaged
+from bounce_mjx.runs.robot import check_robot
 from bounce_mjx.task.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
+ROBOTS = "configs/robots"
+"""Folder of the package with configs of robots."""
 
 
 class TrainConfig(StrictModel):
@@ -52,13 +57,17 @@ def load_run_config(run: Path) -> TrainConfig:
     """Reads the resolved config of a run.
 
     Raises:
-      UserError: the file is missing or damaged.
+      UserError: the file is missing or damaged, or the run's copy of its robot was edited.
     """
-    return load_config(run / CONFIG_FILE)
+    config = load_config(run / CONFIG_FILE)
+    if config.env.mjcf is not None:
+        check_robot(config.env.mjcf, run)
+    return config
 
 
 def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
-    """Reads a run's config from a YAML file, with defaults for missing keys.
+    """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
+    MJCF file starts at the folder of the YAML file.
 
     Args:
       robot: config of a robot, whose keys win over those of the file.
@@ -67,9 +76,11 @@ def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
       UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
+    values = _with_mjcf_from(path.parent, values)
     if robot is None:
         return validate(TrainConfig, values, str(path))
     own = read_mapping(robot, "robot's config file", "configs/robots/ur5e.yaml")
+    own = _with_mjcf_from(robot.parent, own)
     validate(TrainConfig, own, str(robot))
     return validate(TrainConfig, _merged(values, own), f"{path} with {robot}")
 
@@ -84,15 +95,33 @@ def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
-    """Reads a preset from configs/; without a path, the preset for this machine.
+    """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
+    this machine.
 
     Args:
-      robot: config of a robot, whose keys win over the preset's.
+      robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
+        in configs/robots/.
 
     Raises:
       UserError: the file is missing or invalid.
     """
     if path is None:
-        preset = "cpu" if jax.default_backend() == "cpu" else "default"
-        path = resource_path(f"configs/{preset}.yaml")
-    return load_config(path, robot)
+        path = Path("cpu" if jax.default_backend() == "cpu" else "default")
+    return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS))
+
+
+def named_file(path: Path, folder: str) -> Path:
+    """The YAML file in a folder of the package that a path names; the path itself if there is none
+    or if the path exists."""
+    named = resource_path(f"{folder}/{path.name}.yaml")
+    is_name = str(path) == path.name and not os.path.exists(path)
+    return named if is_name and os.path.isfile(named) else path
+
+
+def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """A config's values with an absolute path of the MJCF file."""
+    env = values.get("env")
+    mjcf = env.get("mjcf") if isinstance(env, dict) else None
+    if not isinstance(mjcf, str) or mjcf.startswith("~") or is_packaged(Path(mjcf)):
+        return values
+    return values | {"env": env | {"mjcf": str(folder / mjcf)}}

@@ -10,7 +10,7 @@ from pydantic import Field
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
 from bounce_mjx.robot.arm import is_packaged
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.task.observation import ObservationConfig, ObservationLayout
+from bounce_mjx.task.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig
 
@@ -65,6 +65,8 @@ class EnvConfig(StrictModel):
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
+    estimator: EstimatorConfig = EstimatorConfig()
+    """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
     reward: RewardConfig = RewardConfig()

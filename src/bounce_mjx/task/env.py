@@ -27,6 +27,7 @@ from bounce_mjx.robot.model import (
 from bounce_mjx.task import actuation, noise, sensing
 from bounce_mjx.task.actuation import Actuation
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.estimator import Estimate, Estimator
 from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics
 from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
 from bounce_mjx.task.rewards import (
@@ -40,8 +41,6 @@ from bounce_mjx.task.state import State
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-# Stream of random numbers for the target height; sensors and pushes have their own streams.
-_TARGET_STREAM = 4
 
 
 class TaskState(NamedTuple):
@@ -74,6 +73,7 @@ class Memory(NamedTuple):
     """Range of later target heights, m; None if the target does not change."""
     actuation: Actuation | None
     sensing: Sensing | None
+    estimate: Estimate | None = None
 
 
 class BounceState(NamedTuple):
@@ -119,6 +119,11 @@ class BounceBall:
         self._randomize = randomize
         self.layout = self.config.layout
         self._fingerprint = fingerprint(self.mj_model)
+        self._estimator = (
+            Estimator(self.config, self.mj_model, self.engine)
+            if self.config.observation.is_filtered
+            else None
+        )
 
     def _check_joints(self) -> None:
         given, acting = self.config.num_joints, joint_names(self.mj_model)
@@ -310,7 +315,7 @@ class BounceBall:
             world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
         )
         low, high = memory.target_range
-        share = noise.uniform(memory.counter, _TARGET_STREAM, (), task.target_height.dtype)
+        share = noise.uniform(memory.counter, noise.Stream.TARGET, (), task.target_height.dtype)
         drawn = jnp.where(now, low + (high - low) * share, task.target_height)
         return task._replace(target_height=drawn), memory._replace(
             target_age=jnp.where(now, 0.0, memory.target_age)
@@ -459,7 +464,7 @@ class BounceBall:
         return Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),
-            phases=noise.uniform(counter, _TARGET_STREAM, (3,), dtype),
+            phases=noise.uniform(counter, noise.Stream.TARGET, (3,), dtype),
             target_age=jnp.zeros((), dtype),
             target_range=None,
             actuation=actuation.start_actuation(
@@ -476,6 +481,11 @@ class BounceBall:
             )
             if self._needs_sensing
             else None,
+            estimate=None
+            if self._estimator is None
+            else self._estimator.start(
+                truth.ball_position, self._estimator.plane(state.physics.qpos)
+            ),
         )
 
     def _next_memory(self, state: BounceState, truth: Kinematics) -> Memory:
@@ -501,15 +511,25 @@ class BounceBall:
         angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
         paddle = truth.paddle_position
         if self._misjudges_paddle:
-            qpos = [state.physics.qpos[i] for i in range(self.mj_model.nq)]
-            for i, address in enumerate(self._addresses.arm_qpos):
-                qpos[address] = angles[i]
-            paddle = self.engine.paddle_position(MODEL_PARAMETERS, jnp.stack(qpos))
+            paddle = self.engine.paddle_position(
+                MODEL_PARAMETERS, self._measured_qpos(state.physics, angles)
+            )
+        ball_position, ball_velocity = picture.position, picture.velocity
+        if self._estimator is not None:
+            plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
+            estimate = self._estimator.next(
+                memory.estimate, state.world, past.picture, picture, plane
+            )
+            memory = memory._replace(estimate=estimate)
+            if config.observation.position == "filter":
+                ball_position = estimate.position
+            if config.observation.velocity == "filter":
+                ball_velocity = estimate.velocity
         measured = truth._asdict() | {
             "joint_angles": angles,
             "joint_velocities": velocities,
-            "ball_position": picture.position,
-            "ball_velocity": picture.velocity,
+            "ball_position": ball_position,
+            "ball_velocity": ball_velocity,
             "paddle_position": paddle,
             "target_height": state.task.target_height[None],
             "action": state.task.last_action,
@@ -521,6 +541,13 @@ class BounceBall:
                 past, measured, picture, near_height, state.task.target_height, config.control_dt
             )
         )
+
+    def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
+        """qpos [nq] with measured joint angles [6]."""
+        qpos = [physics.qpos[i] for i in range(self.mj_model.nq)]
+        for i, address in enumerate(self._addresses.arm_qpos):
+            qpos[address] = joint_angles[i]
+        return jnp.stack(qpos)
 
     @property
     def _misjudges_paddle(self) -> bool:

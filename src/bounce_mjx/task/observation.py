@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from pydantic import Field
 
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.settings import NonNegative, Positive, StrictModel
 
 History = Annotated[int, Field(ge=0, le=100)]
 
@@ -97,8 +97,12 @@ class ObservationConfig(StrictModel):
     """Measured joint angles at the lowest points of the last bounces."""
     bounce_joint_velocities: History = 0
     """Measured joint velocities at the lowest points of the last bounces."""
-    velocity: Literal["measured", "differences"] = "measured"
-    """Source of ball_velocity: a sensor, or the differences between pictures."""
+    position: Literal["measured", "filter"] = "measured"
+    """Source of ball_position: the last picture, or the estimate of the Kalman filter
+    (env.estimator)."""
+    velocity: Literal["measured", "differences", "filter"] = "measured"
+    """Source of ball_velocity: a sensor, the differences between pictures, or the estimate of the
+    Kalman filter (env.estimator)."""
 
     def layout(self, num_joints: int) -> "ObservationLayout":
         """The order of the entries for an arm with this number of acting joints."""
@@ -110,7 +114,40 @@ class ObservationConfig(StrictModel):
         """Whether the true state of one instant determines the whole observation."""
         past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
         remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
-        return not past and not remembered and self.velocity == "measured"
+        sources = {self.position, self.velocity}
+        return not past and not remembered and sources == {"measured"}
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether the policy sees an estimate of the Kalman filter."""
+        return bool(
+            (self.ball_position and self.position == "filter")
+            or (self.ball_velocity and self.velocity == "filter")
+        )
+
+
+class EstimatorConfig(StrictModel):
+    """The Kalman filter of a bouncing ball between camera and policy, which computes the sources
+    `filter` of env.observation."""
+
+    measurement_noise: Positive = 0.002
+    """Standard deviation of each measured ball coordinate, m."""
+    process_noise: NonNegative = 0.2
+    """Standard deviation that unknown forces give to each component of the ball's velocity within
+    1 s, m/s; it grows with the square root of the time."""
+    restitution: Annotated[float, Field(ge=0.1, le=1.0)] = 0.85
+    """Restitution of the ball on the paddle."""
+    restitution_noise: NonNegative = 0.05
+    """Standard deviation of the restitution."""
+    contact_time: Annotated[float, Field(ge=0.002, le=0.05)] = 0.01
+    """Time that the ball touches the paddle in a bounce, s."""
+    paddle_noise: NonNegative = 0.002
+    """Standard deviation of the paddle's height by forward kinematics, m."""
+    air_drag: NonNegative = 0.0
+    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
+    latency: NonNegative | None = None
+    """Expected time from a picture to its arrival, s, if the camera does not stamp its pictures;
+    null for pictures with the time at which they were taken."""
 
 
 @dataclasses.dataclass(frozen=True)

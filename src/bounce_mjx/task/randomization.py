@@ -15,6 +15,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
+from bounce_mjx.physics.fused.scalars import Quaternion, quaternion_product
 from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
 from bounce_mjx.robot.model import find_addresses
 
@@ -265,7 +266,8 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         given["paddle_position"] = offset + _array(m.geom_pos[paddle], offset)
     if "paddle_tilt" in world:
         tilt = world["paddle_tilt"]
-        given["paddle_rotation"] = _product(_array(m.geom_quat[paddle], tilt), _rotation_xy(tilt))
+        own = _array(m.geom_quat[paddle], tilt)
+        given["paddle_rotation"] = jnp.stack(quaternion_product(tuple(own), _rotation_xy(tilt)))
     if "gravity_tilt" in world:
         about_x, about_y = world["gravity_tilt"]
         strength = float(np.linalg.norm(m.opt.gravity))
@@ -297,24 +299,9 @@ def _array(values: np.ndarray, like: jax.Array) -> jax.Array:
     return jnp.asarray(values, like.dtype)
 
 
-def _rotation_xy(angles: jax.Array) -> jax.Array:
+def _rotation_xy(angles: jax.Array) -> Quaternion:
     """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
     a, b = 0.5 * angles[0], 0.5 * angles[1]
-    zero = jnp.zeros_like(a)
-    about_x = jnp.stack([jnp.cos(a), jnp.sin(a), zero, zero])
-    about_y = jnp.stack([jnp.cos(b), zero, jnp.sin(b), zero])
-    return _product(about_x, about_y)
-
-
-def _product(p: jax.Array, q: jax.Array) -> jax.Array:
-    """Product of two quaternions [w, x, y, z]."""
-    w, x, y, z = p
-    a, b, c, d = q
-    return jnp.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
+    about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
+    about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
+    return quaternion_product(about_x, about_y)

@@ -2,14 +2,15 @@
 
 import concurrent.futures
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
+from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.policy import Policy, make_networks
@@ -19,17 +20,22 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
 
+Tree = TypeVar("Tree")
+
 # Added to the seed of the selecting evaluations to get the seed of the final one, which no config
 # can contain.
 _FINAL = 2**31
 
 
 class Evaluators:
-    """The programs that evaluate the S policies of a training, compiled in the background.
+    """The program that evaluates the S policies of a training, compiled in the background.
 
     A training selects its best policy by evaluations that all use the same resets. The figures of
     the selected policy are then measured once more on fresh resets, because the best of many
     evaluations on the same resets is biased upwards.
+
+    With a screening, the program runs as many episodes as the screening has, and a full evaluation
+    runs it several times: it is then the only evaluation to be compiled.
     """
 
     def __init__(
@@ -44,65 +50,86 @@ class Evaluators:
         axes = mesh.axis_names if config.num_seeds > 1 else ()
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
-        self._full = pool.submit(self._compile, config.eval_episodes, 0)
-        self._screening = (
-            pool.submit(self._compile, config.screening_episodes, 1)
-            if config.screening_episodes
-            else None
-        )
+        self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
+        self._program = pool.submit(self._compile)
 
     def wait(self) -> None:
-        """Waits until all programs are compiled."""
-        for program in filter(None, (self._full, self._screening)):
-            program.result()
+        """Waits until the program is compiled."""
+        self._program.result()
 
     def select(self, policy: Policy) -> list[Report]:
         """A report of each policy; if no policy passes the screening, the reports of the
         screening."""
-        if self._screening is not None:
-            screened = self._measure(self._screening, policy, self._config.eval_seed)
+        if self._config.screening_episodes:
+            screened = self._measure(policy, self._config.eval_seed, screening=True)
             if not any(report.passed for report in screened):
                 return [dataclasses.replace(report, screening=True) for report in screened]
-        return self._measure(self._full, policy, self._config.eval_seed)
+        return self._measure(policy, self._config.eval_seed)
 
     def final(self, policy: Policy) -> list[Report]:
         """A full report of each policy, on resets that no selection has seen."""
-        return self._measure(self._full, policy, self._config.eval_seed + _FINAL)
+        return self._measure(policy, self._config.eval_seed + _FINAL)
 
-    def _compile(self, episodes: int, stream: int) -> Callable[[Policy, np.uint32], Any]:
+    def _compile(self) -> Callable[[Policy, np.uint32, np.int32], Any]:
+        """The program (policy, seed, index of the first episode) -> statistics and recording of a
+        chunk of episodes. The episodes of a screening follow the episodes of a full evaluation."""
         config, env = self._config, self._env
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
-        if config.num_seeds == 1:
-            evaluate = make_recording_evaluator(env, networks, episodes, RECORDED_EPISODES)
-        else:
-            # No recordings, because a batched loop would copy them at every step.
-            evaluate_all = jax.vmap(make_evaluator(env, networks, episodes), in_axes=(0, None))
-            evaluate = lambda policy, key: (evaluate_all(policy, key), None)  # noqa: E731
-        # Keys are made inside the program: outside it, each operation would take a tenth of a
-        # second.
+        # No recordings of several seeds, because a batched loop would copy them at every step.
+        recorded = RECORDED_EPISODES if config.num_seeds == 1 else 0
+
+        def run(policy: Policy, keys: jax.Array):
+            states = jax.vmap(env.reset, out_axes=-1)(keys)
+            return run_episodes(env, networks, policy, states, recorded)
+
+        if config.num_seeds > 1:
+            run = jax.vmap(run, in_axes=(0, None))
+
+        def evaluate(policy: Policy, seed: jax.Array, first: jax.Array):
+            # Keys are made inside the program: outside it, each operation would take a tenth of a
+            # second. The last chunk may reach beyond the last episode.
+            full, screening = jax.random.split(jax.random.PRNGKey(seed))
+            keys = jnp.concatenate(
+                [
+                    jax.random.split(full, config.eval_episodes),
+                    jax.random.split(screening, config.screening_episodes),
+                ]
+            )
+            return run(policy, jnp.take(keys, first + jnp.arange(self._chunk), 0, mode="clip"))
+
         program = jax.jit(
-            lambda policy, seed: evaluate(
-                policy, jax.random.split(jax.random.PRNGKey(seed))[stream]
-            ),
-            in_shardings=(self._sharding, self._replicated),
+            evaluate,
+            in_shardings=(self._sharding, self._replicated, self._replicated),
             out_shardings=self._replicated,
             compiler_options=compiler_options(),
         )
-        return program.lower(policy_shapes(config, env), np.uint32(0)).compile()
+        return program.lower(policy_shapes(config, env), np.uint32(0), np.int32(0)).compile()
 
-    def _measure(
-        self, program: concurrent.futures.Future, policy: Policy, seed: int
-    ) -> list[Report]:
-        shardings = jax.tree.map(lambda _: self._sharding, policy)
-        on_devices = hosts.distribute(policy, shardings)
-        statistics, recording = program.result()(on_devices, np.uint32(seed))
-        if self._config.num_seeds == 1:
+    def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
+        config, program = self._config, self._program.result()
+        first = config.eval_episodes if screening else 0
+        episodes = config.screening_episodes if screening else config.eval_episodes
+        on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
+        chunks = [
+            program(on_devices, np.uint32(seed), np.int32(first + start))
+            for start in range(0, episodes, self._chunk)
+        ]
+        statistics = _joined([statistics for statistics, _ in chunks], episodes)
+        if config.num_seeds == 1:
+            recorded = min(RECORDED_EPISODES, episodes)
+            needed = chunks[: -(-recorded // self._chunk)]
+            recording = _joined([recording for _, recording in needed], recorded)
             return [dataclasses.replace(judge(self._env, statistics), recording=recording)]
-        statistics = jax.device_get(statistics)
         return [
             judge(self._env, jax.tree.map(lambda x, i=i: x[i], statistics))
-            for i in range(self._config.num_seeds)
+            for i in range(config.num_seeds)
         ]
+
+
+def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:
+    """The first episodes of all chunks as NumPy arrays; the episodes are the last axis."""
+    parts = jax.device_get(chunks)
+    return jax.tree.map(lambda *x: np.concatenate(x, axis=-1)[..., :episodes], *parts)
 
 
 def policy_shapes(config: TrainConfig, env: BounceBall) -> Policy:

@@ -1,9 +1,10 @@
 """The viewing options that `view` and `play` share, and the viewers that they start."""
 
 import contextlib
-from collections.abc import Callable
+import string
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 from rich.console import Console
@@ -11,6 +12,7 @@ from rich.console import Console
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
@@ -18,7 +20,7 @@ from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
 from bounce_mjx.viewers.pace import SPEED_RANGE
 from bounce_mjx.viewers.scene import MAX_ENVS
-from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
 
 _RECORDED_SECONDS = 10.0
@@ -56,19 +58,30 @@ class ViewerOptions(StrictModel):
     """Port of the page's server, or the next free port."""
 
 
+class Shown(NamedTuple):
+    """An environment to show, and its controller."""
+
+    config: EnvConfig
+    make_controller: Callable[[BounceBall], Controller]
+    title: str
+
+
 def show(
-    config: EnvConfig,
-    make_controller: Callable[[BounceBall], Controller],
+    shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    title: str,
     target_height: float | None,
     console: Console,
 ) -> None:
-    """Shows or records an environment under a controller; Ctrl-C closes a viewer.
+    """Shows or records environments under their controllers; Ctrl-C closes a viewer.
+
+    Args:
+      shown: one, or several with the same robot side by side, on the page or in its recording. The
+        labels of several are A, B, ...
 
     Raises:
-      UserError: a file cannot be written, or the viewer does not work here.
+      UserError: a file cannot be written, or the viewer does not work here, or it shows only one
+        of several.
       KeyboardInterrupt: Ctrl-C came during the compilation or the recording.
     """
     recorded = options.video is not None or options.html is not None
@@ -76,9 +89,11 @@ def show(
         raise UserError(
             f"--viewer {options.viewer} and --video or --html exclude each other; give only one"
         )
-    viewer = options.viewer
+    viewer, several = options.viewer, len(shown) > 1
+    if several and (viewer == "native" or options.video is not None):
+        raise UserError("a window or a video shows one policy; show several with --viewer browser")
     if viewer == "auto":
-        viewer = "native" if has_display() else "browser"
+        viewer = "native" if not several and has_display() else "browser"
     film = None
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
@@ -96,18 +111,35 @@ def show(
 
         port = free_port(options.host, options.port)
 
-    env, num_envs, ranges = BounceBall(config), options.num_envs, None
-    if not recorded and viewer == "browser":
-        env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
-        # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
-        if env.engine.name == "fused":
-            num_envs = MAX_ENVS
-    with console.status("compiling"):
+    on_page = not recorded and viewer == "browser"
+    title, names = shown[0].title, None
+    if several:
+        each = max(1, options.num_envs // len(shown))
+        letters = string.ascii_uppercase[: len(shown)]
+        names = [letter for letter in letters for _ in range(each)]
+        titles = zip(letters, shown, strict=True)
+        title = ", ".join(f"{letter}: {one.title}" for letter, one in titles)
+
+    def simulate(one: Shown) -> Simulation:
+        config, num_envs = one.config, each if several else options.num_envs
+        env, ranges = BounceBall(config), None
+        if on_page:
+            env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
+            # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
+            if env.engine.name == "fused" and not several:
+                num_envs = MAX_ENVS
         simulation = run_interruptible(
-            Simulation, env, make_controller(env), num_envs, options.seed, ranges
+            Simulation, env, one.make_controller(env), num_envs, options.seed, ranges
         )
         simulation.target_height = target_height
         simulation.world = None if config.randomization.terms else {}
+        return simulation
+
+    with console.status("compiling"):
+        simulations = [simulate(one) for one in shown]
+    if len({fingerprint(one.env.mj_model) for one in simulations}) > 1:
+        raise UserError("the policies have different robots or time steps; show one at a time")
+    simulation = SideBySide(simulations) if several else simulations[0]
 
     if recorded:
         with console.status("recording"):
@@ -115,7 +147,7 @@ def show(
             if film is not None:
                 film.write(simulation, recording)
             if options.html is not None:
-                write_page(options.html, simulation, recording, options.fps)
+                write_page(options.html, simulation, recording, options.fps, names)
         for path in (options.video, options.html):
             if path is not None:
                 # rich would read brackets in a path as markup.
@@ -127,11 +159,12 @@ def show(
         else:
             run_browser(
                 simulation,
-                num_shown=options.num_envs,
+                num_shown=simulation.num_envs if several else options.num_envs,
                 speed=options.speed,
                 seconds=options.seconds,
                 host=options.host,
                 port=port,
                 title=title,
                 console=console,
+                names=names,
             )

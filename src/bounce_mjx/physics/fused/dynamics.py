@@ -25,6 +25,7 @@ from bounce_mjx.physics.fused.scalars import (
     matmul,
     matvec,
     mul,
+    quaternion_product,
     scale,
     stored,
     sub,
@@ -343,20 +344,14 @@ def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[S
     product of MuJoCo's mju_quatIntegrate."""
     w, x, y, z = quaternion
     inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = (c * inverse_norm for c in quaternion)
+    unit = tuple(c * inverse_norm for c in quaternion)
     squared_speed = dot(spin, spin)
     still = squared_speed == 0.0
     speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
     half_angle = 0.5 * duration * speed
     sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
-    c = jnp.where(still, 1.0, jnp.cos(half_angle))
-    a, b, d = scale(spin, sine)
-    return (
-        w * c - x * a - y * b - z * d,
-        w * a + x * c + y * d - z * b,
-        w * b - x * d + y * c + z * a,
-        w * d + x * b - y * a + z * c,
-    )
+    cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
+    return quaternion_product(unit, (cosine, *scale(spin, sine)))
 
 
 def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:
