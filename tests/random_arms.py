@@ -29,6 +29,7 @@ def random_arm(num_joints: int, seed: int) -> mujoco.MjModel:
         if i % 2 and not shares_body:
             _add_body(body, rng, welded=True)  # a side branch
             body = _add_body(body, rng, welded=True)
+    _add_body(spec.worldbody.bodies[0].bodies[0], rng, welded=True)  # numbered after the links
     blade = _add_body(body, rng, welded=True, gravcomp=0.5)
     blade.add_geom(
         name="blocker",

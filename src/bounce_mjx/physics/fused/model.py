@@ -117,8 +117,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
     if compensated is not None:
         links = [dataclasses.replace(x, floating_mass=0.0, floating_moment=ZERO3) for x in links]
     paddle_body = frames[int(m.geom_bodyid[addresses.paddle_geom])]
-    paddle_origin = _floats(m.geom_pos[addresses.paddle_geom])
-    paddle_rotation = _rotation(m.geom_quat[addresses.paddle_geom])
+    paddle = _geom_frame(m, addresses.paddle_geom)
     implicit = m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     explicit_damping = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     return FusedModel(
@@ -129,8 +128,8 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
             _read_servo(m, actuator, joint)
             for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
         ),
-        paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle_origin)),
-        paddle_rotation=_exact(matmul(paddle_body.rotation, paddle_rotation)),
+        paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle.origin)),
+        paddle_rotation=_exact(matmul(paddle_body.rotation, paddle.rotation)),
         paddle_body=paddle_body,
         ball_mass=float(m.body_mass[addresses.ball_body]),
         ball_inertia=float(m.body_inertia[addresses.ball_body, 0]),
@@ -265,11 +264,11 @@ def _read_links(
     the frame of the world. Welded bodies belong to the link of the last joint above them."""
     m = mj_model
     links: list[chain.Link] = []
-    frames = {0: Frame()}
+    frames, link_of = {0: Frame()}, {0: -1}
     for body in range(1, m.nbody):  # parents come before their children
         if m.body_weldid[body] == addresses.ball_body:
             continue
-        parent = frames[int(m.body_parentid[body])]
+        parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
         origin = vadd(parent.origin, matvec(parent.rotation, _floats(m.body_pos[body])))
         rotation = _exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
         frame = Frame(origin, rotation)
@@ -277,11 +276,12 @@ def _read_links(
             slides = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
             anchor = ZERO3 if slides else _floats(m.jnt_pos[joint])
             origin = vadd(frame.origin, matvec(frame.rotation, anchor))
+            link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
             frame = Frame(scale(anchor, -1.0))
         frames[body] = frame
-        if m.body_weldid[body] != 0:
-            links[-1] = _with_body(m, links[-1], body, frame)
+        if link_of[body] >= 0:
+            links[link_of[body]] = _with_body(m, links[link_of[body]], body, frame)
     return links, frames
 
 
@@ -309,9 +309,10 @@ def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Lin
 def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
     """Link with the mass of one more body, whose frame is given in the link."""
     mass = float(mj_model.body_mass[body])
+    inertial = _inertial_frame(mj_model, body)
     rotation = np.array(frame.rotation)
-    centre = np.array(frame.origin) + rotation @ mj_model.body_ipos[body]
-    principal = rotation @ np.array(_rotation(mj_model.body_iquat[body]))
+    centre = np.array(frame.origin) + rotation @ np.array(inertial.origin)
+    principal = rotation @ np.array(inertial.rotation)
     about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
     about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     floating = float(mj_model.body_gravcomp[body])
@@ -323,6 +324,34 @@ def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Fra
         floating_mass=link.floating_mass + floating * mass,
         floating_moment=_floats(link.floating_moment + floating * mass * centre),
     )
+
+
+def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
+    """Inertial frame of a body in the body's frame. Where the two are almost the same, MuJoCo flags
+    the body and computes as if they were the same."""
+    same = mj_model.body_sameframe[body]
+    frame = Frame(_floats(mj_model.body_ipos[body]), _rotation(mj_model.body_iquat[body]))
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
+        return Frame()
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
+        return Frame(frame.origin)
+    return frame
+
+
+def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
+    """Frame of a geom in its body's frame, with the same flags as for inertial frames."""
+    same = mj_model.geom_sameframe[geom]
+    origin, rotation = _floats(mj_model.geom_pos[geom]), _rotation(mj_model.geom_quat[geom])
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
+        return Frame()
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
+        return Frame(origin)
+    inertial = _inertial_frame(mj_model, int(mj_model.geom_bodyid[geom]))
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA:
+        return inertial
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT:
+        return Frame(origin, inertial.rotation)
+    return Frame(origin, rotation)
 
 
 def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float | None:
