@@ -20,6 +20,7 @@ The friction and the solref of the two geoms act as in a contact without a pair.
 
 import dataclasses
 from collections.abc import Iterator
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -175,40 +176,43 @@ def _sources(mj_model: mujoco.MjModel) -> dict[str, _Source]:
     }
 
 
-def _read(mj_model: mujoco.MjModel, changed: Fields, varied: Fields) -> PhysicsParameters:
+def _read(
+    mj_model: mujoco.MjModel, changed: Fields, varied: Fields, xp: ModuleType = jnp
+) -> PhysicsParameters:
     """The parameters of one environment.
 
     Args:
       changed: fields of its model.
+      xp: numpy or jax.numpy, for the arrays in `changed`.
       varied: mask of the entries of each field that differ between environments.
     """
     given = {
-        parameter: source.sign * jnp.asarray(changed[source.field])[source.index]
+        parameter: source.sign * xp.asarray(changed[source.field])[source.index]
         for parameter, source in _sources(mj_model).items()
         if source.field in varied and varied[source.field][source.index].any()
     }
     addresses, links = find_addresses(mj_model), link_bodies(mj_model)
     geoms = addresses.ball_geom, addresses.paddle_geom
     if "body_mass" in varied and varied["body_mass"][np.concatenate(links)].any():
-        mass = jnp.asarray(changed["body_mass"])
-        given["link_mass"] = jnp.stack([mass[np.asarray(bodies)].sum() for bodies in links])
+        mass = xp.asarray(changed["body_mass"])
+        given["link_mass"] = xp.stack([mass[np.asarray(bodies)].sum() for bodies in links])
     if "pair_friction" in varied:
         given["contact_friction"] = changed["pair_friction"][contact_pair(mj_model), 0]
     if "geom_friction" in varied and varied["geom_friction"][geoms, 0].any():
-        values = jnp.asarray(changed["geom_friction"])[geoms, 0]
+        values = xp.asarray(changed["geom_friction"])[geoms, 0]
         given["contact_friction"] = _combined(mj_model, geoms, values)
     solref = None
     if "pair_solref" in varied:
         solref = changed["pair_solref"][contact_pair(mj_model)]
     if "geom_solref" in varied and varied["geom_solref"][geoms, :].any():
-        solref = mixed_solref(mj_model, geoms, *jnp.asarray(changed["geom_solref"])[geoms, :])
+        solref = mixed_solref(mj_model, geoms, *xp.asarray(changed["geom_solref"])[geoms, :], xp)
     if solref is not None:
         first, second = solref
-        time_constant = jnp.maximum(first, 2.0 * mj_model.opt.timestep)
-        given["contact_stiffness"] = jnp.where(
+        time_constant = xp.maximum(first, 2.0 * mj_model.opt.timestep)
+        given["contact_stiffness"] = xp.where(
             first > 0.0, 1.0 / (time_constant * second) ** 2, -first
         )
-        given["contact_damping"] = jnp.where(first > 0.0, 2.0 / time_constant, -second)
+        given["contact_damping"] = xp.where(first > 0.0, 2.0 / time_constant, -second)
     return PhysicsParameters(**given)
 
 
@@ -222,7 +226,11 @@ def _combined(mj_model: mujoco.MjModel, geoms: tuple[int, int], values: jax.Arra
 
 
 def mixed_solref(
-    mj_model: mujoco.MjModel, geoms: tuple[int, int], first: jax.Array, second: jax.Array
+    mj_model: mujoco.MjModel,
+    geoms: tuple[int, int],
+    first: jax.Array,
+    second: jax.Array,
+    xp: ModuleType = jnp,
 ) -> jax.Array:
     """`solref` [2] of a contact of two geoms with their own ones [2]: the mean by `solmix` of two
     standard formats, and the smaller values if one has the direct format; a higher priority decides
@@ -233,7 +241,7 @@ def mixed_solref(
     mix = mj_model.geom_solmix[list(geoms)]
     share = mix[0] / mix.sum() if mix.sum() > 0.0 else 0.5
     mean = share * first + (1.0 - share) * second
-    return jnp.where((first[0] > 0.0) & (second[0] > 0.0), mean, jnp.minimum(first, second))
+    return xp.where((first[0] > 0.0) & (second[0] > 0.0), mean, xp.minimum(first, second))
 
 
 def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varied: Fields) -> None:
@@ -248,15 +256,16 @@ def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varie
         # A position servo needs kp in both.
         names.append("actuator_biasprm")
 
-    def effect(fields: Fields) -> Fields:
-        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied))
+    def effect(index: int) -> Fields:
+        fields = {name: batches[name][min(index, len(batches[name]) - 1)] for name in varied}
+        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied, np))
         edited |= {f"opt.{name}": value for name, value in options.items()}
-        return {name: jnp.asarray(edited.get(name, base[name])) for name in names}
+        return {name: edited.get(name, np.asarray(base[name])) for name in names}
 
-    with jax.ensure_compile_time_eval():
-        effects = jax.jit(jax.vmap(effect))({name: batches[name] for name in varied})
+    each = [effect(i) for i in range(max(len(batches[name]) for name in varied))]
+    effects = {name: np.stack([one[name] for one in each]) for name in names}
     for name in names:
-        wanted, given = batches.get(name, np.asarray(base[name])), np.asarray(effects[name])
+        wanted, given = batches.get(name, np.asarray(base[name])), effects[name]
         wrong = np.any(np.abs(wanted - given) > 1e-4 * np.abs(wanted) + 1e-9, axis=0)
         wrong &= ~_without_effect(mj_model, name)
         if wrong.any():
