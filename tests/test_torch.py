@@ -3,9 +3,11 @@ libraries."""
 
 import copy
 import itertools
+import runpy
 import subprocess
 import sys
 import types
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -44,6 +46,7 @@ EPISODE_STEPS = 20
 PPO = PPOConfig(
     num_envs=8, rollout_length=8, num_epochs=2, num_minibatches=2, hidden_layers=(16, 12)
 )
+SMALL = {"num_envs", "rollout_length", "num_epochs", "num_minibatches", "hidden_layers"}
 LIBRARIES = ("rsl_rl", "skrl")
 
 
@@ -342,6 +345,13 @@ def test_rsl_rl_exports_the_policy(learners, tmp_path):
     for row, action in zip(observation, expected, strict=True):
         (given,) = session.run(None, {"obs": row[None].numpy()})
         np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
+
+
+def test_example_trains_and_acts_with_its_export(tmp_path):
+    main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "rsl_rl_ppo.py"))["main"]
+    rewards = main(tmp_path, iterations=1, **PPO.model_dump(include=SMALL))
+    assert (tmp_path / "policy.onnx").stat().st_size > 1000 and list(tmp_path.glob("model_*.pt"))
+    assert rewards.shape == (100,) and rewards.isfinite().all() and rewards.std() > 0.0
 
 
 def test_rsl_rl_runner_trains(task, tmp_path):
