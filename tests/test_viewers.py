@@ -56,7 +56,8 @@ from bounce_mjx.viewers.display import (
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
-from bounce_mjx.viewers.scene import Scene
+from bounce_mjx.viewers.scene import Scene, camera_pose
+from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
@@ -194,16 +195,21 @@ def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
     both.target_height = None
 
 
-def test_an_exchanged_policy_acts(env: BounceBall) -> None:
-    def control(policy, states, key):
-        return policy["action"][:, None] + jnp.zeros_like(states.obs[: env.action_size])
+@pytest.fixture(scope="module")
+def exchangeable(env: BounceBall) -> Simulation:
+    """One robot under a policy that is one constant action for all joints."""
 
-    still = {"action": np.zeros(env.action_size, np.float32)}
-    simulation = Simulation(env, control, 1, seed=0, policy=still)
-    before = simulation.frame.qpos[0, :6]
-    np.testing.assert_allclose(simulation.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
-    simulation.policy = {"action": np.ones(env.action_size, np.float32)}
-    moved = simulation.record(0.1).qpos[-1, 0, :6] - before
+    def control(policy, states, key):
+        return policy + jnp.zeros_like(states.obs[: env.action_size])
+
+    return Simulation(env, control, 1, seed=0, policy=np.float32(0.0))
+
+
+def test_an_exchanged_policy_acts(env: BounceBall, exchangeable: Simulation) -> None:
+    before = exchangeable.frame.qpos[0, :6]
+    np.testing.assert_allclose(exchangeable.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
+    exchangeable.policy = np.float32(1.0)
+    moved = exchangeable.record(0.1).qpos[-1, 0, :6] - before
     # The target of a servo is ahead of its joint by the scale of an action.
     assert np.all(moved > 0.5 * env.config.action_scale)
 
@@ -329,6 +335,32 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     display.pose(env.mj_model.qpos0, 0.5)
     assert display.data.site(TARGET_SITE).xpos[2] == 0.5
     assert display.data.site(HOME_SITE).xpos[2] == env.config.reward.paddle_home_height
+
+
+# The camera of the page
+
+
+def projected(points: np.ndarray, aspect: float, on_phone: bool, offsets) -> np.ndarray:
+    """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
+    position, gaze = camera_pose(offsets, aspect, on_phone)
+    forward = (gaze - position) / np.linalg.norm(gaze - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen = (points - position) @ np.stack([right, np.cross(right, forward), forward]).T
+    return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
+
+
+@pytest.mark.parametrize("number", [1, 2, 4, 16])
+@pytest.mark.parametrize(
+    ("aspect", "on_phone", "lowest"), [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
+)
+def test_the_camera_sees_every_robot(number: int, aspect, on_phone, lowest) -> None:
+    """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
+    parts = np.array([(-0.1, 0.0, 0.0), (0.64, 0.0, 0.05), (0.59, 0.0, 0.85)])
+    offsets = scene_grid(number)
+    points = (offsets[:, None] + parts).reshape(-1, 3)
+    across, up = projected(points, aspect, on_phone, offsets).T
+    assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
 
 
 # The clock
@@ -550,9 +582,11 @@ def test_results_are_shown_as_they_are_met() -> None:
     assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
 
 
-def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, monkeypatch) -> None:
+def test_the_page_of_a_training_shows_its_newest_policy(
+    exchangeable: Simulation, monkeypatch
+) -> None:
     """The training only puts the news into a queue."""
-    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: scripted)
+    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: exchangeable)
     stop = threading.Event()
 
     def step(simulation) -> None:
@@ -566,8 +600,8 @@ def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, mo
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
     means = {"episode/return": 1.0, "episode/bounces": NAN, "speed/steps_per_second": 2e6}
     training.block(500_000, means)
-    training.evaluation(500_000, evaluated(True, False), policy := ("newest",))
-    wait_until(lambda: scripted.policy == policy)
+    training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
+    wait_until(lambda: exchangeable.policy == 0.5)
     while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
         client._receive()
     assert any("1 of 2 results met" in text for text in client.texts)

@@ -38,8 +38,8 @@ class TrainingCommand(TrainConfig):
     """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
     The default is default on an accelerator, and cpu on a CPU."""
     robot: Path | None = None
-    """Config of a robot, such as configs/robots/ur5e.yaml or the file that bounce-mjx adopt wrote,
-    on top of the preset."""
+    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
+    one in configs/robots/ (ur5e, panda or iiwa)."""
     resume: Path | None = None
     """Folder of a run, or latest for the newest run, to continue in place from its latest
     checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
@@ -109,8 +109,8 @@ def run_command(
     make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
     prog: str,
     watcher: Watcher | None = None,
-) -> None:
-    """Trains according to the command, and prints the results.
+) -> Sequence[Outcome]:
+    """Trains according to the command, and prints the results; returns each seed's outcome.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -141,6 +141,7 @@ def run_command(
     run = shlex.quote(str(best.run))
     say(console, f"measure it: bounce-mjx eval {run}")
     say(console, f"watch it: bounce-mjx play {run}")
+    return outcomes
 
 
 def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
