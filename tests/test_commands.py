@@ -184,6 +184,11 @@ BAD_MJCF = {
         "default_joint_angles has 6 numbers",
         "5 joints with an actuator (Joint1, Joint3",
     ),
+    "motor": (
+        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
+        "an actuator on Joint2 that is no position servo",
+        '<position joint="Joint2"/>',
+    ),
 }
 
 

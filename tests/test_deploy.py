@@ -463,9 +463,10 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
     foreign = onnx.load_from_string(shipped)
     del foreign.metadata_props[:]
-    newer = onnx.load_from_string(shipped)
-    (entry,) = (prop for prop in newer.metadata_props if prop.key == "format")
-    entry.value = "2"
+    older = onnx.load_from_string(shipped)
+    entries = {prop.key: prop for prop in older.metadata_props}
+    entries["format"].value = "1"
+    older.metadata_props.remove(entries["estimator"])
     unknown = onnx.load_from_string(shipped)
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
@@ -474,7 +475,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),
-        "format is 2, not 1": newer.SerializeToString(),
+        "format is 1, not 2": older.SerializeToString(),
     }
     for reason, content in broken.items():
         (tmp_path / "a.onnx").write_bytes(content)

@@ -332,6 +332,13 @@ def test_a_result_has_one_line_of_80_columns(env):
         assert row.endswith(f"{result.bound:10} pass") and len(row) <= 80
 
 
+def test_seeds_have_one_line_of_80_columns_each(env):
+    report = judge(env, statistics())
+    seeds = [2**31 - 2, 2**31 - 1, 0]
+    rows = show(seeds_table({seeds[0]: report, seeds[1]: report, 0: None})).splitlines()
+    assert [row.split()[0] for row in rows[2:]] == [*map(str, seeds), "mean", "std"]
+
+
 def test_readme_shows_the_table_as_it_is_printed(env):
     shown = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
     table = re.search(r"(?m)^    result +measured.+\n(?:    \S.+\n)+", shown)[0]

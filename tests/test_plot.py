@@ -2,10 +2,12 @@
 
 import base64
 import dataclasses
+import importlib.util
 import io
 import json
 import re
 import shutil
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
 
@@ -37,6 +39,7 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.training import report as training_report
+from bounce_mjx.training.log import Logs, WandbLog, open_log
 
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
@@ -366,6 +369,47 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     assert pixels.shape == (picture.height, picture.width, 3)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
+
+
+class FakeWandb:
+    """Stands for a run of Weights & Biases, and for the package."""
+
+    def __init__(self):
+        self.settings, self.logged, self.finished = {}, [], False
+
+    def init(self, **settings):
+        self.settings = settings
+        return self
+
+    def log(self, values: dict, step: int) -> None:
+        self.logged.append((step, values))
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
+    config = TrainConfig(seed=7)
+    log = Logs([open_log(tmp_path), WandbLog(tmp_path, "bounce", config)])
+    log.add_scalar("episode/return", 2.5, 64)
+    log.add_text("results", "| a |", 64)
+    log.close()
+    assert logged(tmp_path, "episode/return") == {64: 2.5}
+    assert fake.logged == [(64, {"episode/return": 2.5})] and fake.finished
+    first = fake.settings
+    assert (first["project"], first["config"]["seed"]) == ("bounce", 7)
+    # A resumed training continues the same run.
+    WandbLog(tmp_path, "bounce", config)
+    assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
+
+
+def test_weights_and_biases_is_optional(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--wandb", "bounce"])
+    assert exit_info.value.code == 2
+    assert "pip install 'bounce_mjx[wandb]'" in capsys.readouterr().err
 
 
 def test_a_result_that_is_not_judged_is_marked(trained: Path) -> None:

@@ -14,6 +14,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.robot.adopt import Adoption, adopt
+from bounce_mjx.robot.arm import limit_words
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import write_atomically
@@ -123,7 +124,7 @@ def described(adoption: Adoption) -> list[str]:
     ):
         lines.append(
             f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
-            f"kv {servo.damping:.4g}, force limit {servo.force_limit:.4g}"
+            f"kv {servo.damping:.4g}, {limit_words(servo.force_limit)}"
         )
     return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]
 
@@ -135,7 +136,7 @@ def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: Adopti
       UserError: the file cannot be written.
     """
     site = adoption.config.site
-    head = f"# The arm of {mjcf} with a paddle at {site}: bounce-mjx adopt {mjcf} --site {site}\n"
+    head = f"# An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}\n"
     text = head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     try:
         write_atomically(out, text)

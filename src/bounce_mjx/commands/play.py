@@ -55,11 +55,10 @@ def main(args: Sequence[str] | None = None) -> None:
             )
         console = Console()
         set_up_jax()
-        shown = [_load(path, command, console) for path in command.checkpoints or (None,)]
+        paths = command.checkpoints or (None,)
         show(
-            shown,
+            [_load(path, command, console) for path in paths],
             command.viewing,
-            title=" | ".join(one.name for one in shown),
             target_height=command.target_height,
             console=console,
         )
@@ -77,8 +76,6 @@ def _load(path: Path | None, command: PlayCommand, console: Console) -> Shown:
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         return make_policy_controller(networks, policy)
 
-    return Shown(
-        validate(EnvConfig, dict(config.env) | changes, "play"),
-        make_controller,
-        f"{checkpoint.run.name}, {checkpoint.steps:,} steps",
-    )
+    env_config = validate(EnvConfig, dict(config.env) | changes, "play")
+    title = f"{checkpoint.run.name}, {checkpoint.steps / 1e6:.1f} M steps"
+    return Shown(env_config, make_controller, title)

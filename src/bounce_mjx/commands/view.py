@@ -11,7 +11,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import ROBOTS, load_config, named_file
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.setup import set_up_jax
@@ -35,7 +35,8 @@ class ViewCommand(StrictModel):
     actions: Literal["random", "zero", "scripted"] = "random"
     """random: uniform; zero: the servos hold their angles; scripted: a hand-written juggler."""
     robot: Path | None = None
-    """Config of a robot, such as the file that bounce-mjx adopt wrote."""
+    """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
+    configs/robots/ (ur5e, panda or iiwa)."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
 
@@ -45,6 +46,7 @@ def main(args: Sequence[str] | None = None) -> None:
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
         robot = path_flag(args, "--robot")
+        robot = robot and named_file(robot, ROBOTS)
         command = parse(
             ViewCommand,
             args,
@@ -53,11 +55,10 @@ def main(args: Sequence[str] | None = None) -> None:
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
         set_up_jax()
-        title = f"{command.actions} actions"
+        controller = _CONTROLLERS[command.actions]
         show(
-            [Shown(command.env, _CONTROLLERS[command.actions], title)],
+            [Shown(command.env, controller, f"{command.actions} actions")],
             command.viewing,
-            title=title,
             target_height=None,
             console=Console(),
         )

@@ -57,6 +57,8 @@ class Metadata(NamedTuple):
     """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
     estimator: dict[str, Any] | None
     """Constants of the Kalman filter by the names in `ball_filter.Constants`; None without one."""
+    memory_size: int
+    """Size H of the input `memory` and of the output `next_memory` [N, H]; 0 without a memory."""
     control_dt: float
     """Time between two actions, s."""
     action: str
@@ -100,11 +102,12 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for anything else."""
     missing = [name for name in Metadata._fields if name not in entries]
+    # A file of another format lacks entries too, but the format is the reason.
+    if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
+        raise ValueError(f"its format is {given}, not {FORMAT}")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
     plain = {name: json.loads(entries[name]) for name in Metadata._fields}
-    if plain["format"] != FORMAT:
-        raise ValueError(f"its format is {plain['format']}, not {FORMAT}")
     try:
         plain["observation"] = tuple(Part(**part) for part in plain["observation"])
         plain["chain"] = tuple(Link(**link) for link in plain["chain"])

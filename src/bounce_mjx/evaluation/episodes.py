@@ -8,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import Ranges
 from bounce_mjx.task.state import State
@@ -51,20 +51,22 @@ def run_episodes(
     """
 
     def unfinished(carry):
-        _, statistics, _, step = carry
+        _, _, statistics, _, step = carry
         return jnp.any(statistics.running) & (step < env.config.episode_steps)
 
     def advance(carry):
-        states, statistics, recording, step = carry
-        actions = act(networks, policy, states.obs.T)
+        states, memory, statistics, recording, step = carry
+        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
         recording = record(env, recording, states, statistics.running, step)
-        return states, accumulate(env, statistics, states, step), recording, step + 1
+        statistics = accumulate(env, statistics, states, step)
+        return states, memory, statistics, recording, step + 1
 
     episodes = states.done.shape[-1]
     recording = empty_recording(env.config.episode_steps, env.action_size, min(recorded, episodes))
-    carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
-    _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
+    memory = networks.policy_network.start_memory((episodes,))
+    carry = (states, memory, empty_statistics(episodes), recording, jnp.int32(0))
+    _, _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
     return statistics, recording
 
 
@@ -96,19 +98,20 @@ def make_reporting_evaluator(
 
     @jax.jit
     def start(key: jax.Array):
-        return reset_episodes(env, key, episodes), empty_statistics(episodes), jnp.int32(0)
+        memory = networks.policy_network.start_memory((episodes,))
+        return reset_episodes(env, key, episodes), memory, empty_statistics(episodes), jnp.int32(0)
 
     @jax.jit
     def go_on(policy: Policy, carry, until: jax.Array):
         def unfinished(carry):
-            _, statistics, step = carry
+            _, _, statistics, step = carry
             return jnp.any(statistics.running) & (step < until)
 
         def advance(carry):
-            states, statistics, step = carry
-            actions = act(networks, policy, states.obs.T)
+            states, memory, statistics, step = carry
+            actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
             states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
-            return states, accumulate(env, statistics, states, step), step + 1
+            return states, memory, accumulate(env, statistics, states, step), step + 1
 
         return jax.lax.while_loop(unfinished, advance, carry)
 
@@ -117,9 +120,9 @@ def make_reporting_evaluator(
         second = max(1, round(1.0 / env.dt))
         for done in range(0, limit, second):
             carry = go_on(policy, carry, np.int32(min(done + second, limit)))
-            if not np.any(carry[1].running):
+            if not np.any(carry[2].running):
                 break
             progress(min(1.0, (done + second) / limit))
-        return carry[1]
+        return carry[2]
 
     return evaluate

@@ -1,6 +1,5 @@
 """Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -113,10 +112,10 @@ def _servos(
     stiffness = damping * speed / scale
     limits = arm.force_limits
     made = zip(stiffness, damping, limits, strict=True)
-    servos = tuple(Servo(_rounded(k), _rounded(d), float(limit)) for k, d, limit in made)
+    servos = tuple(Servo(_rounded(k), _rounded(d), limit) for k, d, limit in made)
     return servos, _rounded(scale), False
 
 
 def _rounded(value: float) -> float:
     """The value with four digits."""
-    return float(f"{value:.4g}") if math.isfinite(value) else value
+    return float(f"{value:.4g}")

@@ -25,6 +25,8 @@ PADDLE_GEOM_NAME = "blocker"
 MIN_JOINTS = 3
 
 _PADDLE_BODY_NAME = "paddle"
+# Viewers show the groups 0 to 2.
+_HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "target_height")
 _RESERVED += ("paddle_home",)
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
@@ -38,8 +40,8 @@ class Servo(NamedTuple):
     """N m/rad, or N/m."""
     damping: float
     """N m s/rad, or N s/m."""
-    force_limit: float
-    """N m, or N; infinite for none."""
+    force_limit: float | None
+    """N m, or N; None for no limit."""
 
 
 class Arm(NamedTuple):
@@ -50,8 +52,8 @@ class Arm(NamedTuple):
     """The acting joints, from the base to the paddle."""
     servos: tuple[Servo | None, ...]
     """The MJCF's own position servo of each acting joint; None for another actuator."""
-    force_limits: tuple[float, ...]
-    """Largest force of the MJCF's actuator of each acting joint, N m or N; infinite for none."""
+    force_limits: tuple[float | None, ...]
+    """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
 
@@ -395,6 +397,7 @@ class _Builder:
         touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
         if touching:
             self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
+        self._hide_contact_shapes()
         for geom in self._arm.geoms:
             geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
@@ -411,6 +414,14 @@ class _Builder:
         for joint in joints:
             parts[joint].limited = mujoco.mjtLimited.mjLIMITED_FALSE
             parts[joint].frictionloss = 0.0
+
+    def _hide_contact_shapes(self) -> None:
+        """Leaves only the pictured geoms of a body visible, where it has both kinds."""
+        for body in self._arm.bodies[1:]:
+            touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
+            if any(touching) and not all(touching):
+                for geom, touches in zip(body.geoms, touching, strict=True):
+                    geom.group = _HIDDEN_GROUP if touches else geom.group
 
     def _attach(
         self, names: tuple[str, ...], end: int, position: np.ndarray, quaternion: np.ndarray
@@ -473,12 +484,12 @@ class _Builder:
             )
             actuator.gainprm[0] = stiffness
             actuator.biasprm[:3] = 0.0, -stiffness, -damping
-            if np.isfinite(limit):
+            if limit is not None:
                 actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
                 actuator.forcerange = [-limit, limit]
             changes.append(
                 f"replaced the actuator of {name} by a position servo: kp {stiffness:.4g}, "
-                f"kv {damping:.4g}, force limit {limit:.4g}"
+                f"kv {damping:.4g}, {limit_words(limit)}"
             )
         return changes
 
@@ -511,6 +522,11 @@ def _add_paddle(
         )
 
 
+def limit_words(limit: float | None) -> str:
+    """A force limit for a line of text."""
+    return "no force limit" if limit is None else f"force limit {limit:.4g}"
+
+
 def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
     """The position servo that drives a joint alone; None for other actuators."""
     actuator = actuators[0]
@@ -534,9 +550,9 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
     )
 
 
-def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> float:
-    """Largest force of a joint's actuators: by the force range, by the control range of a plain
-    motor, or by the joint's own limit."""
+def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> float | None:
+    """Largest force of a joint's actuators, None for no limit: by the force range, by the control
+    range of a plain motor, or by the joint's own limit."""
     total = 0.0
     for actuator in actuators:
         limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
@@ -549,7 +565,7 @@ def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> flo
         total = max(total, limit * gear)
     if model.jnt_actfrclimited[joint]:
         total = min(total, float(np.min(np.abs(model.jnt_actfrcrange[joint]))))
-    return total
+    return total if np.isfinite(total) else None
 
 
 def _joints_of(model: mujoco.MjModel, body: int) -> range:

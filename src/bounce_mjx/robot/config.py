@@ -1,15 +1,11 @@
 """Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
 
-from typing import Annotated
-
 import pydantic
-from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
 
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
-Limit = Annotated[float, Field(gt=0.0)]
 
 
 class PaddleConfig(StrictModel):
@@ -52,8 +48,8 @@ class RobotConfig(StrictModel):
     N/m; null keeps the MJCF's servos."""
     servo_damping: tuple[NonNegative, ...] | None = None
     """Damping of each replaced servo, N m s/rad or N s/m."""
-    servo_force_limit: tuple[Limit, ...] | None = None
-    """Force limit of each replaced servo, N m or N; .inf for none."""
+    servo_force_limit: tuple[Positive | None, ...] | None = None
+    """Force limit of each replaced servo, N m or N; null for a servo without one."""
 
     @pydantic.model_validator(mode="after")
     def _check_servos(self):

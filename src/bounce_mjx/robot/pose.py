@@ -25,6 +25,8 @@ _DAMPING = 1e-3
 _ITERATIONS = 60
 _MAX_STEP = 0.4
 _CLEARANCE = 0.09
+# Least height of the lines between the joints beyond the first: half the thickness of a link, m.
+_FLOOR_CLEARANCE = 0.07
 # Heights above the paddle that must be free of the arm, m: the ball flies there.
 _HEADROOM = 1.0
 
@@ -76,7 +78,7 @@ def mounts(length: float = 0.19) -> tuple[Mount, ...]:
 
 def find_pose(
     model: mujoco.MjModel,
-    force_limits: Sequence[float],
+    force_limits: Sequence[float | None],
     choices: Sequence[Mount],
     seed: int = 0,
 ) -> Pose:
@@ -84,14 +86,15 @@ def find_pose(
 
     Args:
       model: the compiled scene, with the paddle mounted as in the first choice.
-      force_limits: largest force of each acting joint, N m or N.
+      force_limits: largest force of each acting joint, N m or N; None for no limit.
       choices: mounts of the paddle to try.
       seed: seed of the random first guesses.
 
     Raises:
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
-    search = _Search(model, np.asarray(force_limits), np.random.default_rng(seed))
+    limits = np.array([np.inf if limit is None else limit for limit in force_limits])
+    search = _Search(model, limits, np.random.default_rng(seed))
     return search.best(choices)
 
 
@@ -286,13 +289,13 @@ class _Search:
         return float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
 
     def _is_clear(self, paddle: np.ndarray) -> bool:
-        """Whether the links stay above the floor and out of the ball's way: the straight lines
-        between the joints, and those of the arm's geoms that are not on the last link."""
+        """Whether the links, as straight lines between the joints, stay above the floor and out of
+        the ball's way."""
         data = self._data
         points = [data.xanchor[j] for j in self._joints] + [data.xpos[self._body]]
         for joint, (start, end) in enumerate(zip(points, points[1:], strict=False)):
             samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
-            if joint and np.any(samples[:, 2] < 0.04):
+            if joint and np.any(samples[:, 2] < _FLOOR_CLEARANCE):
                 return False
             near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
             beside = (samples[:, 2] > paddle[2] - 0.03) & (samples[:, 2] < paddle[2] + _HEADROOM)

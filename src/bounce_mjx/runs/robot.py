@@ -15,6 +15,7 @@ from pathlib import Path
 import mujoco
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.robot.arm import locate
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal
 
 ROBOT = "robot"
@@ -25,14 +26,16 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
     by a manifest. An absolute path inside the MJCF still leads to the original file.
 
     Args:
-      mjcf: a file that MuJoCo compiles.
+      mjcf: a file that MuJoCo compiles, as for `locate`.
 
     Returns:
       The copy of the MJCF file.
 
     Raises:
       OSError: a file cannot be read or written.
+      UserError: the file is missing.
     """
+    mjcf = locate(mjcf)
     files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(mjcf))]
     root = Path(os.path.commonpath([path.parent for path in files]))
     for path in files:

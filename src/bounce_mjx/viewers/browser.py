@@ -32,7 +32,7 @@ _LEGEND = """<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px
 <b style="color:#2b8a3e">green disc</b> target height<br>
 <b style="color:#1c6ad6">blue frame</b> home of the paddle<br>
 <b style="color:#e8590c">orange line</b> path of the ball, 0.6 s<br>
-<b>space</b> pause, <b>R</b> reset, <b>&uarr; &darr;</b> target height, <b>&larr; &rarr;</b> speed,
+<b>space</b> pause, <b>R</b> reset, <b>T G</b> target height, <b>M N</b> speed,
 <b>I K J L</b> push the ball, <b>Ctrl-K</b> all keys
 </div>"""
 
@@ -188,7 +188,7 @@ class LivePage:
         shown = self._settings.num_shown
         recording = Frame(*(np.stack(values)[:, :shown] for values in zip(*frames, strict=True)))
         text = replay(self._simulation.env, recording, names=self._names)
-        client.send_file_download("bounce.html", text.encode())
+        client.send_file_download("bounce.html", text.encode(), save_immediately=True)
 
     def _add_plots(self, side: viser.PanelHandle) -> None:
         gui = self._server.gui

@@ -124,7 +124,8 @@ class Controls:
         self._add_keys(gui)
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """The keys of MuJoCo's window (`native`), which Ctrl-K also lists."""
+        """The keys of MuJoCo's window (`native`), which Ctrl-K also lists. The arrows and W, A, S,
+        D, Q and E move viser's camera."""
 
         def pause(_) -> None:
             self._paused.value = not self._paused.value
@@ -155,10 +156,10 @@ class Controls:
         for label, key, change in (
             ("pause", "space", pause),
             ("reset", "R", reset),
-            ("target height up", "arrowup", target(_TARGET_STEP)),
-            ("target height down", "arrowdown", target(-_TARGET_STEP)),
-            ("faster", "arrowright", speed(_SPEED_STEP)),
-            ("slower", "arrowleft", speed(-_SPEED_STEP)),
+            ("target height up", "T", target(_TARGET_STEP)),
+            ("target height down", "G", target(-_TARGET_STEP)),
+            ("faster", "M", speed(_SPEED_STEP)),
+            ("slower", "N", speed(-_SPEED_STEP)),
             ("push the ball up", "I", push("up")),
             ("push the ball back", "K", push("back")),
             ("push the ball left", "J", push("left")),

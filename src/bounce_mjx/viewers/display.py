@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import trimesh
 
+from bounce_mjx.robot.arm import compile_spec
 from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
@@ -49,7 +50,7 @@ class Display:
 
 def _with_markers(config: EnvConfig) -> mujoco.MjModel:
     """The config's model, with the two marker sites added if it lacks them."""
-    spec, _ = scene_spec(config.mjcf, config.robot)
+    spec, path = scene_spec(config.mjcf, config.robot)
     sites = {site.name for site in spec.sites}
     reward = config.reward
     if TARGET_SITE not in sites:
@@ -68,13 +69,14 @@ def _with_markers(config: EnvConfig) -> mujoco.MjModel:
             rgba=[0.15, 0.45, 1.0, 0.45],
         )
     _add_outline(spec)
-    return spec.compile()
+    return compile_spec(spec, path)
 
 
 def _add_outline(spec: mujoco.MjSpec) -> None:
     """Replaces the plate of the paddle's home by the four edges around it."""
     home = spec.site(HOME_SITE)
-    (x, y, z), rgba = home.size, home.rgba.copy()
+    (x, y, z), material = home.size, spec.material(home.material)
+    rgba = home.rgba.copy() if material is None else material.rgba.copy()
     home.rgba = [*rgba[:3], 0.0]
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, home.quat)

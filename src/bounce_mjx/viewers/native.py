@@ -21,22 +21,18 @@ _PICTURE_RATE = 60.0
 _TRAIL_SECONDS = 0.5
 _TARGET_STEP = 0.05
 _PUSH = 0.2
-# Flags that MuJoCo's window toggles with the keys I, J, K, L and R.
-_OPTION_FLAGS = [mujoco.mjtVisFlag.mjVIS_INERTIA, mujoco.mjtVisFlag.mjVIS_JOINT]
-_SCENE_FLAGS = [
-    mujoco.mjtRndFlag.mjRND_SKYBOX,
-    mujoco.mjtRndFlag.mjRND_ADDITIVE,
-    mujoco.mjtRndFlag.mjRND_REFLECTION,
-]
-# GLFW's key codes.
-_SPACE, _RIGHT, _LEFT, _DOWN, _UP = 32, 262, 263, 264, 265
+_KEYS = "RTGMNIKJL"
 _HELP = {
     "space": "pause",
     "R": "reset",
-    "up / down": "target height",
-    "left / right": "speed",
+    "T / G": "target height",
+    "M / N": "speed",
     "I K J L": "push the ball",
 }
+# Flags that MuJoCo's window toggles with the same keys.
+_OPTION_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjVISSTRING) if key and key in _KEYS]
+_SCENE_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjRNDSTRING) if key and key in _KEYS]
+_SPACE = 32  # GLFW's code; the code of a letter is its character.
 
 
 def has_display() -> bool:
@@ -128,12 +124,13 @@ class _Window:
             self._paused = not self._paused
         elif key == ord("R"):
             simulation.reset()
-        elif key in (_UP, _DOWN):
-            step = _TARGET_STEP if key == _UP else -_TARGET_STEP
+        elif key in (ord("T"), ord("G")):
+            step = _TARGET_STEP if key == ord("T") else -_TARGET_STEP
             height = float(simulation.frame.target_height[0])
             simulation.target_height = max(_TARGET_STEP, height + step)
-        elif key in (_RIGHT, _LEFT):
-            self._speed = float(np.clip(self._speed * (1.25 if key == _RIGHT else 0.8), 0.1, 4.0))
+        elif key in (ord("M"), ord("N")):
+            factor = 1.25 if key == ord("M") else 0.8
+            self._speed = float(np.clip(self._speed * factor, 0.1, 4.0))
         elif chr(key) in pushes:
             azimuth = np.radians(self._camera.azimuth)
             view = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

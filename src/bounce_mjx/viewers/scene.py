@@ -3,6 +3,7 @@
 import collections
 import contextlib
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,8 +27,16 @@ _LOOK_AT = np.array([0.34, 0.0, 0.44])
 _VIEW = np.array([1.06, -1.17, 0.42])
 _FIELD_OF_VIEW = math.radians(40.0)
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
-_FULL_ASPECT = 0.8
+_FULL_ASPECT = 0.9
+# On a page with fewer pixels across, viser's controls cover the lower part: the camera looks down
+# by this share of its field of view.
+_PHONE_WIDTH = 576
+_PHONE_SHIFT = 0.27
+# Where there are more robots than this, their labels are short.
+_MAX_LONG_LABELS = 4
 _FOLLOWING = 0.1
+# A page lays out its panels within this time, s.
+_LAYOUT_SECONDS = 5.0
 
 
 class Scene:
@@ -48,7 +57,8 @@ class Scene:
         self._env = env
         self._names = names
         self._display = Display(env)
-        server.on_client_connect(self._frame)
+        self._phones: set[int] = set()
+        server.on_client_connect(self._welcome)
         self.show(num_envs)
 
     def show(self, num_envs: int) -> None:
@@ -108,7 +118,7 @@ class Scene:
                 "",
                 position=place + (0.0, 0.0, _LABEL_HEIGHT),
                 anchor="bottom-center",
-                font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.7,
+                font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.8,
             )
             for i, place in enumerate(self._label_places)
         ]
@@ -117,7 +127,7 @@ class Scene:
         for client in self._server.get_clients().values():
             self._frame(client)
         initial = self._server.initial_camera
-        initial.position, initial.look_at = tuple(self._camera_position()), tuple(_LOOK_AT)
+        initial.position, initial.look_at = map(tuple, camera_pose(self._offsets))
         initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
 
     def update(self, frames: Sequence[Frame]) -> None:
@@ -168,9 +178,12 @@ class Scene:
         name = "" if self._num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
+        short = self._num_envs > _MAX_LONG_LABELS
         if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
-            return f"{name}BALL LOST, new start"
+            return f"{name}LOST" if short else f"{name}BALL LOST"
         count, height = frame.n_bounces[index], frame.target_height[index]
+        if short:
+            return f"{name}{count:.0f}"
         return f"{name}bounces {count:.0f}   target {height:.2f} m"
 
     def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
@@ -192,18 +205,45 @@ class Scene:
         )
         return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
-    def _camera_position(self, aspect: float = 1.0) -> np.ndarray:
-        """Position of a camera that sees all environments, on a canvas of width / height."""
-        extent = 1.0 + 0.95 * np.linalg.norm(np.ptp(self._offsets, axis=0))
-        return _LOOK_AT + extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a new page, and once more when its panels have taken their room."""
+        # Later the width is of the picture between the panels.
+        if client.camera.image_width < _PHONE_WIDTH:
+            self._phones.add(client.client_id)
+        self._frame(client)
+        aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if time.monotonic() < until and camera.aspect != aspect:
+                aspect = camera.aspect
+                self._frame(client)
 
     def _frame(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a page towards the environments."""
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
-            position = self._camera_position(client.camera.aspect)
+            on_phone = client.client_id in self._phones
+            position, gaze = camera_pose(self._offsets, client.camera.aspect, on_phone)
             if np.all(np.isfinite(position)):
-                client.camera.position, client.camera.look_at = position, _LOOK_AT
+                client.camera.position, client.camera.look_at = position, gaze
+
+
+def camera_pose(
+    offsets: np.ndarray, aspect: float = 1.0, on_phone: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
+
+    Args:
+      offsets: positions of the environments [N, 3], m.
+      aspect: width / height of the picture.
+      on_phone: whether the controls cover the lower part of the picture.
+    """
+    extent = 1.0 + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
+    view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
+    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if on_phone else 0.0
+    return _LOOK_AT + view, _LOOK_AT - (0.0, 0.0, down * np.linalg.norm(view))
 
 
 def _grid(number: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The viewing options that `view` and `play` share, and the viewers that they start."""
 
 import contextlib
+import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -11,6 +12,7 @@ from rich.console import Console
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
@@ -61,22 +63,21 @@ class Shown(NamedTuple):
 
     config: EnvConfig
     make_controller: Callable[[BounceBall], Controller]
-    name: str
-    """Name for the label where several are shown."""
+    title: str
 
 
 def show(
     shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    title: str,
     target_height: float | None,
     console: Console,
 ) -> None:
     """Shows or records environments under their controllers; Ctrl-C closes a viewer.
 
     Args:
-      shown: one, or several with the same robot side by side, on the page or in its recording.
+      shown: one, or several with the same robot side by side, on the page or in its recording. The
+        labels of several are A, B, ...
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
@@ -91,8 +92,6 @@ def show(
     viewer, several = options.viewer, len(shown) > 1
     if several and (viewer == "native" or options.video is not None):
         raise UserError("a window or a video shows one policy; show several with --viewer browser")
-    if several and len({one.config.mjcf for one in shown}) > 1:
-        raise UserError("the policies have different robots; show one at a time")
     if viewer == "auto":
         viewer = "native" if not several and has_display() else "browser"
     film = None
@@ -113,10 +112,13 @@ def show(
         port = free_port(options.host, options.port)
 
     on_page = not recorded and viewer == "browser"
-    names = None
+    title, names = shown[0].title, None
     if several:
         each = max(1, options.num_envs // len(shown))
-        names = [one.name for one in shown for _ in range(each)]
+        letters = string.ascii_uppercase[: len(shown)]
+        names = [letter for letter in letters for _ in range(each)]
+        titles = zip(letters, shown, strict=True)
+        title = ", ".join(f"{letter}: {one.title}" for letter, one in titles)
 
     def simulate(one: Shown) -> Simulation:
         config, num_envs = one.config, each if several else options.num_envs
@@ -135,6 +137,8 @@ def show(
 
     with console.status("compiling"):
         simulations = [simulate(one) for one in shown]
+    if len({fingerprint(one.env.mj_model) for one in simulations}) > 1:
+        raise UserError("the policies have different robots or time steps; show one at a time")
     simulation = SideBySide(simulations) if several else simulations[0]
 
     if recorded:

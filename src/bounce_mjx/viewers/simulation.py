@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.policy import Policy, forget
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.randomization import TERMS, Ranges, World, physics_parameters
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.task.state import State
-from bounce_mjx.viewers.controllers import Controller, PolicyController
+from bounce_mjx.viewers.controllers import Controller
 
 
 class Frame(NamedTuple):
@@ -48,7 +48,7 @@ class Simulation:
     def __init__(
         self,
         env: BounceBall,
-        controller: Controller | PolicyController,
+        controller: Controller,
         num_envs: int,
         seed: int,
         ranges: Ranges | None = None,
@@ -57,9 +57,8 @@ class Simulation:
         """Compiles the programs, which takes seconds, and resets all environments.
 
         Args:
-          controller: with a policy, it takes the policy as its first argument.
           ranges: from which the resets draw the worlds, see `BounceBall.reset`.
-          policy: the first value of `policy`.
+          policy: the first value of `policy`, for an exchangeable controller.
         """
         self.env = env
         self.num_envs = num_envs
@@ -69,13 +68,14 @@ class Simulation:
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for the world drawn at each reset."""
-        self._control = controller if policy is not None else lambda _, *args: controller(*args)
+        self._controller = controller
         self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
         self._push = np.zeros(3, np.float32)
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
         self._steps = np.zeros(num_envs, np.int32)
+        self._memory = controller.start_memory((num_envs,))
         over = np.ones(num_envs, bool)
         programs = (
             jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
@@ -115,7 +115,9 @@ class Simulation:
 
     def step(self) -> Frame:
         """Advances one control step."""
-        self._key, self._states, self._steps, frame = self._step_program(*self._inputs())
+        self._key, self._states, self._steps, self._memory, frame = self._step_program(
+            *self._inputs()
+        )
         self._push = np.zeros(3, np.float32)
         self.frame = jax.device_get(frame)
         if self.frame.over.any():
@@ -144,7 +146,8 @@ class Simulation:
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
         changes = self._target(), self._push, self._world()
-        return self.policy, self._key, self._states, self._steps, *changes
+        state = self._key, self._states, self._steps, self._memory
+        return self.policy, *state, *changes
 
     def _reset(self, over: np.ndarray) -> Frame:
         """Starts a new episode in some environments [N]; the frame of all."""
@@ -163,14 +166,15 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, target, push, world):
+    def _advance(self, policy, key, states, steps, memory, target, push, world):
         key, action_key = jax.random.split(key)
         states = _influence(self.env, states, target, push, world)
-        actions = self._control(policy, states, action_key)
+        memory = forget(memory, steps == 0)
+        actions, memory = self._controller.act(policy, states, action_key, memory)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
-        return key, after, steps, _view(self.env, after, steps, over)
+        return key, after, steps, memory, _view(self.env, after, steps, over)
 
 
 class SideBySide:

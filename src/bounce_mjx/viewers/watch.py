@@ -62,6 +62,7 @@ class TrainingPage:
 
     def wait(self) -> None:
         """Waits until Ctrl-C ends the page."""
+        self._news.put(lambda _, panel: panel.end())
         if self._thread.is_alive():
             self._say(f"the page stays at {address(self._host, self._port)} until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
@@ -137,9 +138,13 @@ class _Panel:
         """Adds a point to the curves."""
         self._points.append((steps / 1e6, *(means.get(name, np.nan) for name in _CURVES)))
         rate = means["speed/steps_per_second"]
-        done = f"{steps / 1e6:.1f} of {self._total_steps / 1e6:.1f} M steps"
-        self._progress.content = _text(f"<b>{done}</b>, {rate / 1e6:.2f} M steps/s")
+        done = f"{steps:,} of {self._total_steps:,} steps"
+        self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
         self._changed = True
+
+    def end(self) -> None:
+        """Says that the training has ended."""
+        self._progress.content = _text("<b>the training has ended</b>")
 
     def add_evaluation(self, steps: int, report: Report) -> None:
         """Shows the results of an evaluation."""
@@ -178,11 +183,12 @@ def results_list(report: Report, steps: int, met_at: dict[str, int]) -> str:
             f'<tr><td style="color:{colour}">{mark}</td><td>{html.escape(result.name)}</td>'
             f'<td style="text-align:right">{figure_text(result.value)}</td>'
             f"<td>{html.escape(result.bound.partition(' (')[0])}</td>"
-            f"<td>{'' if since is None else f'since {since / 1e6:.1f} M'}</td></tr>"
+            f"<td>{'' if since is None else f'since {since:,}'}</td></tr>"
         )
     kind = "screening" if report.screening else "evaluation"
-    head = f"{kind} at {steps / 1e6:.1f} M steps: <b>{html.escape(report.summary)}</b>"
-    return _text(f'{head}<table style="font:inherit;width:100%">{"".join(rows)}</table>')
+    head = f"{kind} at {steps:,} steps:<br><b>{html.escape(report.summary)}</b>"
+    style = "font:10px sans-serif;white-space:nowrap;width:100%"
+    return _text(f'{head}<table style="{style}">{"".join(rows)}</table>')
 
 
 def _text(content: str) -> str:
