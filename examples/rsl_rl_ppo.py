@@ -1,7 +1,6 @@
 """rsl_rl's own runner on the environment, with the project's tuned settings; then its exports.
 
-`python examples/rsl_rl_ppo.py` needs the extra `torch`; the ONNX file also needs
-`pip install onnx onnxscript`.
+`python examples/rsl_rl_ppo.py` needs the extra `torch`.
 """
 
 from pathlib import Path

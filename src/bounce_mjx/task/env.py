@@ -167,8 +167,8 @@ class BounceBall:
           UserError: always.
         """
         raise UserError(
-            "brax's randomization_fn changes brax's own physics, which this environment does not "
-            "use, so it would have no effect; give BounceBall a function randomize instead"
+            "BounceBall has no sys, which brax's randomization_fn changes; use "
+            "brax.envs.get_environment('bounce_ball'), or give BounceBall a function randomize"
         )
 
     @property
