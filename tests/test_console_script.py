@@ -70,6 +70,36 @@ def test_only_the_chosen_command_is_imported() -> None:
     assert done.stdout.endswith("['bounce_mjx.commands.eval', 'bounce_mjx.commands.main']")
 
 
+# Libraries that read a command line and print its help; the last line has their dependencies.
+HELP_NEEDS = set("bounce_mjx pydantic rich tyro yaml".split()) | set(
+    "annotated_types docstring_parser pydantic_core typeguard typing_extensions "
+    "typing_inspection".split()
+)
+
+
+@pytest.mark.parametrize("needs", [{"bounce_mjx"}, HELP_NEEDS], ids=["import", "help"])
+def test_an_import_and_each_help_are_light(needs: set[str]) -> None:
+    """Neither imports a library that computes, draws or simulates."""
+    helps = """
+for name in COMMANDS:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main([name, "--help"])
+"""
+    code = f"""
+import contextlib, io, sys
+before = set(sys.modules)
+import bounce_mjx
+from bounce_mjx.commands.main import COMMANDS, main
+{helps if needs is HELP_NEEDS else ""}
+imported = {{name.split(".")[0] for name in set(sys.modules) - before}}
+print(*sorted(imported - sys.stdlib_module_names))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = set(done.stdout.split())
+    libraries = {name for name in imported if not name.startswith(("_", "cython"))}
+    assert "bounce_mjx" in libraries and libraries <= needs
+
+
 @pytest.mark.parametrize(
     "command",
     [[*SCRIPT, "eval"], ["-m", "bounce_mjx.play"], [str(CHECKOUT / "train_jax.py")]],

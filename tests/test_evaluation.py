@@ -582,7 +582,7 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
     """The warnings are printed unchanged, and a missing figure is null in the file."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
-    monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: evaluation)
+    monkeypatch.setattr(policy_evaluation, "evaluate_policy", lambda *_, **__: evaluation)
     results = tmp_path / "results.json"
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([str(resource_path("pretrained")), "--json", str(results)])

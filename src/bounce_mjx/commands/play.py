@@ -12,15 +12,9 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.viewers.controllers import Controller, make_policy_controller
-from bounce_mjx.viewers.show import ViewerOptions, show
+from bounce_mjx.viewers.options import ViewerOptions
 
 
 class PlayCommand(StrictModel):
@@ -48,6 +42,16 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx play",
             description="Shows a trained policy.",
         )
+        with interruptible_imports():
+            from bounce_mjx.learning.policy import make_networks
+            from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.folders import choose_checkpoint
+            from bounce_mjx.runs.reading import load_policy
+            from bounce_mjx.task.env import BounceBall
+            from bounce_mjx.training.setup import set_up_jax
+            from bounce_mjx.viewers.controllers import Controller, make_policy_controller
+            from bounce_mjx.viewers.show import show
+
         console = Console()
         set_up_jax()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)

@@ -8,10 +8,14 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.runs.folders import find_run, latest_checkpoint
-from bounce_mjx.training.command import TrainingCommand, path_flag, read_command, run_command
-from bounce_mjx.training.job import library_of
-from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.training.command import (
+    TrainingCommand,
+    asks_for_help,
+    path_flag,
+    read_command,
+    run_command,
+)
 
 PROG = "bounce-mjx train-torch"
 
@@ -30,9 +34,17 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        set_up_jax()
+        if not asks_for_help(args):
+            with interruptible_imports():
+                from bounce_mjx.training import job  # noqa: F401
+                from bounce_mjx.training.setup import set_up_jax
+
+            set_up_jax()
         resume, defaults = path_flag(args, "--resume"), {}
         if resume:
+            from bounce_mjx.runs.folders import find_run, latest_checkpoint
+            from bounce_mjx.training.job import library_of
+
             library = library_of(latest_checkpoint(find_run(resume)))
             if library in get_args(Library):
                 defaults = {"library": library}

@@ -10,20 +10,9 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.viewers.controllers import (
-    make_random_controller,
-    make_scripted_controller,
-    make_zero_controller,
-)
-from bounce_mjx.viewers.show import ViewerOptions, show
-
-_CONTROLLERS = {
-    "random": make_random_controller,
-    "zero": make_zero_controller,
-    "scripted": make_scripted_controller,
-}
+from bounce_mjx.viewers.options import ViewerOptions
 
 
 class ViewCommand(StrictModel):
@@ -44,10 +33,24 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx view",
             description="Shows the environment under random, zero or scripted actions.",
         )
+        with interruptible_imports():
+            from bounce_mjx.training.setup import set_up_jax
+            from bounce_mjx.viewers.controllers import (
+                make_random_controller,
+                make_scripted_controller,
+                make_zero_controller,
+            )
+            from bounce_mjx.viewers.show import show
+
+        controllers = {
+            "random": make_random_controller,
+            "zero": make_zero_controller,
+            "scripted": make_scripted_controller,
+        }
         set_up_jax()
         show(
             command.env,
-            _CONTROLLERS[command.actions],
+            controllers[command.actions],
             command.viewing,
             title=f"{command.actions} actions",
             target_height=None,

@@ -1,17 +1,15 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-import mujoco
-import numpy as np
-
 from bounce_mjx.errors import UserError
+from bounce_mjx.lazy import jax, jnp, mujoco, np
 from bounce_mjx.resources import resource_path
 
 JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))

@@ -1,12 +1,14 @@
 """The settings of a training run, and their YAML file."""
 
+import importlib.metadata
+import importlib.util
+import sys
 from pathlib import Path
-
-import jax
 
 from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
+from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task.config import EnvConfig
@@ -73,6 +75,15 @@ def read_preset(path: Path | None) -> TrainConfig:
       UserError: the file is missing or invalid.
     """
     if path is None:
-        preset = "cpu" if jax.default_backend() == "cpu" else "default"
+        preset = "default" if has_accelerator() else "cpu"
         path = resource_path(f"configs/{preset}.yaml")
     return load_config(path)
+
+
+def has_accelerator() -> bool:
+    """Whether JAX computes on an accelerator by default. JAX is imported only if a plugin for one
+    is installed."""
+    plugins = importlib.metadata.entry_points(group="jax_plugins") or any(
+        importlib.util.find_spec(name) for name in ("jax_plugins", "libtpu")
+    )
+    return bool(plugins or "jax" in sys.modules) and jax.default_backend() != "cpu"

@@ -1,14 +1,15 @@
 """The observation: its quantities, how many past values of each it holds, and their order."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 from typing import Annotated, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 from pydantic import Field
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
 
@@ -85,7 +86,7 @@ class ObservationConfig(StrictModel):
     """Source of ball_velocity: a sensor, or the differences between pictures."""
 
     @functools.cached_property
-    def layout(self) -> "ObservationLayout":
+    def layout(self) -> ObservationLayout:
         """The order of the entries."""
         sizes = ((p, getattr(self, p.name)) for p in QUANTITIES)
         return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in sizes if n))

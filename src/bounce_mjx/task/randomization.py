@@ -4,25 +4,27 @@ A term is a key of the config with a range (low, high), from which a reset draws
 term uniformly. A term that is null is inactive and costs nothing.
 """
 
-from typing import Annotated, NamedTuple
+from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-import mujoco
-import numpy as np
+import math
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
-from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
+from bounce_mjx.lazy import jax, jnp, mujoco, np
 from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+
+if TYPE_CHECKING:
+    from bounce_mjx.physics import PhysicsParameters
 
 Range = tuple[Finite, Finite]
 
-World = dict[str, jax.Array]
+World = dict[str, "jax.Array"]
 """Values drawn for one episode, by the names of the active terms."""
 
-Ranges = dict[str, tuple[jax.Array, jax.Array]]
+Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 """Lower and upper ends of the active terms' ranges, each a number [] or an array of the term's
 shape."""
 
@@ -40,9 +42,9 @@ class Term(NamedTuple):
 
 
 _J = (len(JOINT_NAMES),)
-_ANY = (-np.inf, np.inf)
+_ANY = (-math.inf, math.inf)
 _FACTOR = (1e-3, 1e3)
-_NOT_NEGATIVE = (0.0, np.inf)
+_NOT_NEGATIVE = (0.0, math.inf)
 
 TERMS: dict[str, Term] = {
     "restitution": Term((), 0.85, (0.6, 0.98)),
@@ -53,7 +55,7 @@ TERMS: dict[str, Term] = {
     "servo_gain": Term(_J, 1.0, _FACTOR),
     "servo_damping": Term(_J, 1.0, _FACTOR),
     "servo_lag": Term((), 0.0, _NOT_NEGATIVE),
-    "torque_limit": Term(_J, None, (1e-3, np.inf)),
+    "torque_limit": Term(_J, None, (1e-3, math.inf)),
     "joint_damping": Term(_J, 0.0, _NOT_NEGATIVE),
     "joint_frictionloss": Term(_J, 0.0, _NOT_NEGATIVE),
     "armature": Term(_J, 1.0, _FACTOR),
@@ -74,9 +76,9 @@ TERMS: dict[str, Term] = {
     "joint_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
     "joint_velocity_bias": Term(_J, 0.0, _ANY),
     "push_speed": Term((), 0.0, _NOT_NEGATIVE),
-    "push_interval": Term((), None, (0.01, np.inf)),
-    "target_height": Term((), None, (1e-3, np.inf)),
-    "target_interval": Term((), None, (0.01, np.inf)),
+    "push_interval": Term((), None, (0.01, math.inf)),
+    "target_height": Term((), None, (1e-3, math.inf)),
+    "target_interval": Term((), None, (0.01, math.inf)),
     "ball_start": Term((3,), 0.0, _ANY),
     "joint_start": Term(_J, 0.0, _ANY),
 }
@@ -221,6 +223,9 @@ def draw_world(
 
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
+    # The engines are not needed to read a config.
+    from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
+
     m, addresses = mj_model, find_addresses(mj_model)
     servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
     links = m.jnt_bodyid[list(addresses.arm_joints)]

@@ -1,11 +1,10 @@
 """Shared by the commands that train: their flags, the start of the job, and the printed results."""
 
-import importlib
 import shlex
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 from rich.console import Console
@@ -15,16 +14,13 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import leave
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.reports.tables import details_line, results_table, seeds_table
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
-from bounce_mjx.runs.folders import find_run
-from bounce_mjx.runs.reading import RESUMABLE_KEYS
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training import hosts
-from bounce_mjx.training.console import say
-from bounce_mjx.training.job import REPORT_MODULE, Outcome, TrainingStopped, train
-from bounce_mjx.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.training.job import Outcome
+    from bounce_mjx.training.trainer import Trainer
 
 
 class TrainingCommand(TrainConfig):
@@ -61,7 +57,13 @@ def read_command(
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
     if config_path and resume:
         raise UserError("--config and --resume exclude each other; a resumed run has its config")
-    base = load_run_config(find_run(resume)) if resume else read_preset(config_path)
+    if resume:
+        from bounce_mjx.runs.folders import find_run
+        from bounce_mjx.runs.reading import RESUMABLE_KEYS
+
+        base = load_run_config(find_run(resume))
+    else:
+        base = read_preset(config_path)
     command = parse(
         command_class,
         args,
@@ -81,7 +83,7 @@ def read_command(
 
 def run_command(
     command: TrainingCommand,
-    make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+    make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
 ) -> None:
     """Trains according to the command, and prints the results.
@@ -89,6 +91,10 @@ def run_command(
     Raises:
       UserError: see `train`.
     """
+    from bounce_mjx.training import hosts
+    from bounce_mjx.training.console import say
+    from bounce_mjx.training.job import TrainingStopped, train
+
     console = Console(quiet=not hosts.is_leader())
     try:
         outcomes = train(
@@ -108,8 +114,11 @@ def run_command(
         leave_report(best, console)
 
 
-def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
+def show(outcomes: "Sequence[Outcome]", console: Console) -> "Outcome":
     """Prints the results of a training; returns the best seed's outcome."""
+    from bounce_mjx.reports.tables import details_line, results_table, seeds_table
+    from bounce_mjx.training.console import say
+
     best = max((o for o in outcomes if o.report is not None), key=lambda o: o.report.score)
     if len(outcomes) > 1:
         console.print(seeds_table({o.seed: o.report for o in outcomes}))
@@ -123,12 +132,15 @@ def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
     return best
 
 
-def leave_report(outcome: Outcome, console: Console) -> None:
+def leave_report(outcome: "Outcome", console: Console) -> None:
     """Draws the report. The training is already saved, so a failure only prints one line."""
+    from bounce_mjx.training.console import say
+
     started = time.perf_counter()
     try:
-        report_module = importlib.import_module(REPORT_MODULE)
-        page = report_module.report_training(outcome.run, outcome.report, outcome.best_steps)
+        from bounce_mjx.training.report import report_training
+
+        page = report_training(outcome.run, outcome.report, outcome.best_steps)
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         again = f"bounce-mjx report {shlex.quote(str(outcome.run))}"
@@ -140,6 +152,11 @@ def leave_report(outcome: Outcome, console: Console) -> None:
 def config_of(command: TrainingCommand) -> TrainConfig:
     """The run's config within a command line."""
     return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+
+
+def asks_for_help(args: Sequence[str]) -> bool:
+    """Whether the command line only prints the help."""
+    return not {"-h", "--help"}.isdisjoint(args)
 
 
 def path_flag(args: Sequence[str], flag: str) -> Path | None:

@@ -1,6 +1,8 @@
 """JAX's settings in a command."""
 
+import contextlib
 import os
+import threading
 from pathlib import Path
 
 import jax
@@ -22,6 +24,17 @@ def set_up_jax() -> None:
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
+
+
+def find_devices() -> None:
+    """Starts JAX's devices in the background; JAX waits for them where it needs them, and reports
+    an error there."""
+
+    def start() -> None:
+        with contextlib.suppress(Exception):
+            jax.devices()
+
+    threading.Thread(target=start, daemon=True).start()
 
 
 def set_up_cpu() -> None:

@@ -12,7 +12,6 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, body_scenes, site_mesh
 from bounce_mjx.viewers.simulation import Frame
 
-MAX_ENVS = 16
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
 _TRAIL_SECONDS = 0.6
