@@ -70,7 +70,7 @@ def simulate(policy, camera: Camera, seconds: float, target_height: float) -> tu
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("policy", nargs="?", default="pretrained", help="name, file or run")
+    parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--target-height", type=float, default=0.5, help="m")
     given = parser.parse_args()

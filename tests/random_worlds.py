@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.physics.parameters import direct_solref
+from bounce_mjx.physics.parameters import direct_solref, link_masses
 from bounce_mjx.robot.model import find_addresses
 
 
@@ -13,7 +13,6 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     """The model's own numbers, all of them given but for those that it has not: friction and
     force limits."""
     at = find_addresses(mj_model)
-    links = mj_model.jnt_bodyid[at.arm_joints,]
     stiffness, damping = direct_solref(mj_model)
     return PhysicsParameters(
         ball_mass=mj_model.body_mass[at.ball_body],
@@ -24,7 +23,7 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
         servo_damping=-mj_model.actuator_biasprm[at.actuators, 2],
         armature=mj_model.dof_armature[at.arm_qvel,],
         damping=mj_model.dof_damping[at.arm_qvel,],
-        link_mass=mj_model.body_mass[links],
+        link_mass=link_masses(mj_model),
         paddle_position=mj_model.geom_pos[at.paddle_geom],
         paddle_rotation=mj_model.geom_quat[at.paddle_geom],
         gravity=mj_model.opt.gravity,
@@ -45,7 +44,7 @@ def random_parameters(mj_model: mujoco.MjModel, count: int, seed: int) -> Physic
     drawn = jax.tree.map(scaled, own)
     quaternion = shifted(own.paddle_rotation, 0.05)
     return drawn._replace(
-        damping=rng.uniform(0.0, 5.0, (count, 6)),
+        damping=rng.uniform(0.0, 5.0, drawn.damping.shape),
         paddle_position=shifted(own.paddle_position, 0.01),
         paddle_rotation=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         gravity=shifted(own.gravity, 1.0),

@@ -1,24 +1,31 @@
-"""brax: its registry, wrappers and trainers on `BounceBall`."""
+"""brax: its registry, wrappers, trainers, checkpoints and pictures on the environment."""
 
 import functools
+import json
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 
 import brax.envs
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from brax.envs.wrappers import training
-from brax.training.agents.apg import networks as apg_networks
-from brax.training.agents.apg import train as brax_apg
-from brax.training.agents.ppo import networks as ppo_networks
-from brax.training.agents.ppo import train as brax_ppo
+from brax.io import json as brax_json
+from brax.training.agents.ppo import checkpoint as brax_checkpoint
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as brax_sac
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.adapters.brax import device_put_replicated, pmap_support
+from bounce_mjx.adapters.brax import (
+    BraxBounceBall,
+    device_put_replicated,
+    load_policy,
+    pmap_support,
+)
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.rewards import TERM_NAMES
 
@@ -36,19 +43,81 @@ def all_finite(tree) -> bool:
 
 
 def test_brax_makes_the_environment():
-    env = brax.envs.get_environment("bounce_ball")
-    assert isinstance(env, BounceBall) and isinstance(env, brax.envs.Env)
-    config = EnvConfig(target_height_range=(0.7, 0.7))
-    wrapped = brax.envs.create("bounce_ball", episode_length=5, batch_size=2, config=config)
+    env = brax.envs.get_environment("bounce_ball", target_height_range=(0.7, 0.7))
+    assert isinstance(env, BraxBounceBall) and isinstance(env.task, brax.envs.Env)
+    config = EnvConfig(target_height_range=(0.7, 0.7), control_dt=0.02)
+    wrapped = brax.envs.create(
+        "bounce_ball", episode_length=5, batch_size=2, config=config, control_dt=0.01
+    )
+    assert wrapped.dt == 0.01
     state = jax.jit(wrapped.reset)(jax.random.PRNGKey(0))
     assert state.obs.shape == (2, 29)
     np.testing.assert_allclose(state.obs[:, 28], 0.7, rtol=1e-6)
 
 
-def test_randomization_by_brax_is_refused(env):
-    """brax's domain randomisation would replace `env.sys`, which the environment does not have."""
-    with pytest.raises(UserError, match="randomization_fn .* no effect; .*randomize"):
+def test_unknown_settings_are_refused():
+    with pytest.raises(UserError, match="bounce_ball: unknown key backend"):
+        brax.envs.get_environment("bounce_ball", backend="positional")
+
+
+def test_the_bare_environment_refuses_randomization_by_brax(env):
+    """It has no `sys`, which brax's domain randomisation replaces."""
+    with pytest.raises(UserError, match="randomization_fn"):
         training.wrap(env, randomization_fn=lambda system: (system, None))
+
+
+def test_randomization_by_brax_acts_on_the_physics():
+    """After a step of free fall, the ball's speed is that of the world's gravity; a time-out keeps
+    the world."""
+    env = brax.envs.get_environment("bounce_ball")
+    strengths = jnp.array([0.0, -3.0, -9.81])
+
+    def randomize(system):
+        gravity = jnp.zeros((3, 3)).at[:, 2].set(strengths)
+        axes = jax.tree.map(lambda _: None, system).tree_replace({"opt.gravity": 0})
+        return system.tree_replace({"opt.gravity": gravity}), axes
+
+    wrapped = training.wrap(env, episode_length=1, randomization_fn=randomize)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    for _ in range(2):
+        state = jax.jit(wrapped.step)(state, jnp.zeros((3, 6)))
+        np.testing.assert_array_equal(state.done, 1.0)
+    task = state.pipeline_state.task
+    np.testing.assert_allclose(task.parameters.gravity[:, 2], strengths)
+    # brax restores the first state at the end of an episode; one more step without an end.
+    plain = jax.tree.map(lambda x: x[1], state)
+    after = jax.jit(env.step)(plain, jnp.zeros(6))
+    np.testing.assert_allclose(
+        after.pipeline_state.qd[8] - plain.pipeline_state.qd[8], -3.0 * env.dt, rtol=1e-4
+    )
+
+
+# Pictures
+
+
+def test_brax_draws_the_links_where_mujoco_has_them():
+    """The page of `brax.io.html` shows every geom of the model at the links' poses."""
+    env = brax.envs.get_environment("bounce_ball")
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    data = mujoco.MjData(env.mj_model)
+    data.qpos[:] = state.pipeline_state.q
+    mujoco.mj_forward(env.mj_model, data)
+    drawn = json.loads(brax_json.dumps(env.sys, [state.pipeline_state]))
+    np.testing.assert_allclose(drawn["states"]["x"][0]["pos"], data.xpos[1:], atol=1e-6)
+    np.testing.assert_allclose(drawn["states"]["x"][0]["rot"], data.xquat[1:], atol=1e-6)
+    assert sum(map(len, drawn["geoms"].values())) == env.mj_model.ngeom
+    with pytest.raises(UserError, match=r"shape \(2, 13\).*one environment"):
+        jax.tree.map(lambda x: jnp.stack([x, x]), state).pipeline_state.x  # noqa: B018
+
+
+def test_brax_renders_states(opengl):
+    env = brax.envs.get_environment("bounce_ball")
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
+    moved = state.replace(
+        task=state.task._replace(physics=state.task.physics._replace(qpos=state.q.at[8].add(0.2)))
+    )
+    first, second = env.render([state, moved], 60, 80, camera="overview")
+    assert first.shape == (60, 80, 3) and not np.array_equal(first, second)
 
 
 # Wrappers
@@ -124,40 +193,60 @@ def assert_evaluated(metrics):
     assert all_finite(list(metrics.values()))
 
 
-def test_brax_ppo_trains_and_evaluates(env):
-    params_at = {}
-    (make_policy, trained, _), history = train(
-        brax_ppo,
-        env,
-        functools.partial(
-            ppo_networks.make_ppo_networks,
-            policy_hidden_layer_sizes=(8,),
-            value_hidden_layer_sizes=(8,),
-        ),
+def example(name: str) -> dict:
+    """The functions of a file in examples/."""
+    return runpy.run_path(str(Path(__file__).parents[1] / "examples" / name))
+
+
+@pytest.fixture(scope="module")
+def ppo_example(tmp_path_factory):
+    """The folder and the evaluations of `examples/brax_ppo.py`."""
+    folder = tmp_path_factory.mktemp("brax")
+    history = example("brax_ppo.py")["main"](
+        folder,
+        rollout_steps=2,
         num_timesteps=400,
+        episode_length=20,
         num_evals=2,
         num_envs=8,
+        num_eval_envs=4,
         unroll_length=5,
         batch_size=8,
         num_minibatches=2,
         num_updates_per_batch=2,
-        normalize_observations=True,
-        policy_params_fn=lambda step, _, params: params_at.update({step: params}),
+        max_devices_per_host=1,
     )
+    return folder, history
+
+
+def test_brax_ppo_trains_and_evaluates(ppo_example):
+    folder, history = ppo_example
     assert len(history) == 2
     for metrics in history:
         assert_evaluated(metrics)
-    assert all_finite(trained)
-    _, *fresh_networks = params_at[0]
-    normalizer, *networks = trained
-    assert normalizer.mean.shape == (29,)
-    for before, after in zip(
-        jax.tree.leaves(fresh_networks), jax.tree.leaves(networks), strict=True
-    ):
-        assert before.shape == after.shape
-        assert np.any(np.asarray(before) != np.asarray(after))
-    action, _ = make_policy(trained, deterministic=True)(jnp.zeros(29), jax.random.key(0))
-    assert action.shape == (6,) and all_finite(action)
+    assert "viewer.js" in (folder / "rollout.html").read_text()
+
+
+def test_brax_checkpoint_has_the_trained_policy(ppo_example):
+    """The action of the loaded policy equals that of a network written out in NumPy."""
+    folder, _ = ppo_example
+    (checkpoint,) = (child for child in folder.iterdir() if child.name.isdigit())
+    normalizer, policy, *_ = brax_checkpoint.load(checkpoint)
+    assert normalizer.count.lo > 0 and np.any(normalizer.mean != 0.0)
+    observation = np.linspace(-1.0, 1.0, 29, dtype=np.float32)
+    x = (observation - normalizer.mean) / normalizer.std
+    for layer in policy["params"]["MLP_0"].values():
+        x = x @ layer["kernel"] + layer["bias"]
+        x = x / (1.0 + np.exp(-x))
+    expected = x @ policy["params"]["Dense_0"]["kernel"] + policy["params"]["Dense_0"]["bias"]
+    for path in (folder, checkpoint):
+        action, _ = load_policy(path)(observation, jax.random.key(0))
+        np.testing.assert_allclose(action, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="no checkpoint of brax's PPO; give"):
+        load_policy(tmp_path)
 
 
 def test_brax_sac_trains_and_evaluates(env):
@@ -181,20 +270,11 @@ def test_brax_sac_trains_and_evaluates(env):
 
 
 @pytest.mark.slow
-def test_brax_apg_learns(env):
+def test_brax_apg_learns():
     """Gradients through the physics and the reward raise the return."""
-    (_, trained, _), history = train(
-        brax_apg,
-        env,
-        functools.partial(apg_networks.make_apg_networks, hidden_layer_sizes=(16,)),
-        policy_updates=30,
-        num_evals=2,
-        num_envs=8,
-        horizon_length=20,
-        learning_rate=3e-3,
-        normalize_observations=True,
+    history = example("brax_apg.py")["main"](
+        policy_updates=30, num_evals=2, num_envs=8, num_eval_envs=4, episode_length=20
     )
-    assert all_finite(trained)
     first, last = (metrics["eval/episode_reward"] for metrics in history)
     assert_evaluated(history[-1])
     assert last > first

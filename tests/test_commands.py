@@ -177,13 +177,17 @@ def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Pat
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 BAD_MJCF = {
     "text": ("hello", "does not compile", "correct it"),
-    "joint": (MJCF.replace('"Joint3"', '"Elbow"'), "no joint named Joint3", "needs the names"),
     "paddle": (MJCF.replace('"blocker"', '"bat"'), "no geom named blocker", "needs the names"),
     "ball": (MJCF.replace('"ball_link"', '"ball"'), "no body named ball_link", "needs the names"),
     "actuator": (
         re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', "", MJCF),
-        "0 actuators on Joint2",
-        "give it exactly one position servo",
+        "default_joint_angles has 6 numbers",
+        "5 joints with an actuator (Joint1, Joint3",
+    ),
+    "motor": (
+        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
+        "an actuator on Joint2 that is no position servo",
+        '<position joint="Joint2"/>',
     ),
 }
 
@@ -421,7 +425,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
     for result in report["results"]:
         value = result["value"]
         assert value is None or isinstance(value, float)
-        figure = "none" if value is None else f"{value:.2f}"
+        figure = "-" if value is None else f"{value:.2f}"
         assert f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown
 
@@ -482,6 +486,7 @@ def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
         "2026-01-04/checkpoints/latest",
     ):
         (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder.split("/")[0] / "config.yaml").touch()
     assert newest_run(tmp_path) == tmp_path / "2026-01-02"
     with pytest.raises(UserError, match="no run with a checkpoint"):
         newest_run(tmp_path / "2026-01-04")

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,51 @@ def test_unknown_command(args: list[str], words: tuple[str, ...], capsys) -> Non
     assert re.fullmatch(r"error: .+\n", error) and all(word in error for word in words), error
 
 
+def test_version(capsys) -> None:
+    console_script.main(["--version"])
+    assert capsys.readouterr().out == f"bounce_mjx {bounce_mjx.__version__}\n"
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert bounce_mjx.__version__ == project["version"]
+
+
+def test_missing_package(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    # None stands for a module that cannot be imported.
+    monkeypatch.setitem(sys.modules, "pydantic", None)
+    monkeypatch.delitem(sys.modules, "bounce_mjx.commands.plot", raising=False)
+    monkeypatch.delitem(sys.modules, "bounce_mjx.config.settings", raising=False)
+    monkeypatch.delitem(sys.modules, "bounce_mjx.config.command_line", raising=False)
+    with pytest.raises(SystemExit) as exit_info:
+        console_script.main(["plot"])
+    assert exit_info.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: the package pydantic is not installed"), error
+    assert "pip install -e ." in error
+
+
+PYTHON_3_10 = "import sys; sys.version_info = (3, 10, 9, 'final', 0)\n"
+
+
+@pytest.mark.parametrize("script", ["train_jax.py", "train_torch.py"])
+@pytest.mark.parametrize(
+    ("before", "sentence"),
+    [
+        (
+            "",
+            r"error: bounce_mjx is not installed for \S+; run: pip install -e \S+; or use: uv run ",
+        ),
+        (PYTHON_3_10, "error: Python 3.10 is too old; use 3.11 to 3.13; or use: uv run "),
+    ],
+    ids=["not installed", "Python 3.10"],
+)
+def test_script_without_the_package(script: str, before: str, sentence: str) -> None:
+    run = f"import runpy; runpy.run_path({str(CHECKOUT / script)!r}, run_name='__main__')"
+    # Isolated from the packages of this environment.
+    command = [sys.executable, "-I", "-S", "-c", before + run]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert re.fullmatch(sentence + script + "\n", done.stderr), done.stderr
+
+
 @pytest.mark.parametrize("name", ["eval", "play", "view", "plot", "report", "export"])
 def test_help_of_a_command_names_it(name: str, capsys) -> None:
     with pytest.raises(SystemExit) as exit_info:
@@ -61,13 +107,15 @@ def test_every_command_also_runs_as_a_module() -> None:
 
 
 def test_only_the_chosen_command_is_imported() -> None:
+    """A training imports no viewer and no optional log before a flag asks for it."""
     code = (
         "import sys; from bounce_mjx.commands.main import main\n"
-        "try: main(['eval', '--help'])\n"
-        "except SystemExit: print(sorted(n for n in sys.modules if '.commands.' in n), end='')"
+        "try: main(['train', '--help'])\n"
+        "except SystemExit: print(sorted(n for n in sys.modules if '.commands.' in n\n"
+        "    or '.viewers' in n or n in ('viser', 'wandb', 'orbax', 'torch')), end='')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.endswith("['bounce_mjx.commands.eval', 'bounce_mjx.commands.main']")
+    assert done.stdout.endswith("['bounce_mjx.commands.main', 'bounce_mjx.commands.train']")
 
 
 # Libraries that read a command line and print its help; the last line has their dependencies.

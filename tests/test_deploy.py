@@ -25,7 +25,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import Normalizer
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import JOINT_NAMES, load_model
+from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
@@ -88,14 +88,14 @@ def input_name(quantity: str) -> str:
 def make_run(folder: Path, env: dict) -> Path:
     """Writes a run with a random policy; its first input never varied in the training."""
     config = TrainConfig(env=env, ppo={"hidden_layers": (24, 8)})
-    size = config.env.observation.layout.size
+    size = config.env.layout.size
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 1.5, size).astype(np.float32)
     std[0] = 1e-3
     normalizer = Normalizer(
         jnp.asarray(rng.normal(size=size), jnp.float32), jnp.asarray(std, jnp.float32)
     )
-    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
+    networks = make_networks(config.ppo, size, config.env.num_joints)
     params = networks.policy_network.init(jax.random.PRNGKey(1))
     params["params"]["Dense_0"]["kernel"] *= 20.0
     folder.mkdir()
@@ -129,14 +129,14 @@ def observations(runs: dict[str, Path]):
         checkpoint = find_checkpoint(runs[name])
         config = load_run_config(checkpoint.run)
         policy = reading.load_policy(checkpoint, config)
-        layout = config.env.observation.layout
+        layout = config.env.layout
         rng = np.random.default_rng(3)
         # Some observations are beyond the clipping range of the normaliser.
         spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
         noise = spread * rng.normal(size=(1000, layout.size))
         mean, std = (np.asarray(array) for array in policy.normalizer)
         observation = (mean + std * noise).astype(np.float32)
-        networks = make_networks(config.ppo, layout.size, len(JOINT_NAMES))
+        networks = make_networks(config.ppo, layout.size, config.env.num_joints)
         inputs = {
             input_name(part.name): observation[:, layout[part.name]].reshape(
                 1000, getattr(config.env.observation, part.name), -1
@@ -177,7 +177,7 @@ def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) ->
         input_name(q.name): n for q in QUANTITIES if (n := getattr(config.env.observation, q.name))
     }
     assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
-    assert (metadata.joint_names, metadata.steps) == (list(JOINT_NAMES), 64)
+    assert (metadata.joint_names, metadata.steps) == ([f"Joint{i}" for i in range(1, 7)], 64)
     assert metadata.control_dt == config.env.control_dt
     assert metadata.randomization["camera_rate"] == [80.0, 130.0]
     assert metadata.target_height_range == [0.4, 0.6]
@@ -463,9 +463,10 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
     foreign = onnx.load_from_string(shipped)
     del foreign.metadata_props[:]
-    newer = onnx.load_from_string(shipped)
-    (entry,) = (prop for prop in newer.metadata_props if prop.key == "format")
-    entry.value = "2"
+    older = onnx.load_from_string(shipped)
+    entries = {prop.key: prop for prop in older.metadata_props}
+    entries["format"].value = "1"
+    older.metadata_props.remove(entries["estimator"])
     unknown = onnx.load_from_string(shipped)
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
@@ -474,7 +475,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),
-        "format is 2, not 1": newer.SerializeToString(),
+        "format is 1, not 2": older.SerializeToString(),
     }
     for reason, content in broken.items():
         (tmp_path / "a.onnx").write_bytes(content)

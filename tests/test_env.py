@@ -595,7 +595,8 @@ def test_non_finite_physics_ends_the_episode_and_does_not_spread(value, walked, 
     np.testing.assert_array_equal(after.done, 1)
     np.testing.assert_array_equal(after.metrics["non_finite"], 1)
     assert all_finite(after)
-    np.testing.assert_array_equal(after.obs, np.tile(walked.obs, (25, 1)))
+    # Two programs round the paddle's position differently.
+    np.testing.assert_allclose(after.obs, np.tile(walked.obs, (25, 1)), rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("speed", [1e20, 1e38])

@@ -17,7 +17,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
@@ -295,24 +295,24 @@ def test_nothing_to_measure_fails(result, changes, env):
     assert Report.from_dict(plain) == report
 
 
-def test_nothing_to_measure_is_shown_as_none(env):
+def test_nothing_to_measure_is_shown_as_a_dash(env):
     """This holds for the table, the Markdown, the line of other figures and the table of seeds."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     rows = show(results_table(report, "exp[lr]")).splitlines()
     assert "exp[lr]" in rows[0]
     (row,) = [row for row in rows if row.startswith("height ")]
-    assert "none" in row and "FAIL" in row
+    assert " - " in row and "FAIL" in row
     (row,) = [row for row in results_markdown(report).splitlines() if "| height |" in row]
-    assert row.split(" | ")[2:] == ["none", ">= 95", "FAIL |"]
-    assert "|apex error| none, " in details_line(report)
+    assert row.split(" | ")[2:] == ["-", ">= 95", "FAIL |"]
+    assert "|apex error| -, " in details_line(report)
 
     good = judge(env, statistics())
     rows = show(seeds_table({0: report, 1: good, 2: None})).splitlines()
     cells = {row.split()[0]: row for row in rows}
-    assert cells["0"].count("none") == 2
-    assert cells["1"].count("none") == 0
+    assert cells["0"].count(" - ") == 2
+    assert cells["1"].count(" - ") == 0
     # The mean of the seeds that have a figure would hide the seed that has none.
-    assert cells["mean"].count("none") == cells["std"].count("none") == 2
+    assert cells["mean"].count(" - ") == cells["std"].count(" - ") == 2
     assert "1/3" in cells["mean"]
 
 
@@ -330,6 +330,13 @@ def test_a_result_has_one_line_of_80_columns(env):
     for row, result in zip(rows[2:], report.results, strict=True):
         assert row.startswith(result.name) and result.measured in row
         assert row.endswith(f"{result.bound:10} pass") and len(row) <= 80
+
+
+def test_seeds_have_one_line_of_80_columns_each(env):
+    report = judge(env, statistics())
+    seeds = [2**31 - 2, 2**31 - 1, 0]
+    rows = show(seeds_table({seeds[0]: report, seeds[1]: report, 0: None})).splitlines()
+    assert [row.split()[0] for row in rows[2:]] == [*map(str, seeds), "mean", "std"]
 
 
 def test_readme_shows_the_table_as_it_is_printed(env):
@@ -519,8 +526,10 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     env = BounceBall(EnvConfig(episode_seconds=1.0))
     assert env.backend == "fused"
     key = jax.random.key(31)
-    fused = make_evaluator(env, networks, 8)(random_policy, key)
-    mujoco = make_mujoco_evaluator(env, networks, 8)(random_policy, key)
+    shares, shares_on_c = [], []
+    fused = make_reporting_evaluator(env, networks, 8, shares.append)(random_policy, key)
+    mujoco = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)(random_policy, key)
+    assert shares == shares_on_c == [1.0], "each second of simulated time is reported"
     assert np.any(fused.max_bounces > 0), "a contact is wanted"
     assert not np.all(fused.running), "an end is wanted"
     np.testing.assert_array_equal(mujoco.running, fused.running)
@@ -582,14 +591,29 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
     """The warnings are printed unchanged, and a missing figure is null in the file."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
-    monkeypatch.setattr(policy_evaluation, "evaluate_policy", lambda *_, **__: evaluation)
+    said_first, now = [], 0.0
+    monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
+
+    def evaluate(*_, progress, **__):
+        nonlocal now
+        said_first.append(capsys.readouterr().out)
+        for share in (0.05, 0.1, 0.15, 0.2, 0.25):
+            now += 6.0
+            progress(share)
+        return evaluation
+
+    monkeypatch.setattr(policy_evaluation, "evaluate_policy", evaluate)
     results = tmp_path / "results.json"
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([str(resource_path("pretrained")), "--json", str(results)])
     assert exit_info.value.code == 1
+    assert re.search(r"^checkpoint: .*/pretrained/checkpoints/best/\d+ \(", said_first[0])
     shown = capsys.readouterr().out
+    # A line after each tenth, and never more often than every 10 s.
+    assert re.findall(r"(\d+)% evaluated", shown) == ["10", "20"]
+    assert "physics: mujoco  1,024 episodes of 20 s\n" in shown
     assert "warning: the solver [CG] stops.\n" in shown
-    assert "|apex error| none" in shown
+    assert "|apex error| -" in shown
     plain = json.loads(results.read_text(), parse_constant=pytest.fail)
     assert plain["results"][HEIGHT]["value"] is None
     assert plain["details"]["mean_apex_error_m"] is None

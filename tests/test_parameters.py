@@ -30,7 +30,7 @@ from bounce_mjx.physics import (
     make_engine,
 )
 from bounce_mjx.physics.fused.model import in_world
-from bounce_mjx.physics.parameters import SHAPES
+from bounce_mjx.physics.parameters import shapes
 from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
 from random_worlds import own_parameters, random_parameters
 from test_physics import (
@@ -274,7 +274,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
 def test_a_parameter_of_another_shape_is_refused(mj_model):
     engine = make_engine(mj_model, "fused")
     state = PhysicsState(jnp.zeros(mj_model.nq), jnp.zeros(mj_model.nv))
-    for field, shape in SHAPES._asdict().items():
+    for field, shape in shapes(6)._asdict().items():
         wrong = PhysicsParameters(**{field: jnp.ones((*shape, 2))})
         with pytest.raises(UserError, match=field):
             engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)

@@ -345,9 +345,13 @@ def piece(start: str, end: str) -> str:
 
 ARM_BODY = piece('    <body name="Link1"', '\n    <body name="ball_link"')
 BALL_BODY = piece('\n    <body name="ball_link"', "  </worldbody>")
-JOINTS_2_AND_3 = piece('"Joint2" axis', '<body name="Link4"')
 PADDLE = piece('<geom name="blocker"', "\n              </body>\n            </body>")
 LINK_6 = piece('<body name="Link6"', PADDLE)
+END = piece('<body name="Link6"', "</mujoco>")
+OPTIONS = piece("<option ", ' limited="false"')
+INERTIAL = '<inertial pos="0.1 0 0.02" quat="1 2 3 4" mass="0.5" diaginertia="0.01 0.012 0.02"/>'
+SIDE_LINK = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}<joint name="side"/></body>'
+WELDED = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}'
 
 # Models that the fused engine supports, each as one edit of the MJCF.
 SUPPORTED = {
@@ -378,10 +382,51 @@ SUPPORTED = {
     "solimp power 1.5": ('solimp="0.95 0.99 0.001"', 'solimp="0.5 0.99 0.02 0.6 1.5"'),
     "solimp out of range": ('solimp="0.95 0.99 0.001"', 'solimp="0 1 0.02 0 0.5"'),
     "heavy ball": ('size="0.019" mass="0.0027"', 'size="0.019" mass="0.3"'),
+    "joint offset": ('name="Joint2"', 'name="Joint2" pos="0.01 -0.02 0.03"'),
+    "slide": ('name="Joint2"', 'name="Joint2" type="slide"'),
+    "spring": ("<joint ", '<joint stiffness="500" springref="0.3" '),
+    "joint force range": ("<joint ", '<joint actuatorfrcrange="-40 60" '),
+    "gravity compensation of a link": ('<body name="Link3"', '<body name="Link3" gravcomp="2"'),
+    "gravity compensation": (ARM_BODY, ARM_BODY.replace("<body ", '<body gravcomp="0.7" ')),
+    "gravity compensation by actuators": (
+        ARM_BODY,
+        ARM_BODY.replace("<body ", '<body gravcomp="0.7" ').replace(
+            "<joint ", '<joint actuatorgravcomp="true" actuatorfrcrange="-20 15" '
+        ),
+    ),
+    "gravity compensation of the ball": (
+        '<body name="ball_link"',
+        '<body gravcomp="0.5" name="ball_link"',
+    ),
+    "welded body": ('<body name="Link4"', f'{WELDED}{WELDED}</body></body><body name="Link4"'),
+    "welded paddle": (PADDLE, f"{WELDED}{PADDLE}</body>"),
+    "pedestal": (ARM_BODY, f'<body pos="0.1 0 0.2" euler="0 0.3 0">{ARM_BODY}</body>'),
+    "affine gain": (
+        '<position name="act2" joint="Joint2"/>',
+        '<general name="act2" joint="Joint2" gear="-2" gaintype="affine" gainprm="100 30 -20" '
+        'biastype="affine" biasprm="3 -80 -10" ctrlrange="-0.5 0.5"/>',
+    ),
+    "Euler": (
+        OPTIONS,
+        OPTIONS.replace("implicitfast", "Euler")
+        .replace('eulerdamp="disable"', "")
+        .replace("<joint ", '<joint damping="5" '),
+    ),
+    "Euler without implicit damping": (
+        OPTIONS,
+        OPTIONS.replace("implicitfast", "Euler").replace("<joint ", '<joint damping="5" '),
+    ),
     "turned paddle": ('quat="0.707107 0 -0.707107 0"', 'quat="0.6 0.1 -0.7 0.2"'),
 }
 # Models that move like the shipped one.
 EQUIVALENT = {
+    "static body": ("  </worldbody>", f"{WELDED}</body></worldbody>"),
+    "springs disabled": (
+        OPTIONS,
+        OPTIONS.replace("<flag ", '<flag spring="disable" ').replace(
+            "<joint ", '<joint stiffness="500" '
+        ),
+    ),
     "pair swapped": ('geom1="blocker" geom2="ball"', 'geom1="ball" geom2="blocker"'),
     "actuators swapped": (
         '<position name="act1" joint="Joint1"/>\n    <position name="act2" joint="Joint2"/>',
@@ -414,7 +459,6 @@ def test_supported_models_step_as_mujoco_does(mj_model, name):
 
 UNSUPPORTED = {
     # edit, required part of the message
-    "Euler": ('integrator="implicitfast"', 'integrator="Euler"', "integrator mjINT_EULER"),
     "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator mjINT_RK4"),
     "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator mjINT_IMPLICIT"),
     "discrete": ('integrator="implicitfast"', 'integrator="discrete"', "mjINT_DISCRETE"),
@@ -450,27 +494,23 @@ UNSUPPORTED = {
     "solimp width": ('solimp="0.95 0.99 0.001"', 'solimp="0.95 0.99 0"', "solimp"),
     "limited": ('limited="false"', 'limited="true"', 'limited="true"'),
     "frictionloss": ("<joint ", '<joint frictionloss="0.1" ', "frictionloss"),
-    "stiffness": ("<joint ", '<joint stiffness="1" ', "stiffness"),
     "stiffness polynomial": ("<joint ", '<joint stiffness="0 1 0" ', "stiffness"),
     "damping polynomial": ("<joint ", '<joint damping="1 1 0" ', "damping"),
-    "joint force range": ("<joint ", '<joint actuatorfrcrange="-9 9" ', "actuatorfrcrange"),
-    "joint offset": ('name="Joint2"', 'name="Joint2" pos="0.01 0 0"', "pos"),
-    "slide": ('name="Joint2"', 'name="Joint2" type="slide"', "hinges"),
-    "gravcomp": ('<body name="Link3"', '<body name="Link3" gravcomp="1"', "gravcomp"),
-    "extra body": ("  </worldbody>", '<body pos="1 0 0"/></worldbody>', "bodies"),
     "extra joint": (
         '<joint name="Joint3"',
         '<joint name="more" axis="1 0 0"/><joint name="Joint3"',
         "joints other",
     ),
-    "another chain": (
-        JOINTS_2_AND_3,
-        JOINTS_2_AND_3.replace('"Joint3"', '"x"')
-        .replace("Joint2", "Joint3")
-        .replace('"x"', '"Joint2"'),
+    "two arms": (
+        END,
+        END.replace('<body name="Link6"', SIDE_LINK + '<body name="Link6"').replace(
+            "<actuator>", '<actuator><position joint="side"/>'
+        ),
         "one serial chain",
     ),
-    "paddle on another link": (LINK_6 + PADDLE, PADDLE + LINK_6, "last link"),
+    "paddle on another link": (LINK_6 + PADDLE, PADDLE + LINK_6, "last joint"),
+    "mocap": ("  </worldbody>", '<body mocap="true"/></worldbody>', "mocap"),
+    "body on the ball": ("<freejoint ", "<body/><freejoint ", "attached to the ball"),
     "cylinder paddle": (
         'name="blocker" type="box" size="0.05 0.065 0.0035"',
         'name="blocker" type="cylinder" size="0.05 0.0035"',
@@ -483,6 +523,7 @@ UNSUPPORTED = {
         '<inertial pos="0 0 0" mass="0.0027" diaginertia="3.9e-7 3.9e-7 3.8e-7"/><freejoint ',
         "homogeneous sphere",
     ),
+    "ball spring": ("<freejoint ", '<joint type="free" stiffness="0.1" ', "ball"),
     "ball damping": ("<freejoint ", '<joint type="free" damping="0.1" ', "ball"),
     "equality": (
         "<actuator>",
@@ -537,7 +578,7 @@ def test_unsupported_models_are_refused(name):
         assert text == f"the fused physics does not support {refusal.value}; use --physics mjx"
 
 
-@pytest.mark.parametrize("name", ["Euler", "stiffness", "condim 4"])
+@pytest.mark.parametrize("name", ["RK4", "frictionloss", "condim 4"])
 def test_auto_takes_mjx_for_unsupported_models(name):
     """The reason is a whole sentence."""
     old, new, feature = UNSUPPORTED[name]

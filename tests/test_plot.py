@@ -2,10 +2,12 @@
 
 import base64
 import dataclasses
+import importlib.util
 import io
 import json
 import re
 import shutil
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
 
@@ -37,6 +39,7 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.training import report as training_report
+from bounce_mjx.training.log import Logs, WandbLog, open_log
 
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
@@ -93,6 +96,16 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
         "num_envs 2048 (one seed)",
     ]
     assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
+
+
+def test_two_runs_of_one_seed_are_two_runs(tmp_path: Path) -> None:
+    logs = {"episode/return": {1: 1.0}}
+    runs = [
+        write_run(tmp_path / name, TrainConfig(seed=seed), logs)
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    ]
+    assert [group.label for group in group_runs(runs[:2])] == ["2 runs of one seed"]
+    assert [group.label for group in group_runs(runs)] == ["3 runs of 2 seeds"]
 
 
 def test_a_label_names_few_settings(tmp_path: Path) -> None:
@@ -274,7 +287,7 @@ def check_report(run: Path) -> str:
 
 def as_shown(value: float | None) -> str:
     """A figure as the tables show it."""
-    return "none" if value is None else f"{value:.2f}"
+    return "-" if value is None else f"{value:.2f}"
 
 
 def test_training_leaves_a_report(trained: Path) -> None:
@@ -282,13 +295,13 @@ def test_training_leaves_a_report(trained: Path) -> None:
     page = check_report(trained)
     height = load_results(trained).best.results[2]
     assert (height.value, height.passed) == (None, False)
-    assert "none" in re.search(r"<td[^>]*>height</td>.*", page)[0]
-    assert "|apex error| none, " in page
+    assert ">-</td>" in re.search(r"<td[^>]*>height</td>.*", page)[0]
+    assert "|apex error| -, " in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
     assert not {"results/height", "results/mean_apex_error_m"} & set(log)
-    met = sum(r.passed is not False for r in load_results(trained).best.results)
+    met = sum(r.passed for r in load_results(trained).best.results)
     assert f"<h1>{met} of 5 results met</h1>" in page
 
 
@@ -356,6 +369,47 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     assert pixels.shape == (picture.height, picture.width, 3)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
+
+
+class FakeWandb:
+    """Stands for a run of Weights & Biases, and for the package."""
+
+    def __init__(self):
+        self.settings, self.logged, self.finished = {}, [], False
+
+    def init(self, **settings):
+        self.settings = settings
+        return self
+
+    def log(self, values: dict, step: int) -> None:
+        self.logged.append((step, values))
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
+    config = TrainConfig(seed=7)
+    log = Logs([open_log(tmp_path), WandbLog(tmp_path, "bounce", config)])
+    log.add_scalar("episode/return", 2.5, 64)
+    log.add_text("results", "| a |", 64)
+    log.close()
+    assert logged(tmp_path, "episode/return") == {64: 2.5}
+    assert fake.logged == [(64, {"episode/return": 2.5})] and fake.finished
+    first = fake.settings
+    assert (first["project"], first["config"]["seed"]) == ("bounce", 7)
+    # A resumed training continues the same run.
+    WandbLog(tmp_path, "bounce", config)
+    assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
+
+
+def test_weights_and_biases_is_optional(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--wandb", "bounce"])
+    assert exit_info.value.code == 2
+    assert "pip install 'bounce_mjx[wandb]'" in capsys.readouterr().err
 
 
 def test_a_result_that_is_not_judged_is_marked(trained: Path) -> None:

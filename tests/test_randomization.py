@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.interpolate import CubicHermiteSpline
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
@@ -45,13 +46,13 @@ RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
 def test_draws_are_uniform_in_their_ranges() -> None:
     config = RandomizationConfig(**RANGES)
     keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"))
+    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6)
     worlds = jax.jit(jax.vmap(draw))(keys)
     assert tuple(worlds) == tuple(sorted(TERMS)) and set(config.terms) == set(TERMS)
     shares = []
     for name, values in worlds.items():
         low, high = RANGES[name]
-        assert values.shape == (2000, *TERMS[name].shape)
+        assert values.shape == (2000, *TERMS[name].shape(6))
         shares += list((np.asarray(values, float).reshape(2000, -1).T - low) / (high - low))
     shares = np.array(shares)
     assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
@@ -65,7 +66,9 @@ def test_draws_are_uniform_in_their_ranges() -> None:
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
     """JAX sorts the keys of a traced dictionary."""
     ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
-    draw = functools.partial(draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"))
+    draw = functools.partial(
+        draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"), num_joints=6
+    )
     expected = draw(ranges)
     for world in (jax.jit(draw)(ranges), draw(dict(reversed(ranges.items())))):
         assert world.keys() == expected.keys()
@@ -105,10 +108,11 @@ def test_bad_range(values: dict, words: str) -> None:
 
 
 def test_off_is_the_program_without_randomisation() -> None:
-    """The warm-up's settings do not matter; an active term changes the program."""
+    """The settings of the warm-up and of an unused estimator do not matter; an active term changes
+    the program."""
 
-    def program(**settings) -> tuple[str, int]:
-        env = BounceBall(EnvConfig(randomization=settings))
+    def program(estimator: dict | None = None, **settings) -> tuple[str, int]:
+        env = BounceBall(EnvConfig(randomization=settings, estimator=estimator or {}))
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
         jaxpr = jax.make_jaxpr(env.step)(state, jnp.zeros(6))
         return str(jaxpr), len(jaxpr.in_avals)
@@ -116,6 +120,7 @@ def test_off_is_the_program_without_randomisation() -> None:
     off, inputs = program()
     assert "shift_right_logical" not in off
     assert program(warmup_steps=1000, share=0.5) == (off, inputs)
+    assert program(estimator={"restitution": 0.7, "latency": 0.1}) == (off, inputs)
     on, more = program(ball_position_noise=(0.0, 0.01))
     assert "shift_right_logical" in on and more > inputs
 
@@ -446,6 +451,12 @@ def watch(float64):
     return watching(camera=True, velocity="measured")
 
 
+def ball_path() -> CubicHermiteSpline:
+    """Position of the ball between the control steps, by the positions and velocities at them."""
+    qpos, qvel = trajectory()
+    return CubicHermiteSpline(DT * np.arange(STEPS + 1), qpos[:, 6:9], qvel[:, 6:9])
+
+
 def pictures(world: dict, phase: float, w: int):
     """Measured position, velocity and age at each control step, simulated frame by frame: the
     camera takes picture n at (n + phase) / rate, and the picture arrives after the latency."""
@@ -455,10 +466,8 @@ def pictures(world: dict, phase: float, w: int):
     taken = (np.arange(2000) + phase) / rate
     taken = taken[taken < time[-1]]
 
-    def at(instants: np.ndarray, of: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(instants, time, column) for column in of.T], axis=1)
-
-    positions, velocities = at(taken, qpos[:, 6:9]), at(taken, qvel[:, 6:9])
+    positions = ball_path()(taken)
+    velocities = np.stack([np.interp(taken, time, column) for column in qvel[:, 6:9].T], axis=1)
     for now in time[1:]:
         arrived = np.flatnonzero(taken + latency <= now + 1e-4 / rate)
         if len(arrived):
@@ -592,13 +601,13 @@ def test_latency_without_a_camera_and_velocity_by_differences() -> None:
     """A picture at every control step; the velocity is the difference from the previous picture."""
     run = watching(camera=False, velocity="differences")
     seen = run(ball_latency=(0.0, 0.03))
-    qpos, _ = trajectory()
     time = DT * np.arange(STEPS + 1)
     for w, latency in enumerate(np.asarray(seen.world["ball_latency"])):
         then = np.maximum(time[1:] - latency, 0.0)
-        expected = np.stack([np.interp(then, time, x) for x in qpos[:, 6:9].T], axis=1)
+        expected = ball_path()(then)
         position = seen.parts["ball_position"][w, :, 0]
-        np.testing.assert_allclose(position, expected, atol=1e-9)
+        # Before the reset there was no path.
+        np.testing.assert_allclose(position[3:], expected[3:], atol=1e-9)
         np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], latency, atol=1e-9)
         velocity = seen.parts["ball_velocity"][w, :, 0]
         np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)

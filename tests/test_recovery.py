@@ -36,13 +36,15 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
-from bounce_mjx.runs.folders import best_checkpoint, latest_checkpoint
+from bounce_mjx.runs.folders import best_checkpoint, latest_checkpoint, save_config
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
+from bounce_mjx.training.command import config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
@@ -293,6 +295,31 @@ def test_signal_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
     assert read_record(latest_checkpoint(run)).progress["evaluations"] == []
 
 
+def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypatch) -> None:
+    """On MJX a block may take minutes. The resumed training first completes the block."""
+    monkeypatch.setattr(ppo_trainer, "_iterations_at_once", lambda *_: 1)
+    flags = [*TINY, "--block-steps", "128", "--total-steps", "256", "--no-report"]
+
+    class Stopped(PPOTrainer):
+        def run(self, iterations, stopping):
+            os.kill(os.getpid(), signal.SIGTERM)
+            while not stopping():
+                time.sleep(0.01)
+            return super().run(iterations, stopping)
+
+    def train(name: str, trainer: type[PPOTrainer], **resumed) -> Path:
+        command = train_command.read_command([*flags, "--log-dir", str(tmp_path / name)])
+        config, console = config_of(command), Console(file=io.StringIO())
+        with contextlib.suppress(training_job.TrainingStopped):
+            training_job.train(config, console, trainer, command="train", report=False, **resumed)
+        return next((tmp_path / name).iterdir())
+
+    stopped = train("stopped", Stopped)
+    assert latest_checkpoint(stopped).steps == 64
+    train("stopped", PPOTrainer, resume=stopped)
+    assert_same_training(stopped, train("straight", PPOTrainer))
+
+
 @pytest.mark.parametrize("pause", [0.0, 0.8], ids=["told twice", "second Ctrl-C"])
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
@@ -518,13 +545,58 @@ def test_a_screening_is_never_better_than_a_full_evaluation() -> None:
     assert [e.screening for e in stored.evaluations] == [True, False, True]
 
 
-def test_the_time_left_is_never_negative() -> None:
+@pytest.mark.parametrize(
+    ("steps", "solved", "expected"),
+    [(128, False, ", 0 s left"), (70, False, ", 180 s left"), (70, True, ", at most 180 s left")],
+)
+def test_the_time_left(monkeypatch, steps: int, solved: bool, expected: str) -> None:
+    """A training that is resumed after 50 steps needs 120 s for the next 20, evaluations included;
+    the last block may exceed the total."""
+    now = 0.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
     shown = io.StringIO()
-    config = TrainConfig(total_steps=100)
+    config = TrainConfig(total_steps=100, stop_when_solved=solved)
     names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
     metrics = {name: np.ones((1, 1)) for name in names} | {"task/non_finite": np.zeros((1, 1))}
-    Reporter([], Console(file=shown, width=200), config, 0).block(128, 1.0, metrics)
-    assert ", 0 s left" in shown.getvalue()
+    reporter = Reporter([], Console(file=shown, width=200), config, 50)
+    now = 120.0
+    reporter.block(steps, 1.0, metrics)
+    assert expected in shown.getvalue()
+
+
+@pytest.fixture
+def solved(run: Path) -> Path:
+    """A run of 128 steps that ended because it met all results."""
+    for path in [run / "results.json", *run.glob("checkpoints/*/128/run.json")]:
+        plain = json.loads(path.read_text())
+        (plain if path.name == "results.json" else plain["progress"])["solved_steps"] = 128
+        if path.name == "run.json":
+            plain["config"] |= {"stop_when_solved": True, "total_steps": 10**6}
+        path.write_text(json.dumps(plain))
+        seal(path.parent)
+    config = load_run_config(run).model_copy(
+        update={"stop_when_solved": True, "total_steps": 10**6}
+    )
+    save_config(run, config)
+    return run
+
+
+def test_a_solved_run_is_told_as_such(solved: Path, capsys) -> None:
+    resume(solved)
+    assert latest_checkpoint(solved).steps == STEPS // 2
+    said = capsys.readouterr().out
+    assert f"{solved} has met all results after 128 steps; add --total-steps N to train on" in said
+    resume(solved, "--total-steps", "128")
+    assert f"{solved} has been trained to its end, 128 steps;" in capsys.readouterr().out
+
+
+def test_a_solved_run_goes_on_to_new_total_steps(solved: Path, straight: Path, capsys) -> None:
+    resume(solved, "--total-steps", str(STEPS))
+    assert "it goes on to 256 steps" in capsys.readouterr().out
+    assert not load_run_config(solved).stop_when_solved
+    ours, theirs = arrays(latest_checkpoint(solved)), arrays(latest_checkpoint(straight))
+    for name in theirs:
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
 
 
 def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> None:
@@ -642,10 +714,10 @@ def change_state(monkeypatch, iteration: int, change: Callable) -> None:
     """Changes the state of every training before the given iteration."""
     run = PPOTrainer.run
 
-    def run_changed(trainer: PPOTrainer):
+    def run_changed(trainer: PPOTrainer, *args):
         if trainer.state.iteration == iteration - 1:
             trainer.state = change(trainer.state)
-        return run(trainer)
+        return run(trainer, *args)
 
     monkeypatch.setattr(PPOTrainer, "run", run_changed)
 

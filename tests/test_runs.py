@@ -1,9 +1,12 @@
 """Files of a run from elsewhere; each is valid or is refused in one sentence."""
 
 import concurrent.futures
+import dataclasses
 import json
 import math
 import os
+import re
+import shutil
 import threading
 from pathlib import Path
 
@@ -15,20 +18,27 @@ from tensorboardX import SummaryWriter
 
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import plot as plot_command
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.robot.model import load_model
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config, read_preset
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
+    best_checkpoint,
     choose_checkpoint,
     create_run,
+    find_checkpoint,
+    latest_checkpoint,
+    named_run,
     pretrained_checkpoint,
     save_config,
 )
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.reading import load_policy
+from tiny_runs import contents
 
 PRETRAINED = resource_path("pretrained")
 NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
@@ -75,7 +85,120 @@ def test_a_path_is_printed_as_it_is(tmp_path: Path, name: str, capsys) -> None:
     save_config(run, TrainConfig())
     chosen = choose_checkpoint(None, tmp_path / name, Console())
     assert chosen.run == run
-    assert capsys.readouterr().out == f"using the newest run: {run}\n"
+    assert capsys.readouterr().out == f"using the newest run: {run} (not evaluated)\n"
+
+
+@pytest.fixture
+def runs(tmp_path: Path, progress: Progress) -> Path:
+    """A folder of runs: the first solved, the second not, the third without a checkpoint."""
+    for name, passed in (("2026-01-01", True), ("2026-01-02", False), ("2026-01-03", None)):
+        run = tmp_path / name
+        run.mkdir()
+        save_config(run, TrainConfig())
+        if passed is not None:
+            (run / "checkpoints/best/64").mkdir(parents=True)
+            results = [dataclasses.replace(r, passed=passed) for r in progress.best.results]
+            results[3] = dataclasses.replace(results[3], passed=None)
+            progress.best = dataclasses.replace(progress.best, results=tuple(results))
+            (run / "results.json").write_text(to_json(results_of(progress)))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", [None, Path("latest")])
+def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> None:
+    """A result that is not judged counts neither as met nor as missed."""
+    assert choose_checkpoint(name, runs, Console()).run == runs / "2026-01-02"
+    assert capsys.readouterr().out.splitlines() == [
+        f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)",
+        f"an older run met all its results: {runs}/2026-01-01",
+        f"a newer run holds no checkpoint yet: {runs}/2026-01-03",
+    ]
+
+
+def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
+    monkeypatch.chdir(runs)
+    assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
+    command = train_command.read_command(["--resume", "latest", "--log-dir", str(runs)])
+    assert command.resume == runs / "2026-01-02"
+    (runs / "latest").mkdir()
+    assert named_run(Path("latest"), runs) == Path("latest")
+
+
+def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
+    for find in (latest_checkpoint, best_checkpoint, find_checkpoint):
+        with pytest.raises(UserError, match="2026-01-03 holds no checkpoint, as the first one"):
+            find(runs / "2026-01-03")
+
+
+# The robot of a run
+
+
+@pytest.fixture
+def robot_run(tmp_path: Path) -> Path:
+    """A run of a robot whose MJCF includes a file and has a mesh in another folder; the original
+    files are gone."""
+    original = tmp_path / "original"
+    for folder in ("mjcf", "meshes"):
+        (original / folder).mkdir(parents=True)
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    text, count = re.subn("<worldbody>", '<include file="more.xml"/><worldbody>', text, count=1)
+    assert count == 1
+    (original / "mjcf/my robot.xml").write_text(text, encoding="utf-8")
+    (original / "mjcf/more.xml").write_text(
+        '<mujoco><compiler meshdir="../meshes"/><asset><mesh name="m" file="m.obj"/></asset>'
+        '<worldbody><geom type="mesh" mesh="m" pos="9 9 9"/></worldbody></mujoco>'
+    )
+    faces = "f 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
+    (original / "meshes/m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n{faces}")
+    config = TrainConfig(env={"mjcf": original / "mjcf/my robot.xml"}, log_dir=tmp_path / "runs")
+    run = create_run(config)
+    shutil.rmtree(original)
+    return run
+
+
+def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypatch) -> None:
+    """The copy is used wherever the run is moved, and is not copied again by a resumed training."""
+    moved = tmp_path / "moved"
+    robot_run.rename(moved)
+    monkeypatch.chdir(tmp_path)
+    for run in (moved, Path("moved")):
+        env = load_run_config(run).env
+        assert env.mjcf == moved / "robot/mjcf/my robot.xml"
+        assert load_model(env.mjcf, 0.001).nmesh == 1
+    before = contents(moved)
+    save_config(moved, load_run_config(moved))
+    assert contents(moved) == before
+    # The config is a preset too, for a new run.
+    assert load_config(moved / "config.yaml").env.mjcf == env.mjcf
+
+
+@pytest.mark.parametrize("name", ["mjcf/my robot.xml", "mjcf/more.xml", "meshes/m.obj"])
+def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, name: str, capsys) -> None:
+    with (robot_run / "robot" / name).open("a") as file:
+        file.write("\n")
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--resume", str(robot_run)])
+    assert exit_info.value.code == 2
+    said = capsys.readouterr().err
+    assert f"{robot_run}/robot is not the robot" in said and f"{name} is not as it was" in said
+    # Every other command reads the config in the same way.
+    with pytest.raises(UserError, match="restore that folder"):
+        load_run_config(robot_run)
+
+
+def test_a_resumed_run_keeps_its_robot(robot_run: Path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        train_command.main(["--resume", str(robot_run), "--mjcf", "other.xml"])
+    assert "--resume cannot change env.mjcf" in capsys.readouterr().err
+
+
+def test_a_preset_has_a_name(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert read_preset(Path("seed")) == load_config(resource_path("configs/seed.yaml"))
+    with pytest.raises(UserError, match="the config file sead cannot be read"):
+        read_preset(Path("sead"))
+    (tmp_path / "seed").write_text("seed: 7")
+    assert read_preset(Path("seed")).seed == 7
 
 
 def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> None:

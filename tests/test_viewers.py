@@ -15,6 +15,7 @@ from pathlib import Path
 
 import imageio_ffmpeg
 import jax
+import jax.numpy as jnp
 import msgspec
 import mujoco
 import numpy as np
@@ -27,14 +28,15 @@ from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, view
+from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import TERM_NAMES
-from bounce_mjx.viewers import offscreen, pace
+from bounce_mjx.viewers import native, offscreen, pace
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
     make_policy_controller,
@@ -42,15 +44,25 @@ from bounce_mjx.viewers.controllers import (
     make_scripted_controller,
     make_zero_controller,
 )
-from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, _primitive, body_scenes
+from bounce_mjx.viewers.controls import direction
+from bounce_mjx.viewers.display import (
+    HOME_EDGES,
+    HOME_SITE,
+    TARGET_SITE,
+    Display,
+    _primitive,
+    body_scenes,
+)
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
+from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
 
 GRAVITY = 9.81
+HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
 SECONDS = 3.0
 PATIENCE = 60.0
 
@@ -129,12 +141,12 @@ def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording:
 def test_random_actions_are_uniform(env: BounceBall) -> None:
     states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 500))
     control = make_random_controller(env)
-    actions = np.asarray(control(states, jax.random.PRNGKey(1)))
+    actions, _ = control.act(None, states, jax.random.PRNGKey(1), ())
     assert actions.shape == (env.action_size, 500)
     np.testing.assert_allclose(
         np.quantile(actions, (0.0, 0.25, 0.75, 1.0)), (-1, -0.5, 0.5, 1), atol=0.05
     )
-    assert np.all(control(states, jax.random.PRNGKey(2)) != actions)
+    assert np.all(control.act(None, states, jax.random.PRNGKey(2), ())[0] != actions)
 
 
 def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
@@ -149,6 +161,69 @@ def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
     scripted.reset()
     low, high = scripted.env.config.target_height_range
     assert np.all((scripted.step().target_height >= low) & (scripted.frame.target_height <= high))
+
+
+def test_a_new_target_is_seen_before_the_next_step(scripted: Simulation) -> None:
+    """While the page is paused, and after a reset."""
+    scripted.reset()
+    scripted.target_height = 0.77
+    np.testing.assert_allclose(scripted.frame.target_height, 0.77)
+    np.testing.assert_allclose(scripted.reset().target_height, 0.77)
+    scripted.target_height = None
+
+
+def test_only_an_episode_that_was_not_timed_out_is_lost(
+    env: BounceBall, scripted: Simulation, recording: Frame
+) -> None:
+    assert recording.over.any() and not recording.lost.any()
+    scripted.reset()
+    scripted.push((2.0, 0.0, 0.0))
+    frames = scripted.record(1.0)
+    assert frames.lost.any(axis=0).all() and frames.over.any(axis=0).all()
+    scripted.reset()
+
+
+def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
+    both = SideBySide([scripted, scripted])
+    both.target_height = 0.7
+    both.reset()
+    frame = both.step()
+    assert both.num_envs == len(frame.ball) == len(both.frame.n_bounces) == 4
+    np.testing.assert_allclose(both.frame.target_height, 0.7)
+    assert both.record(0.05).qpos.shape[:2] == (6, 4)
+    both.target_height = None
+
+
+def test_an_exchanged_policy_acts(env: BounceBall) -> None:
+    def control(policy, states, key):
+        return policy["action"][:, None] + jnp.zeros_like(states.obs[: env.action_size])
+
+    still = {"action": np.zeros(env.action_size, np.float32)}
+    simulation = Simulation(env, control, 1, seed=0, policy=still)
+    before = simulation.frame.qpos[0, :6]
+    np.testing.assert_allclose(simulation.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
+    simulation.policy = {"action": np.ones(env.action_size, np.float32)}
+    moved = simulation.record(0.1).qpos[-1, 0, :6] - before
+    # The target of a servo is ahead of its joint by the scale of an action.
+    assert np.all(moved > 0.5 * env.config.action_scale)
+
+
+VIEWS = {
+    # From the default camera, the arm's side (-x, +y) is away.
+    "default": ((-1.06, 1.17, -0.42), "right", (1.17, 1.06, 0.0)),
+    "from behind the arm": ((1.0, 0.0, -0.3), "left", (0.0, 1.0, 0.0)),
+    "from the front": ((-1.0, 0.0, -0.3), "left", (0.0, -1.0, 0.0)),
+    "from above": ((0.0, 0.0, -1.0), "away", (1.0, 0.0, 0.0)),
+    "any": ((0.0, 2.0, 0.0), "back", (0.0, -1.0, 0.0)),
+    "no number": ((NAN, 0.0, 0.0), "up", (0.0, 0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("case", VIEWS.values(), ids=VIEWS)
+def test_pushes_follow_the_camera(case) -> None:
+    view, towards, expected = case
+    expected = np.array(expected) / np.linalg.norm(expected)
+    np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
 
 
 def test_a_push_adds_its_velocity_to_the_ball_once(scripted: Simulation) -> None:
@@ -174,7 +249,7 @@ def ramp(over: tuple[int, ...] = ()) -> Frame:
     wide = np.repeat(value[..., None], 3, axis=-1)
     ended = np.zeros((11, 1), bool)
     ended[list(over)] = True
-    return Frame(value * 0.01, wide, wide, wide, value, value, wide, ended)
+    return Frame(value * 0.01, wide, wide, wide, value, value, wide, ended, ended)
 
 
 def test_resampling_interpolates_positions() -> None:
@@ -234,6 +309,16 @@ def test_markers_are_at_the_positions_of_the_task(env: BounceBall) -> None:
     )
 
 
+def test_the_home_is_an_outline_that_leaves_the_paddle_free(env: BounceBall) -> None:
+    model, data = (display := Display(env)).model, display.data
+    display.pose(env.mj_model.qpos0, 0.5)
+    assert model.site(HOME_SITE).rgba[3] == 0.0
+    home, half = data.site(HOME_SITE).xpos, model.site(HOME_SITE).size
+    for name in HOME_EDGES:
+        gap = np.abs(data.site(name).xpos - home) - model.site(name).size
+        assert np.max(gap[:2] - half[:2]) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     bare = tmp_path / "bare.xml"
@@ -280,21 +365,36 @@ class Client:
         )
         self.look(position=[1.0, 0.0, 0.0])
         self._controls: dict[str, str] = {}
+        self._labels: list[str] = []
         self.texts: list[str] = []
 
     def control(self, label: str) -> str:
-        """The identifier of a control, by its label."""
+        """The identifier of a control or of a key's command, by its label."""
         while label not in self._controls:
-            window = self._socket.recv(timeout=PATIENCE)
-            length = int.from_bytes(window[8:16], "little")
-            text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
-            for message in msgspec.msgpack.decode(text)["messages"]:
-                props = message.get("props", {})
-                if "label" in props:
-                    self._controls[props["label"]] = message["uuid"]
-                if "content" in props:
-                    self.texts.append(props["content"])
+            self._receive()
         return self._controls[label]
+
+    def press(self, label: str) -> None:
+        """Triggers the command of a key."""
+        self.send({"type": "CommandTriggerMessage", "uuid": self.control(label)})
+
+    def labels(self) -> list[str]:
+        """All texts of labels in the scene so far."""
+        self._receive()
+        return self._labels
+
+    def _receive(self) -> None:
+        window = self._socket.recv(timeout=PATIENCE)
+        length = int.from_bytes(window[8:16], "little")
+        text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
+        for message in msgspec.msgpack.decode(text)["messages"]:
+            props = message.get("props", {})
+            if "label" in props:
+                self._controls[props["label"]] = message["uuid"]
+            updates = message.get("updates", {})
+            self.texts += [part["content"] for part in (props, updates) if "content" in part]
+            if "text" in updates:
+                self._labels.append(updates["text"])
 
     def set(self, label: str, value: object, name: str = "value") -> None:
         """Sets a control, and gives the page time to read it."""
@@ -382,7 +482,6 @@ def wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
 HOSTILE = {
     "robots": (0, 40, HUGE, -HUGE, NAN, "many", [1], None),
     "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", {}),
@@ -410,6 +509,74 @@ def test_no_client_can_end_or_stall_the_server(page) -> None:
     assert {height for height in did["target"] if height is not None} == {0.3, 0.8}
     speeds = {float(np.linalg.norm(push)) for push in did["push"]}
     assert speeds == {0.2, 1.0}
+
+
+def test_keys_act_as_in_the_window(page) -> None:
+    client, did = page
+    client.press("target height up")
+    wait_until(lambda: did["target"][-1] == pytest.approx(0.55))
+    client.press("slower")
+    wait_until(lambda: did["speed"][-1] == pytest.approx(0.9))
+    client.press("push the ball up")
+    wait_until(lambda: did["push"])
+    np.testing.assert_allclose(did["push"][-1], (0.0, 0.0, 0.2))
+    client.press("pause")
+    wait_until(lambda: len(did["target"]) == (time.sleep(0.3), len(did["target"]))[1])
+    client.press("pause")
+
+
+def test_a_lost_ball_is_announced(page, scripted: Simulation) -> None:
+    client, _ = page
+    client.control("robots")
+    scripted.push((2.0, 0.0, 0.0))
+    wait_until(lambda: any("BALL LOST" in text for text in client.labels()))
+
+
+def evaluated(*passed: bool | None) -> Report:
+    return Report(tuple(Result(f"r{i}", "%", 1.0, ">= 1", p) for i, p in enumerate(passed)), {})
+
+
+def test_results_are_shown_as_they_are_met() -> None:
+    """Each with the step since which it is met without a break."""
+    met_at: dict[str, int] = {}
+    for steps, *passed in (
+        (1_000_000, True, True, None),
+        (2_000_000, True, False, None),
+        (3_000_000, True, True, None),
+    ):
+        text = results_list(evaluated(*passed), steps, met_at)
+    assert met_at == {"r0": 1_000_000, "r1": 3_000_000}
+    assert "evaluation at 3,000,000 steps" in text and "2 of 2 judged results met" in text
+    assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
+
+
+def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, monkeypatch) -> None:
+    """The training only puts the news into a queue."""
+    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: scripted)
+    stop = threading.Event()
+
+    def step(simulation) -> None:
+        if stop.is_set():
+            raise RuntimeError("the\nend")
+
+    watch(monkeypatch, Simulation, "step", step)
+    printed = io.StringIO()
+    training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
+    wait_until(lambda: "watch: " in printed.getvalue())
+    client = Client(re.search(r"http://\S+", printed.getvalue())[0])
+    means = {"episode/return": 1.0, "episode/bounces": NAN, "speed/steps_per_second": 2e6}
+    training.block(500_000, means)
+    training.evaluation(500_000, evaluated(True, False), policy := ("newest",))
+    wait_until(lambda: scripted.policy == policy)
+    while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
+        client._receive()
+    assert any("1 of 2 results met" in text for text in client.texts)
+    # A page that fails leaves the training alone.
+    stop.set()
+    wait_until(
+        lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
+    )
+    training.wait()
 
 
 def test_a_title_is_not_markup(page) -> None:
@@ -695,6 +862,25 @@ def fails(tmp_path: Path, monkeypatch, capfd):
         return err
 
     return call
+
+
+def test_a_dead_display_is_not_used(monkeypatch) -> None:
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    assert sys.platform != "linux" or not native.has_display()
+
+
+def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
+    monkeypatch.setattr(Simulation, "__init__", None)
+    sentence = fails(play.main, "pretrained pretrained --video a.mp4".split())
+    assert "shows one policy" in sentence and "--viewer browser" in sentence
+
+
+def test_the_windows_own_toggles_of_the_used_keys_are_undone() -> None:
+    keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
+    keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
+    used = {letter for words in native._HELP for letter in words if letter.isupper()}
+    assert keys == used == set(native._KEYS)
 
 
 @pytest.mark.parametrize("main", [view.main, play.main])

@@ -9,7 +9,9 @@ if TYPE_CHECKING:
     from bounce_mjx.task.config import EnvConfig
     from bounce_mjx.task.env import BounceBall
 
-__all__ = ["BounceBall", "EnvConfig", "load_policy"]
+    __version__: str
+
+__all__ = ["BounceBall", "EnvConfig", "__version__", "load_policy"]
 
 register_when_imported()
 
@@ -25,6 +27,10 @@ def __getattr__(name: str) -> Any:
         from bounce_mjx.task.config import EnvConfig
 
         return EnvConfig
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("bounce_mjx")
     if name == "load_policy":
         from bounce_mjx.deploy.loading import load_policy
 

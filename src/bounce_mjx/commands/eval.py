@@ -2,12 +2,21 @@
 
 import os
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
@@ -15,13 +24,17 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 
+# An evaluation that is not slower needs no lines about its progress.
+_SILENT_SECONDS = 10.0
+
 
 class EvalCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), or a checkpoint in it. The default is the newest run,
-    or the policy that comes with the package if there is no run."""
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained or robust. The default is the newest run, or
+    pretrained if there is no run."""
     episodes: Count = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = DEFAULT_SEED
@@ -64,21 +77,24 @@ def main(args: Sequence[str] | None = None) -> None:
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
         policy = load_policy(checkpoint, config)
-        report, engine, warnings = run_interruptible(
-            evaluate_policy,
-            policy,
-            config.env,
-            config.ppo,
-            episodes=command.episodes,
-            seed=command.seed,
-            target_height=command.target_height,
-            nominal=command.nominal,
-            physics=command.physics,
-        )
         console.out(
-            f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)  physics: {engine}",
-            highlight=False,
+            f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False
         )
+        with _Progress(console) as progress:
+            report, engine, warnings = run_interruptible(
+                evaluate_policy,
+                policy,
+                config.env,
+                config.ppo,
+                episodes=command.episodes,
+                seed=command.seed,
+                target_height=command.target_height,
+                nominal=command.nominal,
+                physics=command.physics,
+                progress=progress.show,
+            )
+        length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
+        console.out(f"physics: {engine}  {length}", highlight=False)
         for warning in warnings:
             console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
         console.print(results_table(report, "the five results"))
@@ -95,6 +111,40 @@ def main(args: Sequence[str] | None = None) -> None:
                     "another file"
                 ) from error
     sys.exit(0 if report.passed else 1)
+
+
+class _Progress:
+    """A progress bar on a terminal; elsewhere, a line after each tenth of a slow evaluation."""
+
+    def __init__(self, console: Console):
+        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
+        self._console = console
+        self._bar = Progress(
+            *columns,
+            TimeElapsedColumn(),
+            TextColumn("<"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("compiling", total=1.0)
+        self._said, self._said_at = 0.0, time.monotonic()
+
+    def __enter__(self) -> "_Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._bar.stop()
+
+    def show(self, share: float) -> None:
+        """Shows the share of the evaluation that is done, from 0 to 1."""
+        self._bar.update(self._task, completed=share, description="evaluating")
+        slow = time.monotonic() - self._said_at >= _SILENT_SECONDS
+        if not self._console.is_terminal and slow and share - self._said >= 0.1:
+            self._said, self._said_at = share, time.monotonic()
+            self._console.print(f"{share:.0%} evaluated", highlight=False)
 
 
 def _check_writable(json_file: Path) -> None:

@@ -19,8 +19,9 @@ class ExportCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), a checkpoint in it, or pretrained, the policy that
-    comes with the package. The default is the newest run, or pretrained if there is no run."""
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained or robust. The default is the newest run, or
+    pretrained if there is no run."""
     onnx: Path | None = None
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
     jax: Path | None = None

@@ -1,13 +1,15 @@
 """The console script.
 
-`bounce-mjx train|eval|robustness|play|view|plot|report|export|train-torch`
+`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|train-torch`
 """
 
 import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
+import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 
@@ -17,6 +19,7 @@ COMMANDS = {
     "robustness": "measure the five results in perturbed worlds",
     "play": "show a trained policy",
     "view": "show the environment under random, zero or scripted actions",
+    "adopt": "write the config of another robot arm",
     "plot": "draw the learning curves of runs, and an evaluation",
     "report": "write the report of a run, report.html",
     "export": "write a trained policy as an ONNX file",
@@ -28,7 +31,7 @@ A robot arm learns to bounce a ball.
 
 {commands}
 
-bounce-mjx COMMAND --help lists the arguments of a command.
+bounce-mjx COMMAND --help lists the arguments of a command. bounce-mjx --version prints the version.
 """
 
 
@@ -43,10 +46,30 @@ def main(args: Sequence[str] | None = None) -> None:
             lines = (f"  {command:<13}{meaning}" for command, meaning in COMMANDS.items())
             print(_HELP.format(commands="\n".join(lines)), end="")
             return
+        if name == "--version":
+            print(f"bounce_mjx {bounce_mjx.__version__}")
+            return
         if name not in COMMANDS:
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
         with interruptible_imports():
-            module = importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}")
+            module = _import(f"bounce_mjx.commands.{name.replace('-', '_')}")
         module.main(rest)
+
+
+def _import(name: str) -> ModuleType:
+    """Imports a command's module.
+
+    Raises:
+      UserError: a package that it needs is missing.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("bounce_mjx"):
+            raise
+        raise UserError(
+            f"the package {error.name} is not installed for {sys.executable}; in the folder of "
+            "bounce_mjx run: pip install -e . (or start the command with uv run)"
+        ) from error

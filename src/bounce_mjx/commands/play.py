@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -11,19 +11,24 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.viewers.options import ViewerOptions
+from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
+
+if TYPE_CHECKING:
+    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.viewers.controllers import Controller
+    from bounce_mjx.viewers.show import Shown
 
 
 class PlayCommand(StrictModel):
     """The command line."""
 
-    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), a checkpoint in it, or a policy that comes with the
-    package: pretrained or robust. The default is the newest run, or pretrained if there is no
-    run."""
+    checkpoints: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained or robust. Several are shown side by side. The
+    default is the newest run, or pretrained if there is no run."""
     target_height: Positive | None = None
     """Target height, m. By default each reset draws it from the range of the run's config."""
     physics: Literal["config", "fused", "mjx"] = "config"
@@ -40,35 +45,46 @@ def main(args: Sequence[str] | None = None) -> None:
             PlayCommand,
             sys.argv[1:] if args is None else args,
             prog="bounce-mjx play",
-            description="Shows a trained policy.",
+            description="Shows a trained policy, or several side by side.",
         )
+        if len(command.checkpoints) > MAX_ENVS:
+            raise UserError(
+                f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
+            )
         with interruptible_imports():
-            from bounce_mjx.learning.policy import make_networks
-            from bounce_mjx.runs.config import load_run_config
-            from bounce_mjx.runs.folders import choose_checkpoint
-            from bounce_mjx.runs.reading import load_policy
-            from bounce_mjx.task.env import BounceBall
             from bounce_mjx.training.setup import set_up_jax
-            from bounce_mjx.viewers.controllers import Controller, make_policy_controller
             from bounce_mjx.viewers.show import show
 
         console = Console()
         set_up_jax()
-        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
-        config = load_run_config(checkpoint.run)
-        console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-        changes = {} if command.physics == "config" else {"physics": command.physics}
-        policy = load_policy(checkpoint, config)
-
-        def make_controller(env: BounceBall) -> Controller:
-            networks = make_networks(config.ppo, env.observation_size, env.action_size)
-            return make_policy_controller(networks, policy)
-
+        paths = command.checkpoints or (None,)
         show(
-            validate(EnvConfig, dict(config.env) | changes, "play"),
-            make_controller,
+            [_load(path, command, console) for path in paths],
             command.viewing,
-            title=f"policy of {checkpoint.run.name}, {checkpoint.steps:,} steps",
             target_height=command.target_height,
             console=console,
         )
+
+
+def _load(path: Path | None, command: PlayCommand, console: Console) -> "Shown":
+    """The environment and the policy of a checkpoint."""
+    from bounce_mjx.learning.policy import make_networks
+    from bounce_mjx.runs.config import load_run_config
+    from bounce_mjx.runs.folders import choose_checkpoint
+    from bounce_mjx.runs.reading import load_policy
+    from bounce_mjx.viewers.controllers import make_policy_controller
+    from bounce_mjx.viewers.show import Shown
+
+    checkpoint = choose_checkpoint(path, command.log_dir, console)
+    config = load_run_config(checkpoint.run)
+    console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
+    changes = {} if command.physics == "config" else {"physics": command.physics}
+    policy = load_policy(checkpoint, config)
+
+    def make_controller(env: "BounceBall") -> "Controller":
+        networks = make_networks(config.ppo, env.observation_size, env.action_size)
+        return make_policy_controller(networks, policy)
+
+    env_config = validate(EnvConfig, dict(config.env) | changes, "play")
+    title = f"{checkpoint.run.name}, {checkpoint.steps / 1e6:.1f} M steps"
+    return Shown(env_config, make_controller, title)

@@ -18,9 +18,9 @@ class PlotCommand(StrictModel):
     """The command line."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs. Runs that differ only in the seed become one curve with a band, as do the
-    seeds of one run. The default is the newest run. For a run of one seed, or one checkpoint in it,
-    the evaluation is drawn too."""
+    """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
+    become one curve with a band, as do the seeds of one run. For a run of one seed, or one
+    checkpoint in it, the evaluation is drawn too."""
     out: Path = Path("plots")
     """Folder for the pictures: curves, rewards and, for one run, evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
@@ -48,10 +48,10 @@ def main(args: Sequence[str] | None = None) -> None:
             )
             from bounce_mjx.reports.page import record_checkpoint
             from bounce_mjx.runs.config import load_run_config
-            from bounce_mjx.runs.folders import find_checkpoint, newest_run, runs_of_seeds
+            from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
             from bounce_mjx.task.env import BounceBall
 
-        runs = command.runs or (newest_run(command.log_dir),)
+        runs = [named_run(run, command.log_dir) for run in command.runs or (None,)]
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
         checkpoints = [find_checkpoint(seed) for seed in seeds]
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])

@@ -17,7 +17,7 @@ class ReportCommand(StrictModel):
     """The command line."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder. The default is the newest run."""
+    """A run's folder; latest, the default, is the newest run."""
     log_dir: Path = Path("runs/bounce_ball")
     """Folder in which to look for the newest run."""
 
@@ -33,9 +33,9 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         with interruptible_imports():
             from bounce_mjx.reports.page import record_checkpoint, write_report
-            from bounce_mjx.runs.folders import find_checkpoint, newest_run
+            from bounce_mjx.runs.folders import find_checkpoint, named_run
 
-        checkpoint = find_checkpoint(command.run or newest_run(command.log_dir))
+        checkpoint = find_checkpoint(named_run(command.run, command.log_dir))
         recording = run_interruptible(record_checkpoint, checkpoint)
         path, _ = write_report(checkpoint.run, recording)
         print(path)

@@ -26,8 +26,9 @@ class RobustnessCommand(StrictModel):
     """The command line."""
 
     checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder (its best checkpoint), or a checkpoint in it. The default is the newest run,
-    or the policy that comes with the package if there is no run."""
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained or robust. The default is the newest run, or
+    pretrained if there is no run."""
     suite: Path | None = None
     """YAML file of the perturbations; the default is configs/robustness.yaml."""
     episodes: Count = DEFAULT_CONDITION_EPISODES

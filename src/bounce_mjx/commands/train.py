@@ -5,11 +5,18 @@ from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field
+from rich.console import Console
 
 from bounce_mjx.config.settings import whole_number
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.training.command import TrainingCommand, asks_for_help, early_flag, run_command
+from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.training.command import (
+    TrainingCommand,
+    asks_for_help,
+    config_of,
+    early_flag,
+    run_command,
+)
 from bounce_mjx.training.command import read_command as read
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
@@ -29,6 +36,12 @@ class TrainCommand(TrainingCommand):
     """Number of processes, one per host; with coordinator-address."""
     process_id: Annotated[int, Field(ge=0)] | None = None
     """Number of this process, from 0; with coordinator-address."""
+    watch: bool = False
+    """Serve a page beside the training, with the newest policy, the curves and the five results."""
+    watch_host: str = "127.0.0.1"
+    """Address of that page's server; 0.0.0.0 also admits other machines."""
+    watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
+    """Port of that page's server, or the next free port."""
     host_timeout: Annotated[int, Field(ge=1, le=10**6)] = DEFAULT_TIMEOUT
     """Seconds that the processes wait for each other at the start, and after which a silent one
     counts as dead."""
@@ -55,7 +68,18 @@ def main(args: Sequence[str] | None = None) -> None:
         if several_hosts is not None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
-        run_command(read_command(args), PPOTrainer, PROG)
+        command = read_command(args)
+        if not command.watch or not hosts.is_leader():
+            run_command(command, PPOTrainer, PROG)
+            return
+        # Only a training that is watched pays for this import.
+        from bounce_mjx.viewers.watch import TrainingPage
+
+        page = TrainingPage(config_of(command), command.watch_host, command.watch_port, Console())
+        run_command(command, PPOTrainer, PROG, page)
+        page.wait()
+        # A thread that simulates cannot be stopped.
+        leave(0)
 
 
 def read_command(args: Sequence[str]) -> TrainCommand:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -11,7 +12,9 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.runs.config import load_config
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.training.command import path_flag
 from bounce_mjx.viewers.options import ViewerOptions
 
 
@@ -20,6 +23,8 @@ class ViewCommand(StrictModel):
 
     actions: Literal["random", "zero", "scripted"] = "random"
     """random: uniform; zero: the servos hold their angles; scripted: a hand-written juggler."""
+    robot: Path | None = None
+    """Config of a robot, such as the file that bounce-mjx adopt wrote."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
 
@@ -27,11 +32,14 @@ class ViewCommand(StrictModel):
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
+        args = sys.argv[1:] if args is None else args
+        robot = path_flag(args, "--robot")
         command = parse(
             ViewCommand,
-            sys.argv[1:] if args is None else args,
+            args,
             prog="bounce-mjx view",
             description="Shows the environment under random, zero or scripted actions.",
+            default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
         with interruptible_imports():
             from bounce_mjx.training.setup import set_up_jax
@@ -40,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 make_scripted_controller,
                 make_zero_controller,
             )
-            from bounce_mjx.viewers.show import show
+            from bounce_mjx.viewers.show import Shown, show
 
         controllers = {
             "random": make_random_controller,
@@ -49,10 +57,8 @@ def main(args: Sequence[str] | None = None) -> None:
         }
         set_up_jax()
         show(
-            command.env,
-            controllers[command.actions],
+            [Shown(command.env, controllers[command.actions], f"{command.actions} actions")],
             command.viewing,
-            title=f"{command.actions} actions",
             target_height=None,
             console=Console(),
         )

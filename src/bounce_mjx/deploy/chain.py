@@ -10,7 +10,7 @@ class Chain:
 
     def __init__(self, metadata: Metadata):
         links = metadata.chain
-        self._paddle = np.array(metadata.paddle)
+        self._paddle, self._normal = np.array(metadata.paddle), np.array(metadata.paddle_normal)
         self._joints = [link.joint for link in links]
         self._references = np.array([link.reference for link in links])
         self._positions = np.array([link.position for link in links])
@@ -22,14 +22,19 @@ class Chain:
 
     def paddle_position(self, joint_angles: np.ndarray) -> np.ndarray:
         """World position [3] of the paddle's centre at joint angles [J] (rad), m."""
+        return self.paddle(joint_angles)[0]
+
+    def paddle(self, joint_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World position [3] (m) of the paddle's centre, and upward unit normal [3] of the paddle,
+        at joint angles [J] (rad)."""
         angles = (joint_angles[self._joints] - self._references)[:, None, None]
         turned = np.sin(angles) * self._sine_term + (1.0 - np.cos(angles)) * self._cosine_term
-        position = self._paddle
+        position, normal = self._paddle, self._normal
         for origin, rotation in zip(
             self._positions[::-1], (self._fixed + turned)[::-1], strict=True
         ):
-            position = origin + rotation @ position
-        return position
+            position, normal = origin + rotation @ position, rotation @ normal
+        return position, normal
 
 
 def _matrix(quaternion: tuple[float, ...]) -> np.ndarray:

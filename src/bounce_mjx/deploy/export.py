@@ -4,6 +4,7 @@ Both have a separate input for each part of the observation. The runtime checks 
 of the inputs; a single vector would hide a wrong order.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,14 +15,15 @@ import numpy as np
 from bounce_mjx.deploy import metadata as metadata_module
 from bounce_mjx.deploy.metadata import FORMAT, Link, Metadata, Part
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.policy import Policy, act_with_memory, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses, load_model
+from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.observation import QUANTITIES
+from bounce_mjx.task.estimator import filter_constants, paddle_normal
+from bounce_mjx.task.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
@@ -39,7 +41,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping and metadata.
 
     The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
-    action); the output is `action`, float32 [N, 6].
+    action); the output is `action`, float32 [N, n]. A gru also has the input `memory` and the
+    output `next_memory`, float32 [N, H]; at the start of an episode the memory is zero.
 
     Raises:
       UserError: the checkpoint is damaged, its arm cannot be exported, or onnx is not installed.
@@ -55,8 +58,9 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 def export_jax(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
 
-    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, 6] for any N; `inputs` is
-    a dict with the names and shapes of `export_onnx`.
+    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, n] for any N; `inputs` is
+    a dict with the names and shapes of `export_onnx`. For a gru it gives the actions and the next
+    memory.
 
     Raises:
       UserError: the checkpoint is damaged.
@@ -64,14 +68,21 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     parts = _parts(config.env)
-    networks = make_networks(config.ppo, config.env.observation.layout.size, len(JOINT_NAMES))
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
 
-    def call(inputs: dict[str, jax.Array]) -> jax.Array:
+    memory_size = _memory_size(config)
+
+    def call(inputs: dict[str, jax.Array]) -> jax.Array | tuple[jax.Array, jax.Array]:
         flat = [inputs[p.name].reshape(-1, p.history * p.size) for p in parts]
-        return act(networks, policy, jnp.concatenate(flat, axis=-1))
+        memory = (inputs["memory"],) if memory_size else ()
+        observation = jnp.concatenate(flat, axis=-1)
+        actions, memory = act_with_memory(networks, policy, observation, memory)
+        return (actions, *memory) if memory_size else actions
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = {p.name: jax.ShapeDtypeStruct((n, p.history, p.size), jnp.float32) for p in parts}
+    if memory_size:
+        shapes["memory"] = jax.ShapeDtypeStruct((n, memory_size), jnp.float32)
     return jax.export.export(jax.jit(call), platforms=("cpu", "cuda"))(shapes).serialize()
 
 
@@ -82,21 +93,26 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, or its arm is not a chain of hinges Joint1..Joint6.
+      UserError: the MJCF file is missing, or its paddle hangs on a joint that is no hinge
+        with a servo.
     """
     env = config.env
-    m = load_model(env.mjcf, env.physics_dt, visual=False)
+    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
-    chain, paddle = _chain(m)
+    chain, paddle, normal = _chain(m, env.default_joint_angles)
+    filtered = env.observation.is_filtered
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
     limited = m.actuator_forcelimited[servos]
     return Metadata(
         format=FORMAT,
         steps=steps,
-        joint_names=JOINT_NAMES,
+        joint_names=joint_names(m),
         observation=_parts(env),
+        position=env.observation.position,
         velocity=env.observation.velocity,
+        estimator=filter_constants(env, m)._asdict() if filtered else None,
+        memory_size=_memory_size(config),
         control_dt=env.control_dt,
         action=_ACTION,
         action_scale=env.action_scale,
@@ -118,13 +134,19 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         bounce_max_distance=env.bounce_max_distance,
         chain=chain,
         paddle=paddle,
+        paddle_normal=normal,
     )
+
+
+def _memory_size(config: TrainConfig) -> int:
+    """Size of the policy's memory; 0 without one."""
+    return config.ppo.gru_size if config.ppo.network == "gru" else 0
 
 
 def _parts(env: EnvConfig) -> tuple[Part, ...]:
     return tuple(
         Part(_INPUT_NAMES.get(q.name, q.name), history, q.size, q.unit)
-        for q in QUANTITIES
+        for q in parts(env.num_joints)
         if (history := getattr(env.observation, q.name))
     )
 
@@ -133,8 +155,11 @@ def _plain(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, float]]:
-    """Hinges from the world to the paddle, and the paddle's centre in the last hinge's frame."""
+def _chain(
+    m: mujoco.MjModel, default_joint_angles: Sequence[float]
+) -> tuple[tuple[Link, ...], tuple[float, ...], tuple[float, ...]]:
+    """Hinges from the world to the paddle, and in the last hinge's frame the paddle's centre and
+    the normal of the face that is the upper one at the default joint angles."""
     addresses = find_addresses(m)
     body = m.geom_bodyid[addresses.paddle_geom]
     bodies = [body]
@@ -149,9 +174,8 @@ def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, flo
             is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
             if joint not in addresses.arm_joints or not is_hinge:
                 raise UserError(
-                    f"the paddle hangs on the joint {m.joint(joint).name!r}, and a policy can be "
-                    f"exported for hinges {JOINT_NAMES[0]} to {JOINT_NAMES[-1]} only; remove the "
-                    "joint from the MJCF"
+                    f"the paddle hangs on the joint {joint_name(m, joint)!r}, and a policy can be "
+                    "exported for hinges with servos only; remove the joint from the MJCF"
                 )
             anchor = m.jnt_pos[joint]
             links.append(
@@ -164,7 +188,9 @@ def _chain(m: mujoco.MjModel) -> tuple[tuple[Link, ...], tuple[float, float, flo
                 )
             )
             position, quaternion = -anchor, np.array([1.0, 0.0, 0.0, 0.0])
-    return tuple(links), _plain(position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion))
+    centre = position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion)
+    normal = _rotated(paddle_normal(m, default_joint_angles), quaternion)
+    return tuple(links), _plain(centre), _plain(normal)
 
 
 def _rotated(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -199,6 +225,28 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
         nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
+    def gated_unit(weights: Any, x: str) -> str:
+        """The next memory by flax's `GRUCell`: r and z from input and memory, then
+        n = tanh(input + r * memory), and (1 - z) * n + z * memory."""
+
+        def linear(gate: str, value: str) -> str:
+            layer = weights[gate]
+            inputs = [value, constant(f"gru/{gate}/kernel", layer["kernel"])]
+            if "bias" in layer:
+                inputs.append(constant(f"gru/{gate}/bias", layer["bias"]))
+            return node("Gemm", inputs, f"gru/{gate}")
+
+        def gate(name: str) -> str:
+            terms = [linear(f"i{name}", x), linear(f"h{name}", "memory")]
+            return node("Sigmoid", [node("Add", terms, f"gru/{name}/sum")], f"gru/{name}")
+
+        reset, kept = gate("r"), gate("z")
+        recalled = node("Mul", [reset, linear("hn", "memory")], "gru/recalled")
+        total = node("Add", [linear("in", x), recalled], "gru/new/sum")
+        new = node("Tanh", [total], "gru/new")
+        change = node("Sub", ["memory", new], "gru/change")
+        return node("Add", [new, node("Mul", [kept, change], "gru/kept")], "next_memory")
+
     parts = metadata.observation
     flat = [node("Flatten", [p.name], f"{p.name}/flat", axis=1) for p in parts]
     x = node("Concat", flat, "observation", axis=1)
@@ -220,6 +268,8 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
         weights = [constant(f"{name}/{k}", hidden[name][k]) for k in ("kernel", "bias")]
         x = node("Gemm", [x, *weights], f"{name}/linear")
         x = node("Mul", [x, node("Sigmoid", [x], f"{name}/sigmoid")], f"{name}/silu")
+    if metadata.memory_size:
+        x = gated_unit(params["gru"], x)
     weights = [constant(f"mean/{k}", params["Dense_0"][k]) for k in ("kernel", "bias")]
     x = node("Gemm", [x, *weights], "mean")
     limits = [constant("action/least", -1.0), constant("action/most", 1.0)]
@@ -233,6 +283,10 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
         for p in parts
     ]
     outputs = [tensor("action", ["N", len(metadata.joint_names)], metadata.action)]
+    if metadata.memory_size:
+        shape = ["N", metadata.memory_size]
+        inputs.append(tensor("memory", shape, "next_memory of the last step; at first zeros"))
+        outputs.append(tensor("next_memory", shape, "the memory of the next step"))
     graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
     model = helper.make_model(
         graph,

@@ -6,6 +6,7 @@ Its function `remember` is the reference for every history; a test compares the 
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
+from bounce_mjx.deploy.estimator import Estimator
 from bounce_mjx.deploy.metadata import Metadata
 
 Measurements = dict[str, np.ndarray]
@@ -35,13 +36,18 @@ class Histories:
         self._metadata, self._chain = metadata, Chain(metadata)
         self._ball = measured.get("ball_position", np.zeros(3))
         self._ball_velocity = np.zeros(3)
-        self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
+        # Without time stamps, each picture arrives after the latency that the filter expects.
+        self._latency = (metadata.estimator or {}).get("latency") or 0.0
+        self._age = float(measured["ball_age"][0]) if "ball_age" in measured else self._latency
         height = self._ball[2]
         self._flight_apex, self._lowest = height, height
         self._is_low = False
         self._flight_time = 0.0
         zero, joints = np.zeros(1), np.zeros(len(metadata.joint_names))
         angles = measured.get("joint_angles", joints)
+        self._estimator = None
+        if metadata.estimator is not None:
+            self._estimator = Estimator(metadata, self._ball, angles, self._age)
         start = {
             "past_actions": joints,
             "ball_age": np.array([self._age]),
@@ -58,15 +64,19 @@ class Histories:
         }
         """Last values of each quantity [history, size], the newest first."""
 
-    def add(self, measured: Measurements, action: np.ndarray) -> None:
-        """Adds the measurements of the next control step, and the action [J] of the step before."""
+    def add(self, measured: Measurements, action: np.ndarray, is_real: bool = True) -> None:
+        """Adds the measurements of the next control step, and the action [J] of the step before.
+
+        Args:
+          is_real: False for measurements that were interpolated, which the state estimator ignores.
+        """
         metadata = self._metadata
         angles = measured.get("joint_angles")
         paddle = np.zeros(3) if angles is None else self._chain.paddle_position(angles)
         measured = measured | {"past_actions": action, "paddle_position": paddle}
-        if "ball_position" in measured:
-            measured |= self._picture(measured)
         bounces = self._bounces(measured, paddle[2] + metadata.bounce_max_distance)
+        if "ball_position" in measured:
+            measured |= self._ball_now(measured, is_real)
         for name, past in self.values.items():
             if name not in OF_BOUNCES:
                 past[1:] = past[:-1].copy()
@@ -77,9 +87,9 @@ class Histories:
                     past[1:] = past[:-1].copy()
                 past[0] = value
 
-    def _picture(self, measured: Measurements) -> Measurements:
-        """Ball velocity from the last two pictures, if the policy uses differences; updates the age
-        of the picture. Without a measured age, a picture is new as soon as the position differs."""
+    def _ball_now(self, measured: Measurements, is_real: bool) -> Measurements:
+        """Position and velocity of the ball if they are not measured; updates the last picture.
+        Without a measured age, a picture is new as soon as the position differs."""
         held_age = self._age + self._metadata.control_dt
         position = measured["ball_position"]
         if "ball_age" in measured:
@@ -87,15 +97,26 @@ class Histories:
             is_new = held_age - age > _SAME_PICTURE
         else:
             is_new = bool(np.any(position != self._ball))
-            age = 0.0 if is_new else held_age
+            age = self._latency if is_new else held_age
         if is_new:
             elapsed = max(held_age - age, _SHORTEST)
             self._ball_velocity = (position - self._ball) / elapsed
             self._ball = position
         self._age = age
-        if self._metadata.velocity == "differences":
-            return {"ball_velocity": self._ball_velocity}
-        return {}
+        sources = {"differences": {"ball_velocity": self._ball_velocity}}
+        if self._estimator is not None:
+            estimate = self._estimator.add(
+                position if is_new and is_real else None, age, measured["joint_angles"]
+            )
+            sources["filter"] = dict(zip(("ball_position", "ball_velocity"), estimate, strict=True))
+        return {
+            name: sources[source][name]
+            for name, source in (
+                ("ball_position", self._metadata.position),
+                ("ball_velocity", self._metadata.velocity),
+            )
+            if source in sources
+        }
 
     def _bounces(
         self, measured: Measurements, near_height: float

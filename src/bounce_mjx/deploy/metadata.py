@@ -7,7 +7,9 @@ import json
 import math
 from typing import Any, NamedTuple
 
-FORMAT = 1
+from bounce_mjx.task.ball_filter import Constants
+
+FORMAT = 2
 """Version of the entries; readers refuse other versions."""
 
 
@@ -46,11 +48,17 @@ class Metadata(NamedTuple):
     steps: int
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
-    """Order of the joints in every array of J = 6 joints."""
+    """Order of the joints in every array of J joints."""
     observation: tuple[Part, ...]
     """The inputs of the network, each [N, history, size]."""
+    position: str
+    """Source of ball_position: `measured`, or `filter` for the estimate of the Kalman filter."""
     velocity: str
-    """Source of ball_velocity: `measured`, or `differences` of the measured positions."""
+    """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
+    estimator: dict[str, Any] | None
+    """Constants of the Kalman filter by the names in `ball_filter.Constants`; None without one."""
+    memory_size: int
+    """Size H of the input `memory` and of the output `next_memory` [N, H]; 0 without a memory."""
     control_dt: float
     """Time between two actions, s."""
     action: str
@@ -78,6 +86,8 @@ class Metadata(NamedTuple):
     """The hinges from the world to the paddle."""
     paddle: tuple[float, float, float]
     """Centre of the paddle in the frame of the last hinge, m."""
+    paddle_normal: tuple[float, float, float]
+    """Unit normal of the paddle's upper face in the frame of the last hinge."""
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
@@ -92,15 +102,18 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for anything else."""
     missing = [name for name in Metadata._fields if name not in entries]
+    # A file of another format lacks entries too, but the format is the reason.
+    if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
+        raise ValueError(f"its format is {given}, not {FORMAT}")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
     plain = {name: json.loads(entries[name]) for name in Metadata._fields}
-    if plain["format"] != FORMAT:
-        raise ValueError(f"its format is {plain['format']}, not {FORMAT}")
     try:
         plain["observation"] = tuple(Part(**part) for part in plain["observation"])
         plain["chain"] = tuple(Link(**link) for link in plain["chain"])
         metadata = Metadata(**plain)
+        if metadata.estimator is not None:
+            Constants(**metadata.estimator)
         _check(metadata)
     except (TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"its metadata is malformed: {error}") from error
@@ -110,6 +123,7 @@ def from_entries(entries: dict[str, str]) -> Metadata:
 def _check(metadata: Metadata) -> None:
     count = len(metadata.joint_names)
     numbers: list[Any] = [metadata.control_dt, metadata.action_scale, *metadata.paddle]
+    numbers += metadata.paddle_normal
     numbers += [n for link in metadata.chain for n in (*link.position, *link.quaternion)]
     if not all(math.isfinite(number) for number in numbers) or not metadata.control_dt > 0.0:
         raise ValueError("its metadata holds a number that is not finite or not positive")

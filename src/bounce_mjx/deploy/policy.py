@@ -78,6 +78,7 @@ class DeployedPolicy:
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
+        self._memory = np.zeros((1, self.metadata.memory_size), np.float32)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -110,6 +111,7 @@ class DeployedPolicy:
             return self._action.copy()
         if self._histories is None:
             self._histories = Histories(self.metadata, measured)
+            action = self._respond()
         else:
             for i in range(1, steps + 1):
                 share = i / steps
@@ -118,13 +120,12 @@ class DeployedPolicy:
                     for name, value in measured.items()
                     if name in self._measured
                 }
-                self._histories.add(measured | between if i < steps else measured, self._action)
-        self._measured, self._time = measured, time
-        inputs = {
-            name: values[None].astype(np.float32) for name, values in self._histories.values.items()
-        }
-        (actions,) = self._session.run(["action"], inputs)
-        self._action = actions[0].astype(float)
+                last = i == steps
+                self._histories.add(measured if last else measured | between, self._action, last)
+                # A memory needs every step.
+                if last or self.metadata.memory_size:
+                    action = self._respond()
+        self._measured, self._time, self._action = measured, time, action
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
@@ -145,6 +146,19 @@ class DeployedPolicy:
         targets = self._measured["joint_angles"] + self.metadata.action_scale * np.asarray(action)
         return np.clip(targets, low, high)
 
+    def _respond(self) -> np.ndarray:
+        """Action [J] of the network for the histories; updates its memory."""
+        inputs = {
+            name: values[None].astype(np.float32) for name, values in self._histories.values.items()
+        }
+        if not self.metadata.memory_size:
+            (actions,) = self._session.run(["action"], inputs)
+        else:
+            actions, self._memory = self._session.run(
+                ["action", "next_memory"], inputs | {"memory": self._memory}
+            )
+        return actions[0].astype(float)
+
     @property
     def observation(self) -> np.ndarray:
         """Inputs of the network at the last step in one vector, with the newest value of each
@@ -160,12 +174,14 @@ class DeployedPolicy:
         known = self._shapes.keys() | OF_BOUNCES | {"past_actions", "paddle_position"}
         if unknown := stated.keys() - known:
             raise ValueError(f"its input {min(unknown)} is unknown here")
-        if stated != actual or outputs != {"action": [len(self.metadata.joint_names)]}:
+        expected = {"action": [len(self.metadata.joint_names)]}
+        if size := self.metadata.memory_size:
+            stated["memory"] = expected["next_memory"] = [size]
+        if stated != actual or outputs != expected:
             raise ValueError("its inputs or outputs are not as its metadata states")
 
     def _needs(self) -> tuple[str, ...]:
         seen = {part.name for part in self.metadata.observation}
-        differences = self.metadata.velocity == "differences"
         needs = {
             "joint_angles": {"joint_angles", "paddle_position"} | OF_BOUNCES,
             "joint_velocities": {"joint_velocities", "bounce_joint_velocities"},
@@ -174,8 +190,10 @@ class DeployedPolicy:
             "ball_age": {"ball_age"},
             "target_height": {"target_height", "apex_error"},
         }
-        if differences:
+        if self.metadata.velocity != "measured":
             needs["ball_position"] |= needs.pop("ball_velocity")
+        if self.metadata.estimator is not None:
+            needs["joint_angles"] |= needs["ball_position"]
         return tuple(name for name, users in needs.items() if users & seen)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
@@ -193,7 +211,7 @@ class DeployedPolicy:
         checked["ball_angular_velocity"] = np.zeros(3)
         for name, value in measurements.items():
             checked[name] = self._array(name, value)
-        if self.metadata.velocity == "differences":
+        if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
 

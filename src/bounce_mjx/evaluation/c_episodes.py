@@ -11,7 +11,7 @@ from mujoco import rollout
 
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -29,11 +29,17 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 
 def make_mujoco_evaluator(
-    env: BounceBall, networks: Networks, episodes: int
+    env: BounceBall,
+    networks: Networks,
+    episodes: int,
+    progress: Callable[[float], None] | None = None,
 ) -> Callable[..., Statistics]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
+
+    Args:
+      progress: called every 100 control steps with the share of the time limit that is simulated.
     """
     num_threads = os.cpu_count() or 1
 
@@ -42,10 +48,11 @@ def make_mujoco_evaluator(
         return reset_episodes(env, key, episodes, ranges)
 
     @jax.jit
-    def decide(policy, states):
-        actions = act(networks, policy, states.obs.T).T
+    def decide(policy, states, memory):
+        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
+        actions = actions.T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
-        return actions, states, _rollout_inputs(env, control)
+        return actions, memory, states, _rollout_inputs(env, control)
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -54,6 +61,7 @@ def make_mujoco_evaluator(
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         states = start(key, ranges)
+        memory = networks.policy_network.start_memory((episodes,))
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
         ball_velocity = np.array(find_addresses(env.mj_model).ball_qvel[:3]) + 1 + env.mj_model.nq
         models = episode_models(env, states.pipeline_state.parameters)
@@ -61,7 +69,7 @@ def make_mujoco_evaluator(
         statistics = empty_statistics(episodes)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, states, inputs = decide(policy, states)
+                actions, memory, states, inputs = decide(policy, states, memory)
                 control, push = (np.asarray(x, np.float64) for x in inputs)
                 simulated[:, ball_velocity] += push
                 spec = _CTRL if control.shape[-1] == env.mj_model.nu else _CTRL_AND_FORCE
@@ -69,8 +77,12 @@ def make_mujoco_evaluator(
                 simulated = trajectory[:, -1]
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
-                if step % 100 == 99 and not np.any(statistics.running):
+                if step % 100 < 99:
+                    continue
+                if not np.any(statistics.running):
                     break
+                if progress is not None:
+                    progress((step + 1) / env.config.episode_steps)
         return statistics
 
     return evaluate
@@ -102,7 +114,7 @@ def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoc
     given = jax.tree.leaves(parameters)
     if not given:
         return [env.mj_model]
-    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False)
+    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False, robot=env.config.robot)
     return [
         edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
         for i in range(given[0].shape[-1])

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import Ranges
 from bounce_mjx.task.state import State
@@ -50,20 +51,22 @@ def run_episodes(
     """
 
     def unfinished(carry):
-        _, statistics, _, step = carry
+        _, _, statistics, _, step = carry
         return jnp.any(statistics.running) & (step < env.config.episode_steps)
 
     def advance(carry):
-        states, statistics, recording, step = carry
-        actions = act(networks, policy, states.obs.T)
+        states, memory, statistics, recording, step = carry
+        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
         recording = record(env, recording, states, statistics.running, step)
-        return states, accumulate(env, statistics, states, step), recording, step + 1
+        statistics = accumulate(env, statistics, states, step)
+        return states, memory, statistics, recording, step + 1
 
     episodes = states.done.shape[-1]
-    recording = empty_recording(env.config.episode_steps, min(recorded, episodes))
-    carry = (states, empty_statistics(episodes), recording, jnp.int32(0))
-    _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
+    recording = empty_recording(env.config.episode_steps, env.action_size, min(recorded, episodes))
+    memory = networks.policy_network.start_memory((episodes,))
+    carry = (states, memory, empty_statistics(episodes), recording, jnp.int32(0))
+    _, _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
     return statistics, recording
 
 
@@ -85,3 +88,41 @@ def reset_episodes(
     keys = jax.random.split(key, each)[index % each]
     ranges = jax.tree.map(lambda end: jnp.asarray(end)[index // each], ranges)
     return jax.vmap(env.reset, out_axes=-1)(keys, ranges)
+
+
+def make_reporting_evaluator(
+    env: BounceBall, networks: Networks, episodes: int, progress: Callable[[float], None]
+) -> Callable[[Policy, jax.Array], Statistics]:
+    """Like `make_evaluator`, but calls `progress` every second of simulated time with the share of
+    the time limit that is simulated."""
+
+    @jax.jit
+    def start(key: jax.Array):
+        memory = networks.policy_network.start_memory((episodes,))
+        return reset_episodes(env, key, episodes), memory, empty_statistics(episodes), jnp.int32(0)
+
+    @jax.jit
+    def go_on(policy: Policy, carry, until: jax.Array):
+        def unfinished(carry):
+            _, _, statistics, step = carry
+            return jnp.any(statistics.running) & (step < until)
+
+        def advance(carry):
+            states, memory, statistics, step = carry
+            actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
+            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
+            return states, memory, accumulate(env, statistics, states, step), step + 1
+
+        return jax.lax.while_loop(unfinished, advance, carry)
+
+    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
+        carry, limit = start(key), env.config.episode_steps
+        second = max(1, round(1.0 / env.dt))
+        for done in range(0, limit, second):
+            carry = go_on(policy, carry, np.int32(min(done + second, limit)))
+            if not np.any(carry[2].running):
+                break
+            progress(min(1.0, (done + second) / limit))
+        return carry[2]
+
+    return evaluate

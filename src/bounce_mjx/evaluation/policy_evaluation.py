@@ -1,5 +1,7 @@
 """The five results of a policy, on any engine."""
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -7,7 +9,7 @@ import jax
 from bounce_mjx.config.validation import validate
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
-from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
@@ -36,6 +38,7 @@ def evaluate_policy(
     target_height: float | None = None,
     nominal: bool = False,
     physics: Physics = "config",
+    progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
     """Measures the five results of a policy without action noise.
 
@@ -47,6 +50,7 @@ def evaluate_policy(
       target_height: one target height for all episodes, m; None for the config's range.
       nominal: whether the worlds are the model's own; else they are drawn as in the training.
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
+      progress: called now and then with the share of the work that is done, from 0 to 1.
 
     Raises:
       UserError: the engine does not support the model.
@@ -65,6 +69,9 @@ def evaluate_policy(
     networks = make_networks(ppo_config, env.observation_size, env.action_size)
     on_c = physics == "mujoco"
     make = make_mujoco_evaluator if on_c else make_evaluator
+    if progress is not None:
+        make = make_mujoco_evaluator if on_c else make_reporting_evaluator
+        make = functools.partial(make, progress=progress)
     statistics = make(env, networks, episodes)(policy, jax.random.PRNGKey(seed))
     return Evaluation(
         judge(env, statistics),

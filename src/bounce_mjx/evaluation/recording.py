@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
 
@@ -18,7 +18,7 @@ class Recording(NamedTuple):
     """T control steps of K episodes; entries after the end of an episode are undefined."""
 
     joint_angles: jax.Array
-    """Angles of Joint1..Joint6 after the step [T, 6, K], rad."""
+    """Positions of the acting joints after the step [T, n, K], rad."""
     ball: jax.Array
     """Ball positions after the step [T, 3, K], m."""
     paddle: jax.Array
@@ -33,10 +33,10 @@ class Recording(NamedTuple):
     """Whether the episode had not ended before the step [T, K], bool."""
 
 
-def empty_recording(steps: int, episodes: int) -> Recording:
+def empty_recording(steps: int, num_joints: int, episodes: int) -> Recording:
     """A recording before the first step."""
     return Recording(
-        joint_angles=jnp.zeros((steps, len(JOINT_NAMES), episodes)),
+        joint_angles=jnp.zeros((steps, num_joints, episodes)),
         ball=jnp.zeros((steps, 3, episodes)),
         paddle=jnp.zeros((steps, 3, episodes)),
         target_height=jnp.zeros((steps, episodes)),

@@ -70,6 +70,14 @@ class Report:
         return all(result.passed is not False for result in self.results)
 
     @property
+    def summary(self) -> str:
+        """The number of results that are met, such as "4 of 5 results met". A result that is not
+        judged does not count."""
+        judged = [result.passed for result in self.results if result.passed is not None]
+        kind = "results" if len(judged) == len(self.results) else "judged results"
+        return f"{sum(judged)} of {len(judged)} {kind} met"
+
+    @property
     def score(self) -> tuple[bool, int, float]:
         """Sort key of quality: a full evaluation ranks above a screening, then the number of
         results met counts, then the mean return."""

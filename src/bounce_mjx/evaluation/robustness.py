@@ -1,6 +1,7 @@
 """Robustness of a policy: its five results in every condition of a suite."""
 
 import json
+import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 
@@ -26,7 +27,7 @@ _SEPARATE_TERMS = frozenset(
     ("camera_rate", "contact_friction", "torque_limit", "joint_frictionloss")
 )
 # Episodes in one call: larger batches are not faster and would delay the progress report.
-_CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH = 1024, 16_384, 256
+_CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH_PER_CORE = 1024, 16_384, 128
 
 
 class Outcome(pydantic.BaseModel):
@@ -186,6 +187,6 @@ def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:
     accelerated = jax.default_backend() != "cpu"
     batch = _GPU_BATCH if accelerated else _CPU_BATCH
     if on_c:
-        batch = _MUJOCO_BATCH
+        batch = _MUJOCO_BATCH_PER_CORE * (os.cpu_count() or 1)
     calls = -(-conditions // max(1, batch // episodes))
     return -(-conditions // calls)

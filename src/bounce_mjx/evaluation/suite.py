@@ -130,7 +130,7 @@ def neutral_range(term: str, env: EnvConfig) -> Bounds | None:
         low = high = _NEVER
     elif term == "target_height":
         low, high = env.target_height_range
-    return None if low is None else _shaped(term, low, high)
+    return None if low is None else _shaped(term, env.num_joints, low, high)
 
 
 def _check(p: Perturbation, source: str) -> None:
@@ -166,10 +166,12 @@ def _condition(
     env = _with_settings(plain, perturbation.settings, value, source)
     if perturbation.trained_ranges:
         config = trained.randomization
-        ranges = {name: _shaped(name, *getattr(config, name)) for name in config.terms}
+        n = trained.num_joints
+        ranges = {name: _shaped(name, n, *getattr(config, name)) for name in config.terms}
     else:
         ranges = {
-            term: _bounds(term, entry, value, source) for term, entry in perturbation.terms.items()
+            term: _bounds(term, trained.num_joints, entry, value, source)
+            for term, entry in perturbation.terms.items()
         }
     spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
     # Raises an error for values outside a term's limits.
@@ -199,7 +201,7 @@ def _with_settings(
             )
         group[key] = _SIGNS[value] * strength if value in _SIGNS else value
     changed = validate(EnvConfig, values, source)
-    if changed.observation.layout != env.observation.layout:
+    if changed.layout != env.layout:
         raise UserError(
             f"{source}: it changes the quantities of the observation, which the policy's network "
             "fixes; remove that setting"
@@ -207,10 +209,10 @@ def _with_settings(
     return changed
 
 
-def _bounds(term: str, entry: Any, strength: float | None, source: str) -> Bounds:
+def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, source: str) -> Bounds:
     """Range of a term from its entry in the suite: a value, a list with one value for each entry of
     the term, or a mapping {from, to} of either."""
-    size = math.prod(TERMS[term].shape)
+    size = math.prod(TERMS[term].shape(num_joints))
     ends = [entry, entry]
     if isinstance(entry, dict):
         if entry.keys() != {"from", "to"}:
@@ -234,15 +236,15 @@ def _bounds(term: str, entry: Any, strength: float | None, source: str) -> Bound
             raise UserError(f"{source}: {term} has {len(end)} values, but must have {size}")
         return [number(value) for value in end]
 
-    low, high = _shaped(term, *map(numbers, ends))
+    low, high = _shaped(term, num_joints, *map(numbers, ends))
     if np.any(low > high):
         raise UserError(f"{source}: {term} is from a value to a lower one; swap from and to")
     return low, high
 
 
-def _shaped(term: str, low: Any, high: Any) -> Bounds:
+def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape; a list of one value also fits a scalar term."""
-    shape = TERMS[term].shape
+    shape = TERMS[term].shape(num_joints)
 
     def shaped(end: Any) -> np.ndarray:
         array = np.asarray(end, np.float64)

@@ -6,7 +6,7 @@ its loops, becomes one kernel of Pallas' Mosaic GPU backend, in which each threa
 environment in its registers.
 
 XLA compiles the function everywhere else: on a CPU, on GPUs before NVIDIA's Hopper, for other types
-than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`.
+than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`. It also compiles derivatives on a GPU.
 """
 
 import functools
@@ -55,9 +55,18 @@ def elementwise(
 
     call = batch_by(on_batch, lambda *args: call(*args))
 
+    @jax.custom_jvp
+    def differentiable(*args: jax.Array) -> Arrays:
+        return tuple(call(*args))
+
+    @differentiable.defjvp
+    def derivative(args: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
+        # A kernel has no derivative, so XLA compiles the function and its derivative.
+        return jax.jvp(lambda *args: tuple(function(*args)), args, tangents)
+
     def chosen(*args: jax.Array) -> Arrays:
         float32 = all(x.dtype == jnp.float32 for x in args)
-        return (call if float32 and (interpret or has_kernels()) else function)(*args)
+        return (differentiable if float32 and (interpret or has_kernels()) else function)(*args)
 
     return chosen
 

@@ -59,6 +59,11 @@ class PPOConfig(StrictModel):
     """Factor by which the trainer scales the reward."""
     init_noise_std: Positive = 0.4
     """Standard deviation of the action noise at the start."""
+    network: Literal["mlp", "gru"] = "mlp"
+    """Policy network: hidden layers alone, or hidden layers and a gated recurrent unit, which
+    remembers the episode so far. The value network is always an mlp."""
+    gru_size: Count = 128
+    """Size of the memory of a gru."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy and of the value network."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -82,6 +87,11 @@ class PPOConfig(StrictModel):
                 f"num_minibatches {self.num_minibatches} does not divide the batch of "
                 f"{batch} samples (num_envs {self.num_envs} * rollout_length "
                 f"{self.rollout_length}); choose a divisor of {batch}"
+            )
+        if self.network == "gru" and self.num_envs % self.num_minibatches:
+            raise ValueError(
+                f"num_minibatches {self.num_minibatches} does not divide num_envs {self.num_envs}; "
+                "the minibatches of a gru consist of whole environments, so choose a divisor"
             )
         return self
 

@@ -56,7 +56,8 @@ def supports(config: PPOConfig, num_inputs: int, num_actions: int) -> bool:
     """Whether the kernel supports networks and minibatches of these sizes."""
     widths = config.hidden_layers
     return (
-        config.compute_dtype == "bfloat16"
+        config.network == "mlp"
+        and config.compute_dtype == "bfloat16"
         and len(widths) == 2
         and widths[0] == widths[1]
         and widths[0] in HIDDEN_WIDTHS

@@ -2,6 +2,8 @@
 
 `make_trainer` gives two pure functions over one pytree of state: `init(key)` and
 `run(state, num_iterations)`. Inside `run` everything is a `scan`; nothing returns to Python.
+With a gru, the update unrolls the policy over the rollout of each environment, from its memory
+before the rollout.
 Source: Schulman et al., Proximal Policy Optimization Algorithms (2017).
 """
 
@@ -27,7 +29,15 @@ from bounce_mjx.learning.metrics import (
     rollout_metrics,
     step_metrics,
 )
-from bounce_mjx.learning.policy import Policy, cast_hidden_layers, make_networks
+from bounce_mjx.learning.policy import (
+    Memory,
+    Policy,
+    cast_hidden_layers,
+    forget,
+    make_networks,
+    respond,
+    respond_in_sequence,
+)
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
 from bounce_mjx.task import vector
 from bounce_mjx.task.state import Env
@@ -64,6 +74,8 @@ class TrainingState(NamedTuple):
     """Random key of the next iteration."""
     iteration: jax.Array
     """Iterations done [], int."""
+    memory: Memory = ()
+    """Memory of the policy network, each array [H, B]."""
 
 
 class Rollout(NamedTuple):
@@ -111,10 +123,15 @@ class Collection(NamedTuple):
     timeout_inputs: jax.Array
     """Normalised inputs at each environment's time-out, before its reset [B, N + K]; unused for an
     environment that did not time out."""
+    first_memory: Memory
+    """Memory of the policy network before the first step, each array [H, B]."""
+    last_memory: Memory
+    """Memory after the last step."""
 
 
 class Samples(NamedTuple):
-    """Data of an update: G groups of M samples (`num_groups`)."""
+    """Data of an update: G groups of M samples (`num_groups`). With a gru a sample is a sequence,
+    the whole rollout of one environment, and arrays have the T steps as third axis."""
 
     inputs: jax.Array
     """Normalised observation and critic metrics [G, M, N + K]."""
@@ -126,6 +143,10 @@ class Samples(NamedTuple):
     """[G, M]."""
     value_target: jax.Array
     """[G, M]."""
+    memory: Memory = ()
+    """Memory of the policy network before each sequence, each array [G, M, H]."""
+    starts: jax.Array | None = None
+    """Whether a step of a sequence is the first one of an episode [G, M, T], bool."""
 
 
 class Trainer(NamedTuple):
@@ -171,9 +192,18 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         dtype = jnp.dtype(config.compute_dtype)
         return Params(*(cast_hidden_layers(config, network, dtype) for network in params))
 
-    def policy_apply(params: Params, inputs: jax.Array) -> Gaussian:
+    def policy_apply(params: Params, inputs: jax.Array, memory: Memory) -> tuple[Gaussian, Memory]:
         observation = inputs[..., : env.observation_size]
-        return networks.policy_network.apply(params.policy, observation)
+        return respond(networks.policy_network, params.policy, observation, memory)
+
+    def distribution_of(params: Params, samples: Samples) -> Gaussian:
+        """Distributions of the samples' actions."""
+        if samples.starts is None:
+            return policy_apply(params, samples.inputs, ())[0]
+        observation = samples.inputs[..., : env.observation_size]
+        return respond_in_sequence(
+            networks.policy_network, params.policy, observation, samples.memory, samples.starts
+        )
 
     def value_apply(params: Params, inputs: jax.Array) -> jax.Array:
         return networks.value_network.apply(params.value, inputs)
@@ -206,6 +236,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             env=env_state._replace(clock=clock),
             key=key,
             iteration=jnp.int32(0),
+            memory=_transposed(networks.policy_network.start_memory((config.num_envs,))),
         )
 
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
@@ -215,10 +246,12 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
 
         def one_step(carry, draws):
-            env_state, timeout_inputs = unpack(carry)
+            env_state, timeout_inputs, memory = unpack(carry)
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
-            distribution = policy_apply(params, cast_inputs(normalize(raw_inputs, normalizer)))
+            distribution, memory = policy_apply(
+                params, cast_inputs(normalize(raw_inputs, normalizer)), _transposed(memory)
+            )
             action = distribution.mean + distribution.std * noise
             env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
             timeout_inputs = jnp.where(
@@ -235,7 +268,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 truncated=result.truncated,
             )
             metrics = step_metrics(result, groups)
-            return pack((env_state, timeout_inputs)), (pack(step_of_rollout), pack(metrics))
+            memory = _transposed(forget(memory, result.terminated | result.truncated))
+            return pack((env_state, timeout_inputs, memory)), (pack(step_of_rollout), pack(metrics))
 
         # An environment times out at most once in a rollout, because no time limit is shorter than
         # a rollout.
@@ -247,9 +281,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
         )
-        carry = pack((state.env, first_inputs.T))
+        carry = pack((state.env, first_inputs.T, state.memory))
         carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, fresh))
-        env_state, timeout_inputs = unpack(carry)
+        env_state, timeout_inputs, memory = unpack(carry)
         steps = unpack(steps)
         raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)
         rollout = Rollout(
@@ -268,6 +302,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             statistics=statistics.update(state.statistics, raw_inputs),
             last_inputs=normalize(last_inputs, normalizer),
             timeout_inputs=normalize(timeout_inputs.T, normalizer),
+            first_memory=state.memory,
+            last_memory=memory,
         )
         return collection, rollout_metrics(unpack(metrics))
 
@@ -296,11 +332,22 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage=advantage,
             value_target=advantage + values[:-1],
         )
-        return jax.tree.map(lambda x: group(x, groups), samples)
+        if config.network == "mlp":
+            return jax.tree.map(lambda x: group(x, groups), samples)
+        ended = rollout.terminated | rollout.truncated
+        # The memory before the first step is already empty where an episode starts there.
+        starts = jnp.concatenate([jnp.zeros_like(ended[:1]), ended[:-1]])
+        samples = jax.tree.map(
+            lambda x: group_sequences(x, groups), samples._replace(starts=starts)
+        )
+        first_memory = _transposed(collection.first_memory)
+        return samples._replace(
+            memory=jax.tree.map(lambda x: x.reshape(groups, -1, x.shape[-1]), first_memory)
+        )
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         params = cast_params(params)
-        distribution = policy_apply(params, samples.inputs)
+        distribution = distribution_of(params, samples)
         log_ratio = distribution.log_prob(samples.action) - samples.log_prob
         ratio = jnp.exp(log_ratio)
         advantage = samples.advantage
@@ -346,13 +393,14 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
-            size = config.batch_steps // groups
+            size = samples.log_prob.shape[1]
             order = jax.vmap(lambda key: jax.random.permutation(key, size))(keys)
             order = order.reshape((groups, config.num_minibatches, -1))
             # Mean and deviation of all minibatches at once: on several devices each reduction is a
             # message, and every minibatch already has one for its gradient.
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
-            mean, deviation = jnp.mean(advantage, axis=(0, 2)), jnp.std(advantage, axis=(0, 2))
+            axes = (0, *range(2, advantage.ndim))
+            mean, deviation = jnp.mean(advantage, axis=axes), jnp.std(advantage, axis=axes)
             shuffled, minibatches = gradients.shuffle(samples, order, mean, deviation)
 
             def step(carry, minibatch):
@@ -404,6 +452,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             env=collection.env,
             key=key,
             iteration=state.iteration + 1,
+            memory=collection.last_memory,
         )
         metrics |= losses | {"policy/learning_rate": learning_rate, "fault": fault}
         return state, metrics
@@ -432,8 +481,9 @@ def num_groups(config: PPOConfig) -> int:
     A device that holds whole groups therefore shuffles only its own samples, and the training does
     not depend on the number of devices.
     """
+    samples = config.num_envs if config.network == "gru" else config.batch_steps
     groups = max(_MIN_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
-    while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
+    while config.num_envs % groups or (samples // groups) % config.num_minibatches:
         groups //= 2
     return groups
 
@@ -443,6 +493,16 @@ def group(x: jax.Array, groups: int) -> jax.Array:
     length, batch, *rest = x.shape
     x = jnp.moveaxis(x.reshape((length, groups, batch // groups, *rest)), 1, 0)
     return x.reshape((groups, length * batch // groups, *rest))
+
+
+def group_sequences(x: jax.Array, groups: int) -> jax.Array:
+    """Deals the steps [T, B, ...] of environments into groups of sequences [G, B / G, T, ...]."""
+    length, batch, *rest = x.shape
+    return jnp.moveaxis(x, 0, 1).reshape((groups, batch // groups, length, *rest))
+
+
+def _transposed(memory: Memory) -> Memory:
+    return jax.tree.map(jnp.transpose, memory)
 
 
 def policy_of(state: TrainingState, observation_size: int) -> Policy:

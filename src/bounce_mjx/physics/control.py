@@ -41,12 +41,9 @@ def servo_target(control: Control, step: Scalar) -> Scalar:
       step: index of the physics step, from 0.
     """
     late = control.previous is not None
-    asked = control.ctrl
     before = control.switch if late else 0.0
-    if late:
-        asked = jnp.where(step < before, control.previous, control.ctrl)
     if control.lag is None:
-        return asked
+        return jnp.where(step < before, control.previous, control.ctrl) if late else control.ctrl
     # A filter with a time constant of 0 has no memory.
     rate = -1.0 / jnp.maximum(control.lag, 1e-3)
     held = jnp.minimum(step + 1.0, before) if late else 0.0

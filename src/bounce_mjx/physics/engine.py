@@ -16,6 +16,7 @@ from bounce_mjx.physics.control import Control
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.physics.parameters import PhysicsParameters, check_shapes
 from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.robot.model import find_addresses
 
 
 class Engine(NamedTuple):
@@ -61,11 +62,12 @@ def _engine(
     warnings: tuple[str, ...],
 ) -> Engine:
     constants = implementation.read_model(mj_model)
+    num_joints = len(find_addresses(mj_model).arm_joints)
 
     def step(
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
-        check_shapes(parameters)
+        check_shapes(parameters, num_joints)
         if parameters.frictionloss is not None:
             raise UserError(
                 f"the {name} physics does not compute dry friction that differs between "

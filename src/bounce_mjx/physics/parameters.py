@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
+from bounce_mjx.robot.model import find_addresses
 
 Array = np.ndarray | jax.Array
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
@@ -21,8 +21,8 @@ class PhysicsParameters(NamedTuple):
     """Physics parameters of one environment; None keeps the model's own value.
 
     Every engine replaces the model's value by the given one; the reference is `mj_step` on the
-    model returned by `edited_model`. Quantities of joints and links are in the order of
-    Joint1..Joint6. `jax.vmap` batches the arrays.
+    model returned by `edited_model`. Quantities of the n acting joints and their links are in the
+    order of `Addresses.arm_joints`. `jax.vmap` batches the arrays.
     """
 
     ball_mass: Array | None = None
@@ -37,24 +37,24 @@ class PhysicsParameters(NamedTuple):
     """Coefficient [] of sliding friction between ball and paddle; it turns a frictionless pair into
     one with `condim="3"`."""
     servo_gain: Array | None = None
-    """Stiffness [6] of the position servos, N m/rad: `kp`."""
+    """Stiffness [n] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
-    """Damping [6] of the position servos, N m s/rad: `kv`."""
+    """Damping [n] of the position servos, N m s/rad: `kv`."""
     force_limit: Array | None = None
-    """Force limits [6] of the position servos, N m: a symmetric `forcerange`."""
+    """Force limits [n] of the position servos, N m: a symmetric `forcerange`."""
     armature: Array | None = None
-    """Rotor inertia [6] at the joints, kg m^2."""
+    """Rotor inertia [n] at the joints, kg m^2."""
     damping: Array | None = None
-    """Viscous damping [6] of the joints, N m s/rad."""
+    """Viscous damping [n] of the joints, N m s/rad."""
     frictionloss: Array | None = None
-    """Dry friction [6] of the joints, N m; only MuJoCo's C engine simulates it."""
+    """Dry friction [n] of the joints, N m; only MuJoCo's C engine simulates it."""
     link_mass: Array | None = None
-    """Masses [6] of the links, kg; first moment and inertia scale in proportion, the centre of mass
+    """Masses [n] of the links, kg; first moment and inertia scale in proportion, the centre of mass
     stays in place."""
     paddle_position: Array | None = None
-    """Centre [3] of the paddle in the frame of the last link, m."""
+    """Centre [3] of the paddle in the frame of its body, m."""
     paddle_rotation: Array | None = None
-    """Orientation [4] of the paddle in the frame of the last link: a unit quaternion w, x, y, z."""
+    """Orientation [4] of the paddle in the frame of its body: a unit quaternion w, x, y, z."""
     gravity: Array | None = None
     """Gravitational acceleration [3] in the world, m/s^2."""
 
@@ -62,34 +62,36 @@ class PhysicsParameters(NamedTuple):
 MODEL_PARAMETERS = PhysicsParameters()
 """The model's own parameters: no value is replaced."""
 
-_NUM_JOINTS = len(JOINT_NAMES)
-SHAPES = PhysicsParameters(
-    ball_mass=(),
-    ball_radius=(),
-    contact_stiffness=(),
-    contact_damping=(),
-    contact_friction=(),
-    servo_gain=(_NUM_JOINTS,),
-    servo_damping=(_NUM_JOINTS,),
-    force_limit=(_NUM_JOINTS,),
-    armature=(_NUM_JOINTS,),
-    damping=(_NUM_JOINTS,),
-    frictionloss=(_NUM_JOINTS,),
-    link_mass=(_NUM_JOINTS,),
-    paddle_position=(3,),
-    paddle_rotation=(4,),
-    gravity=(3,),
-)
-"""Shape of each parameter for one environment."""
+
+def shapes(num_joints: int) -> PhysicsParameters:
+    """Shape of each parameter for one environment."""
+    per_joint = (num_joints,)
+    return PhysicsParameters(
+        ball_mass=(),
+        ball_radius=(),
+        contact_stiffness=(),
+        contact_damping=(),
+        contact_friction=(),
+        servo_gain=per_joint,
+        servo_damping=per_joint,
+        force_limit=per_joint,
+        armature=per_joint,
+        damping=per_joint,
+        frictionloss=per_joint,
+        link_mass=per_joint,
+        paddle_position=(3,),
+        paddle_rotation=(4,),
+        gravity=(3,),
+    )
 
 
-def check_shapes(parameters: PhysicsParameters) -> None:
+def check_shapes(parameters: PhysicsParameters, num_joints: int) -> None:
     """Checks the shapes of one environment's parameters.
 
     Raises:
       UserError: an array does not have the shape of its field.
     """
-    for name, value, shape in zip(parameters._fields, parameters, SHAPES, strict=True):
+    for name, value, shape in zip(parameters._fields, parameters, shapes(num_joints), strict=True):
         if value is not None and jnp.shape(value) != shape:
             raise UserError(
                 f"the physics parameter {name} has the shape {jnp.shape(value)}; give an array of "
@@ -108,11 +110,7 @@ def edited_fields(
     link's share of the softness, a thousandth of the sum, keeps its value of the unedited model.
     """
     m, addresses, p = mj_model, find_addresses(mj_model), parameters
-    links, dofs, servos = (
-        m.jnt_bodyid[addresses.arm_joints,],
-        np.array(addresses.arm_qvel),
-        np.array(addresses.actuators),
-    )
+    dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
     ball, ball_geom, paddle = addresses.ball_body, addresses.ball_geom, addresses.paddle_geom
     fields: dict[str, Array] = {}
 
@@ -165,9 +163,15 @@ def edited_fields(
     if p.frictionloss is not None:
         put("dof_frictionloss", dofs, p.frictionloss)
     if p.link_mass is not None:
-        ratio = p.link_mass / m.body_mass[links]
-        put("body_mass", links, p.link_mass)
-        put("body_inertia", links, current("body_inertia")[links] * ratio[:, None])
+        links = link_bodies(m)
+        bodies = np.concatenate(links)
+        joints = np.repeat(np.arange(len(links)), [len(link) for link in links])
+        moved = m.body_mass[bodies] > 0.0
+        bodies, joints = bodies[moved], joints[moved]
+        mass, old_mass = p.link_mass[joints], link_masses(m)[joints]
+        ratio = (mass / old_mass)[:, None]
+        put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
+        put("body_inertia", bodies, current("body_inertia")[bodies] * ratio)
     if p.ball_mass is not None or p.link_mass is not None:
         fields["body_subtreemass"] = _subtree_masses(m, current("body_mass"))
     if p.paddle_position is not None:
@@ -186,13 +190,26 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     Raises:
       UserError: an array does not have the shape of its field.
     """
-    check_shapes(parameters)
+    check_shapes(parameters, len(find_addresses(mj_model).arm_joints))
     numbers = jax.tree.map(lambda x: np.asarray(x, np.float64), parameters)
     fields, options = edited_fields(mj_model, numbers)
     model = copy.copy(mj_model)
     _assign(model, fields)
     _assign(model.opt, options)
     return model
+
+
+def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
+    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body with
+    several joints belongs to the last one, and the others have no bodies."""
+    m = mj_model
+    last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
+    return tuple(np.flatnonzero(last_joint == j) for j in find_addresses(m).arm_joints)
+
+
+def link_masses(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Masses [n] of the acting joints' links, kg."""
+    return np.array([np.sum(mj_model.body_mass[bodies]) for bodies in link_bodies(mj_model)])
 
 
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:

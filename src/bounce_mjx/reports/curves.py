@@ -10,6 +10,7 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.robot import identify_robot
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
@@ -40,7 +41,8 @@ class Group(NamedTuple):
     """Runs whose configs differ only in `_FREE_KEYS`."""
 
     label: str
-    """The first settings that distinguish this group from the others, and the number of seeds."""
+    """The first settings that distinguish this group from the others, and the number of seeds or
+    runs."""
     runs: list[RunCurves]
 
 
@@ -75,17 +77,21 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     Raises:
       UserError: a run has no config or no scalars.
     """
-    groups: dict[str, list[Path]] = {}
+    groups: dict[str, dict[Path, int]] = {}
     settings: dict[str, dict[str, Any]] = {}
     for run in runs:
-        flat = _settings(load_run_config(run))
+        config = load_run_config(run)
+        flat = _settings(config)
+        if config.env.mjcf is not None:
+            # The path of the run's own copy would make every run a group of its own.
+            flat["env.mjcf"] = identify_robot(config.env.mjcf, run)
         key = json.dumps(flat)
-        groups.setdefault(key, []).append(run)
+        groups.setdefault(key, {})[run] = config.seed
         settings[key] = flat
     labels = _differences(list(settings.values()))
     return [
-        Group(_label(differences, len(members)), [read_curves(run) for run in members])
-        for differences, members in zip(labels, groups.values(), strict=True)
+        Group(_label(differences, [*seeds.values()]), [read_curves(run) for run in seeds])
+        for differences, seeds in zip(labels, groups.values(), strict=True)
     ]
 
 
@@ -124,8 +130,12 @@ def _differences(settings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{name: each[name] for name in names} for each in settings]
 
 
-def _label(differences: dict[str, Any], runs: int) -> str:
+def _label(differences: dict[str, Any], seeds: Sequence[int]) -> str:
+    """The label of a group from the seeds of its runs."""
     named = [f"{name.split('.')[-1]} {value}" for name, value in differences.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
-    seeds = f"{runs} seeds" if runs > 1 else "one seed"
-    return f"{values} ({seeds})" if values else seeds
+    different = len(set(seeds))
+    members = "one seed" if different == 1 else f"{different} seeds"
+    if len(seeds) > different:
+        members = f"{len(seeds)} runs of {members}"
+    return f"{values} ({members})" if values else members

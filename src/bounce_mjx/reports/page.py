@@ -84,7 +84,6 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
 
 def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
     report = results.best
-    met = sum(result.passed is not False for result in report.results)
     pictures = "".join(
         f'<h2>{title}</h2>\n<img alt="{title}" src="{_embed(figure)}">\n'
         for title, figure in figures.items()
@@ -106,7 +105,7 @@ def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 <style>{_STYLE}</style>
 </head>
 <body>
-<h1>{met} of {len(report.results)} results met</h1>
+<h1>{report.summary}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
 {html.escape(results.device)}. The best of {len(evaluations)} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:

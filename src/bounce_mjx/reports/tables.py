@@ -8,8 +8,8 @@ from bounce_mjx.evaluation.results import Report, Result
 
 
 def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit: str = "") -> str:
-    """A measured figure times `scale`, as text; "none" if there was nothing to measure."""
-    return "none" if value is None else f"{scale * value:{spec}}{unit}"
+    """A measured figure times `scale`, as text; "-" if there was nothing to measure."""
+    return "-" if value is None else f"{scale * value:{spec}}{unit}"
 
 
 def _plain_table(title: str) -> Table:

@@ -1,49 +1,41 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
-from __future__ import annotations
-
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
 from bounce_mjx.errors import UserError
-from bounce_mjx.lazy import jax, jnp, mujoco, np
 from bounce_mjx.resources import resource_path
-
-JOINT_NAMES = tuple(f"Joint{i}" for i in range(1, 7))
-BALL_BODY_NAME = "ball_link"
-PADDLE_GEOM_NAME = "blocker"
-
-# Fields that MuJoCo's compiler can compute from others.
-_DERIVED_FIELDS = frozenset(
-    (
-        "actuator_acc0",
-        "actuator_length0",
-        "body_inertia",
-        "body_invweight0",
-        "body_subtreemass",
-        "dof_M0",
-        "dof_invweight0",
-        "dof_length",
-        "geom_aabb",
-        "geom_rbound",
-    )
+from bounce_mjx.robot.arm import (
+    BALL_BODY_NAME,
+    PADDLE_GEOM_NAME,
+    build_arm,
+    compile_spec,
+    locate,
+    read_spec,
 )
+from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers, physical_fields
 
 
 class Addresses(NamedTuple):
     """Indices of the named parts in the arrays of the model."""
 
     arm_joints: tuple[int, ...]
-    """Ids of Joint1..Joint6."""
+    """Ids of the acting joints, the joints with an actuator, in the model's order: the base comes
+    first."""
     arm_qpos: tuple[int, ...]
-    """Joint angles in qpos."""
+    """Positions of the acting joints in qpos."""
     arm_qvel: tuple[int, ...]
-    """Joint velocities in qvel."""
+    """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Servos of Joint1..Joint6 in ctrl."""
+    """Servos of the acting joints in ctrl."""
     ball_body: int
     ball_geom: int
     ball_qpos: tuple[int, ...]
@@ -53,51 +45,59 @@ class Addresses(NamedTuple):
     paddle_geom: int
 
 
-def load_model(mjcf: Path | None, physics_dt: float, visual: bool = True) -> mujoco.MjModel:
+def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
+    """Spec of the whole scene, and the path of its MJCF file.
+
+    Args:
+      mjcf: the file, as for `locate`; None for the project's own robot.
+      robot: the adoption of an arm; without a site, the file is the whole scene.
+
+    Raises:
+      UserError: the file is missing, is no MJCF, or holds no arm that can do the task.
+    """
+    path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf)
+    if robot.site is None:
+        return read_spec(path), path
+    try:
+        return build_arm(path, robot).spec, path
+    except UserError as error:
+        raise named(path, error) from error
+
+
+def named(path: Path, error: UserError) -> UserError:
+    """The error with the file's name, if it is missing."""
+    return error if str(path) in str(error) else UserError(f"the MJCF file {path} has {error}")
+
+
+def load_model(
+    mjcf: Path | None,
+    physics_dt: float,
+    visual: bool = True,
+    robot: RobotConfig | None = None,
+) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
     Args:
-      mjcf: the file; None for the project's own robot.
+      mjcf: the file, as for `locate`; None for the project's own robot.
       physics_dt: physics time step, s.
       visual: False drops the textures and geoms that only pictures need; they take most of a
         model's memory.
+      robot: the adoption of an arm; None for an MJCF file that is a whole scene.
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
         without a position servo, or has a number that cannot be simulated.
     """
-    path = mjcf or resource_path("mjcf/bounce_ball.xml")
-    if not os.path.isfile(path):
-        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+    spec, path = scene_spec(mjcf, robot or RobotConfig())
+    spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+    mj_model = compile_spec(spec, path)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
-        mj_model = spec.compile()
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
-    try:
-        _check_numbers(mj_model)
+        check_numbers(mj_model)
         _check_servos(mj_model, find_addresses(mj_model))
     except UserError as error:
-        raise UserError(f"the MJCF file {path} has {error}") from error
+        raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
     return mj_model
-
-
-def _check_numbers(mj_model: mujoco.MjModel) -> None:
-    """Refuses a time step that is not positive, and numbers that are not finite."""
-    step = mj_model.opt.timestep
-    if not 0.0 < step < np.inf:
-        raise UserError(f"the timestep {step}; give a positive number of seconds")
-    fields = [(mj_model, name) for name in _physical_fields(mj_model)]
-    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
-    # Derived fields come last: the message must name a number that is in the file.
-    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
-        values = np.asarray(getattr(owner, name))
-        if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
-            value = values[~np.isfinite(values)][0]
-            raise UserError(f"the number {value} in {name}; give finite numbers")
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -107,7 +107,7 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
         mujoco.mjtDyn.mjDYN_FILTER,
         mujoco.mjtDyn.mjDYN_FILTEREXACT,
     )
-    for name, actuator in zip(JOINT_NAMES, addresses.actuators, strict=True):
+    for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
         is_position_servo = (
             mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
             and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -116,6 +116,7 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
             and mj_model.actuator_biasprm[actuator, 1] < 0.0
         )
         if not is_position_servo:
+            name = joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is no position servo; drive it by "
                 f'<position joint="{name}"/>'
@@ -128,7 +129,6 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
-    joints = tuple(_find(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in JOINT_NAMES)
     ball_body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, BALL_BODY_NAME)
     paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
 
@@ -137,31 +137,49 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
         raise UserError(f"no free joint on the body {BALL_BODY_NAME}; add <freejoint/> to it")
     if mj_model.body_geomnum[ball_body] < 1:
         raise UserError(f"no geom on the body {BALL_BODY_NAME}; add the ball's sphere to it")
-    actuators = []
-    for joint, name in zip(joints, JOINT_NAMES, strict=True):
-        driving = [
-            i
-            for i in range(len(mj_model.actuator_trntype))
-            if mj_model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-            and mj_model.actuator_trnid[i, 0] == joint
-        ]
-        if len(driving) != 1:
-            raise UserError(
-                f"{len(driving)} actuators on {name}; give it exactly one position servo"
-            )
-        actuators.append(driving[0])
+    servos = _servos(mj_model)
+    joints = tuple(servos)
     ball_qpos, ball_qvel = mj_model.jnt_qposadr[ball_joint], mj_model.jnt_dofadr[ball_joint]
     return Addresses(
         arm_joints=joints,
         arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
         arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
-        actuators=tuple(actuators),
+        actuators=tuple(servos.values()),
         ball_body=ball_body,
         ball_geom=_ball_geom(mj_model, ball_body),
         ball_qpos=tuple(range(ball_qpos, ball_qpos + 7)),
         ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
         paddle_geom=paddle_geom,
     )
+
+
+def joint_name(mj_model: mujoco.MjModel, joint: int) -> str:
+    """Name of a joint; an unnamed joint has its index for a name."""
+    return mj_model.joint(joint).name or f"joint{joint}"
+
+
+def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the acting joints."""
+    return tuple(joint_name(mj_model, j) for j in find_addresses(mj_model).arm_joints)
+
+
+def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
+    """The actuator of each hinge and slide that has one, in the order of the joints."""
+    acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    servos: dict[int, int] = {}
+    for actuator in range(mj_model.nu):
+        joint = int(mj_model.actuator_trnid[actuator, 0])
+        if mj_model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        if int(mj_model.jnt_type[joint]) not in acting:
+            continue
+        if joint in servos:
+            name = joint_name(mj_model, joint)
+            raise UserError(f"several actuators on {name}; give it exactly one position servo")
+        servos[joint] = actuator
+    if not servos:
+        raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
+    return dict(sorted(servos.items()))
 
 
 def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> jax.Array | None:
@@ -184,7 +202,7 @@ def fingerprint(mj_model: mujoco.MjModel) -> bytes:
     """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
     for owner, names in (
-        (mj_model, _physical_fields(mj_model)),
+        (mj_model, physical_fields(mj_model)),
         (mj_model.opt, [name for name in dir(mj_model.opt) if not name.startswith("_")]),
     ):
         for name in names:
@@ -205,12 +223,6 @@ def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
         )
 
 
-def _physical_fields(mj_model: mujoco.MjModel) -> list[str]:
-    kinds = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
-    pictured = ("geom_rgba", "geom_matid", "geom_group")
-    return [name for name in dir(mj_model) if name.startswith(kinds) and name not in pictured]
-
-
 def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
     """The ball's geom in the contact pair; without a pair, its first geom."""
     ball_geoms = {
@@ -226,6 +238,6 @@ def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     index = mujoco.mj_name2id(mj_model, kind, name)
     if index < 0:
         noun = kind.name.removeprefix("mjOBJ_").lower()
-        needed = ", ".join((*JOINT_NAMES, BALL_BODY_NAME, PADDLE_GEOM_NAME))
+        needed = f"{BALL_BODY_NAME} and {PADDLE_GEOM_NAME}"
         raise UserError(f"no {noun} named {name}; the task needs the names {needed}")
     return index

@@ -2,8 +2,10 @@
 
 import importlib.metadata
 import importlib.util
+import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
@@ -11,6 +13,8 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.config import is_packaged
+from bounce_mjx.runs.robot import check_robot
 from bounce_mjx.task.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
@@ -53,31 +57,58 @@ def load_run_config(run: Path) -> TrainConfig:
     """Reads the resolved config of a run.
 
     Raises:
-      UserError: the file is missing or damaged.
+      UserError: the file is missing or damaged, or the run's copy of its robot was edited.
     """
-    return load_config(run / CONFIG_FILE)
+    config = load_config(run / CONFIG_FILE)
+    if config.env.mjcf is not None:
+        check_robot(config.env.mjcf, run)
+    return config
 
 
-def load_config(path: Path) -> TrainConfig:
-    """Reads a run's config from a YAML file, with defaults for missing keys.
+def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
+    """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
+    MJCF file starts at the folder of the YAML file.
+
+    Args:
+      robot: config of a robot, whose keys win over those of the file.
 
     Raises:
       UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
     """
     values = read_mapping(path, "config file", "configs/default.yaml")
-    return validate(TrainConfig, values, str(path))
+    values = _with_mjcf_from(path.parent, values)
+    if robot is None:
+        return validate(TrainConfig, values, str(path))
+    own = read_mapping(robot, "robot's config file", "configs/robots/ur5e.yaml")
+    own = _with_mjcf_from(robot.parent, own)
+    validate(TrainConfig, own, str(robot))
+    return validate(TrainConfig, _merged(values, own), f"{path} with {robot}")
 
 
-def read_preset(path: Path | None) -> TrainConfig:
-    """Reads a preset from configs/; without a path, the preset for this machine.
+def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    """Nested mappings in which the others' keys win."""
+    merged = dict(values)
+    for key, value in others.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged
+
+
+def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
+    """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
+    this machine.
+
+    Args:
+      robot: config of a robot, whose keys win over the preset's.
 
     Raises:
       UserError: the file is missing or invalid.
     """
     if path is None:
-        preset = "default" if has_accelerator() else "cpu"
-        path = resource_path(f"configs/{preset}.yaml")
-    return load_config(path)
+        path = Path("default" if has_accelerator() else "cpu")
+    named = resource_path(f"configs/{path.name}.yaml")
+    is_name = str(path) == path.name and not os.path.exists(path)
+    return load_config(named if is_name and os.path.isfile(named) else path, robot)
 
 
 def has_accelerator() -> bool:
@@ -87,3 +118,12 @@ def has_accelerator() -> bool:
         importlib.util.find_spec(name) for name in ("jax_plugins", "libtpu")
     )
     return bool(plugins or "jax" in sys.modules) and jax.default_backend() != "cpu"
+
+
+def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """A config's values with an absolute path of the MJCF file."""
+    env = values.get("env")
+    mjcf = env.get("mjcf") if isinstance(env, dict) else None
+    if not isinstance(mjcf, str) or mjcf.startswith("~") or is_packaged(Path(mjcf)):
+        return values
+    return values | {"env": env | {"mjcf": str(folder / mjcf)}}

@@ -2,6 +2,7 @@
 
     runs/bounce_ball/<time stamp>/
         config.yaml                     the resolved config
+        robot/                          a copy of --mjcf and its files (`runs.robot`)
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/latest/<steps>/     the newest state
@@ -17,10 +18,11 @@ one seed; the run's own checkpoints/latest/ holds the state of all seeds.
 Functions that search raise a `UserError` if they find nothing.
 """
 
+import contextlib
 import datetime
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -29,12 +31,16 @@ from rich.console import Console
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import locate
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.robot import ROBOT, copy_robot
 
 CheckpointName = Literal["latest", "best"]
 PRETRAINED = "pretrained"
+LATEST = "latest"
+"""Name of the newest run on the command line."""
 SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
 """Policies that come with the package: their names, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
@@ -77,7 +83,13 @@ def create_run(config: TrainConfig) -> Path:
 
 
 def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config."""
+    """Writes the run's resolved config, and a copy of its robot unless the run has one."""
+    if (mjcf := config.env.mjcf) is not None:
+        if not mjcf.is_relative_to((run / ROBOT).absolute()):
+            mjcf = copy_robot(locate(mjcf), run).absolute()
+        # The run's folder may be moved.
+        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
+        config = config.model_copy(update={"env": env})
     write_atomically(run / CONFIG_FILE, dump_config(config))
 
 
@@ -110,13 +122,20 @@ def find_run(path: Path) -> Path:
 
 def newest_run(log_dir: Path) -> Path:
     """Folder of the newest run with a checkpoint."""
-    found = [p.parent.parent for p in log_dir.glob(f"*/{CHECKPOINTS}/*") if stored_checkpoints(p)]
+    found = [run for run in _runs(log_dir) if _has_checkpoint(run)]
     if not found:
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with bounce-mjx train, or "
             "give a run's folder"
         )
     return max(found)
+
+
+def named_run(path: Path | None, log_dir: Path) -> Path:
+    """A run's folder or a path in it, as the user named it: None and `LATEST` (unless there is a
+    folder with that name) stand for the newest run in `log_dir`."""
+    is_name = path is None or (str(path) == LATEST and not os.path.isdir(path))
+    return newest_run(log_dir) if is_name else path
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -135,17 +154,17 @@ def find_checkpoint(path: Path) -> Checkpoint:
     for folder in (place, place / CHECKPOINTS / "best", place / CHECKPOINTS / "latest"):
         if stored := stored_checkpoints(folder):
             return Checkpoint(run, stored[max(stored)], max(stored))
-    raise UserError(f"{path} holds no checkpoint; train longer or give another run's folder")
+    raise _no_checkpoint(path)
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """Newest checkpoint of a run, from which its training resumes."""
-    return find_checkpoint(run / CHECKPOINTS / "latest")
+    return _checkpoint_of(run, "latest")
 
 
 def best_checkpoint(run: Path) -> Checkpoint:
     """Checkpoint of a run with the best evaluation."""
-    return find_checkpoint(run / CHECKPOINTS / "best")
+    return _checkpoint_of(run, "best")
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -164,23 +183,40 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     """Checkpoint to show or to evaluate; prints the choice if the user made none.
 
     Args:
-      path: see `find_checkpoint`; or a name in `SHIPPED`, unless there is a folder with that name.
-        For None, the newest run in `log_dir`, or `PRETRAINED` if the default folder of runs is
-        empty.
+      path: see `find_checkpoint`; or `LATEST` or a name in `SHIPPED`, unless there is a folder with
+        that name. For None, the newest run in `log_dir`, or `PRETRAINED` if the default folder of
+        runs is empty.
     """
-    if str(path) in SHIPPED and not path.is_dir():
+    if str(path) in SHIPPED and not os.path.isdir(path):
         return pretrained_checkpoint(str(path))
-    if path is not None:
-        return find_checkpoint(path)
     try:
-        run = newest_run(log_dir)
+        run = named_run(path, log_dir)
     except UserError:
-        if log_dir != TrainConfig().log_dir:
+        if path is not None or log_dir != TrainConfig().log_dir:
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint()
-    console.out(f"using the newest run: {run}", highlight=False)
+    if run != path:
+        for line in _introduction(run, log_dir):
+            console.out(line, highlight=False)
     return find_checkpoint(run)
+
+
+def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
+    """Lines that say which run is used, how good it is, and which run may be meant instead."""
+    results = load_results(_best_seed(run))
+    yield f"using the newest run: {run} ({results.best.summary if results else 'not evaluated'})"
+    if results is None or not results.best.passed:
+        for other in sorted(_runs(log_dir), reverse=True):
+            # A damaged file of another run is no reason to stop.
+            with contextlib.suppress(UserError):
+                found = load_results(_best_seed(other)) if _has_checkpoint(other) else None
+                if found is not None and found.best.passed:
+                    yield f"an older run met all its results: {other}"
+                    break
+    newer = [other for other in _runs(log_dir) if other > run]
+    if newer:
+        yield f"a newer run holds no checkpoint yet: {max(newer)}"
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
@@ -198,3 +234,26 @@ def _best_seed(run: Path) -> Path:
     results = {seed: load_results(seed) for seed in runs_of_seeds(run) if seed != run}
     scores = {seed: found.best.score for seed, found in results.items() if found}
     return max(scores, key=scores.get, default=run)
+
+
+def _runs(log_dir: Path) -> list[Path]:
+    """Folders of runs, with and without a checkpoint."""
+    return [path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}")]
+
+
+def _has_checkpoint(run: Path) -> bool:
+    return any(stored_checkpoints(folder) for folder in (run / CHECKPOINTS).glob("*"))
+
+
+def _checkpoint_of(run: Path, name: CheckpointName) -> Checkpoint:
+    folder = run / CHECKPOINTS / name
+    if not stored_checkpoints(folder):
+        raise _no_checkpoint(run)
+    return find_checkpoint(folder)
+
+
+def _no_checkpoint(path: Path) -> UserError:
+    return UserError(
+        f"{path} holds no checkpoint, as the first one follows the first evaluation; train longer "
+        "or give another run's folder"
+    )

@@ -18,7 +18,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, read_json
 from bounce_mjx.runs.folders import Checkpoint
@@ -26,11 +25,13 @@ from bounce_mjx.runs.folders import Checkpoint
 RECORD_FILE = "run.json"
 
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
-# shape the training's state. The MJCF file may have moved, but must describe the same model.
+# shape the training's state.
 RESUMABLE_KEYS = frozenset(
     "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
-    "num_devices env.mjcf".split()
+    "num_devices".split()
 )
+# The checkpoint has the path of the original file, and the run's config the path of its own copy.
+_MJCF_KEY = "env.mjcf"
 
 
 class Record(pydantic.BaseModel):
@@ -43,8 +44,8 @@ class Record(pydantic.BaseModel):
 
 def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
-    size = config.env.observation.layout.size
-    networks = make_networks(config.ppo, size, len(JOINT_NAMES))
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints)
 
     def initial_policy() -> Policy:
         params = networks.policy_network.init(jax.random.PRNGKey(0))
@@ -80,7 +81,8 @@ def read_record(checkpoint: Checkpoint) -> Record:
             raise ValueError(f"it was written after {record.steps} steps")
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
-    differing = differing_keys(load_run_config(checkpoint.run), record.config) - RESUMABLE_KEYS
+    differing = differing_keys(load_run_config(checkpoint.run), record.config)
+    differing -= RESUMABLE_KEYS | {_MJCF_KEY}
     if differing:
         raise UserError(
             f"the checkpoint {checkpoint.folder} is of another config than "

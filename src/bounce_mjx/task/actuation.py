@@ -14,7 +14,6 @@ from bounce_mjx.task.randomization import RandomizationConfig, World
 
 # Time between pushes if only their speed is given, s.
 DEFAULT_PUSH_INTERVAL = 2.0
-_PUSH_STREAM = 3
 
 
 class Actuation(NamedTuple):
@@ -106,7 +105,7 @@ def push(
     """
     interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
     now = passes(interval, phase, step, control_dt)
-    angle = 2.0 * math.pi * noise.uniform(counter, _PUSH_STREAM, (), phase.dtype)
+    angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, (), phase.dtype)
     speed = jnp.where(now, world["push_speed"], 0.0)
     return jnp.stack([speed * jnp.cos(angle), speed * jnp.sin(angle), jnp.zeros_like(speed)])
 

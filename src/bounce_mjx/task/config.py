@@ -2,16 +2,16 @@
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pydantic
+from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
-from bounce_mjx.task.observation import ObservationConfig
+from bounce_mjx.robot.config import RobotConfig, is_packaged
+from bounce_mjx.task.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig
-
-ArmVector = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
 class EnvConfig(StrictModel):
@@ -22,7 +22,10 @@ class EnvConfig(StrictModel):
     """Physics engine: fused (fast, for one kind of model), mjx (any MJCF), auto (fused if it
     supports the model)."""
     mjcf: PlainPath | None = None
-    """MJCF file to simulate; null for the project's own robot."""
+    """MJCF file to simulate; null for the project's own robot. package:NAME/FILE is a file of an
+    installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
+    robot: RobotConfig = RobotConfig()
+    """Adoption of an arm."""
     physics_dt: Positive = 0.001
     """Physics time step, s."""
     control_dt: Positive = 0.01
@@ -31,8 +34,10 @@ class EnvConfig(StrictModel):
     """Length of an episode before it is truncated, s."""
     action_scale: Positive = 0.02
     """Change of the servo target for an action of 1, rad."""
-    default_joint_angles: ArmVector = tuple(math.radians(a) for a in (0, 40, 110, 0, -60, 0))
-    """Joint angles at a reset, before noise, rad."""
+    default_joint_angles: Annotated[tuple[Finite, ...], Field(min_length=1)] = tuple(
+        math.radians(a) for a in (0, 40, 110, 0, -60, 0)
+    )
+    """Position of each acting joint at a reset, before noise, rad."""
     joint_angle_noise: NonNegative = 0.1
     """Half-width of the uniform noise of the joint angles at a reset, rad."""
     joint_velocity_noise: NonNegative = 0.01
@@ -59,6 +64,8 @@ class EnvConfig(StrictModel):
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
+    estimator: EstimatorConfig = EstimatorConfig()
+    """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
     reward: RewardConfig = RewardConfig()
@@ -95,9 +102,21 @@ class EnvConfig(StrictModel):
     def _make_absolute(cls, path: Path | None) -> Path | None:
         """A run's config is read from other folders too."""
         try:
-            return None if path is None else path.expanduser().absolute()
+            if path is None or is_packaged(path):
+                return path
+            return path.expanduser().absolute()
         except RuntimeError as error:
             raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
+
+    @property
+    def num_joints(self) -> int:
+        """Number of acting joints, which is the number of actions."""
+        return len(self.default_joint_angles)
+
+    @property
+    def layout(self) -> ObservationLayout:
+        """The order of the entries of the observation."""
+        return self.observation.layout(self.num_joints)
 
     @property
     def target_heights(self) -> tuple[float, float]:

@@ -17,16 +17,17 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import (
-    JOINT_NAMES,
     check_unedited,
     find_addresses,
     fingerprint,
+    joint_names,
     load_model,
     resting_activations,
 )
 from bounce_mjx.task import actuation, noise, sensing
 from bounce_mjx.task.actuation import Actuation
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.estimator import Estimate, Estimator
 from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics
 from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
 from bounce_mjx.task.rewards import (
@@ -40,8 +41,6 @@ from bounce_mjx.task.state import State
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-# Stream of random numbers for the target height; sensors and pushes have their own streams.
-_TARGET_STREAM = 4
 
 
 class TaskState(NamedTuple):
@@ -50,7 +49,7 @@ class TaskState(NamedTuple):
     target_height: jax.Array
     """Target height of the bounces [], m."""
     last_action: jax.Array
-    """Clipped action of the last step [6]."""
+    """Clipped action of the last step [n]."""
     rising: jax.Array
     """Whether the ball moved upward after the last step [], bool."""
     n_bounces: jax.Array
@@ -74,6 +73,7 @@ class Memory(NamedTuple):
     """Range of later target heights, m; None if the target does not change."""
     actuation: Actuation | None
     sensing: Sensing | None
+    estimate: Estimate | None = None
 
 
 class BounceState(NamedTuple):
@@ -110,12 +110,29 @@ class BounceBall:
           UserError: the MJCF file or the engine does not fit the task.
         """
         self.config = config or EnvConfig()
-        self.mj_model: mujoco.MjModel = load_model(self.config.mjcf, self.config.physics_dt)
+        self.mj_model: mujoco.MjModel = load_model(
+            self.config.mjcf, self.config.physics_dt, robot=self.config.robot
+        )
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
+        self._check_joints()
         self._randomize = randomize
-        self.layout = self.config.observation.layout
+        self.layout = self.config.layout
         self._fingerprint = fingerprint(self.mj_model)
+        self._estimator = (
+            Estimator(self.config, self.mj_model, self.engine)
+            if self.config.observation.is_filtered
+            else None
+        )
+
+    def _check_joints(self) -> None:
+        given, acting = self.config.num_joints, joint_names(self.mj_model)
+        if given != len(acting):
+            model = f"the MJCF file {self.config.mjcf}" if self.config.mjcf else "the model"
+            raise UserError(
+                f"default_joint_angles has {given} numbers, but {model} has {len(acting)} joints "
+                f"with an actuator ({', '.join(acting)}); give one number for each"
+            )
 
     @property
     def dt(self) -> float:
@@ -130,7 +147,7 @@ class BounceBall:
     @property
     def action_size(self) -> int:
         """Length of the action vector."""
-        return len(JOINT_NAMES)
+        return self.config.num_joints
 
     @property
     def backend(self) -> str:
@@ -182,7 +199,7 @@ class BounceBall:
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
             share = config.randomization.share if share is None else share
-            world = draw_world(ranges, world_rng, jnp.result_type(float), share)
+            world = draw_world(ranges, world_rng, jnp.result_type(float), self.action_size, share)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
@@ -190,9 +207,10 @@ class BounceBall:
             parameters = PhysicsParameters(
                 *(b if a is None else a for a, b in zip(given, parameters, strict=True))
             )
+        n = self.action_size
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
-        draws = jax.random.uniform(rng, (16,), minval=-1.0, maxval=1.0)
+        draws = jax.random.uniform(rng, (2 * n + 4,), minval=-1.0, maxval=1.0)
         dtype = draws.dtype
         zero = jnp.zeros((), dtype)
         low, high = config.target_height_range
@@ -201,9 +219,11 @@ class BounceBall:
         qvel = [zero] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
             qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
-            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[6 + i]
+            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[n + i]
         for i, coordinate in enumerate(config.ball_init_pos):
-            qpos[addresses.ball_qpos[i]] = coordinate + config.ball_position_noise * draws[12 + i]
+            qpos[addresses.ball_qpos[i]] = (
+                coordinate + config.ball_position_noise * draws[2 * n + i]
+            )
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
             qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, dtype)
         for term, entries in (
@@ -217,7 +237,9 @@ class BounceBall:
         )
 
         task = TaskState(
-            target_height=world.get("target_height", low + (high - low) * 0.5 * (draws[15] + 1.0)),
+            target_height=world.get(
+                "target_height", low + (high - low) * 0.5 * (draws[2 * n + 3] + 1.0)
+            ),
             last_action=jnp.zeros(self.action_size, dtype),
             rising=jnp.zeros((), bool),
             n_bounces=zero,
@@ -245,7 +267,7 @@ class BounceBall:
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [6], clipped to [-1, 1]."""
+        """Advances one control step under the action [n], clipped to [-1, 1]."""
         check_unedited(self.mj_model, self._fingerprint)
         action = jnp.clip(action, -1.0, 1.0)
         state, control = self.begin_step(state, action)
@@ -256,13 +278,13 @@ class BounceBall:
         return self.finish_step(state, action, physics)
 
     def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
-        """The task's part of a step before the physics: the control of a clipped action [6]."""
+        """The task's part of a step before the physics: the control of a clipped action [n]."""
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
             return state, Control(self.servo_targets(before.physics, action))
         # The same noise as in the observation from which the policy chose the action.
-        error = sensing.joint_angle_noise(world, memory.counter, action.dtype)
+        error = sensing.joint_angle_noise(world, memory.counter, self.action_size, action.dtype)
         targets = self.servo_targets(before.physics, action, error)
         control, queue = actuation.delayed(
             world, memory.actuation, targets, config.control_dt, config.num_substeps
@@ -293,7 +315,7 @@ class BounceBall:
             world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
         )
         low, high = memory.target_range
-        share = noise.uniform(memory.counter, _TARGET_STREAM, (), task.target_height.dtype)
+        share = noise.uniform(memory.counter, noise.Stream.TARGET, (), task.target_height.dtype)
         drawn = jnp.where(now, low + (high - low) * share, task.target_height)
         return task._replace(target_height=drawn), memory._replace(
             target_age=jnp.where(now, 0.0, memory.target_age)
@@ -302,11 +324,11 @@ class BounceBall:
     def servo_targets(
         self, physics: PhysicsState, action: jax.Array, error: jax.Array | None = None
     ) -> jax.Array:
-        """Servo targets ctrl [nu] of a clipped action [6]: the measured joint angles plus the
+        """Servo targets ctrl [nu] of a clipped action [n]: the measured joint angles plus the
         scaled action (rad), clipped to the range of each joint that has one, times the gear.
 
         Args:
-          error: error of the measured angles [6], rad, without the offset of the encoders' zeros,
+          error: error of the measured angles [n], rad, without the offset of the encoders' zeros,
             which the servo shares.
         """
         model, addresses = self.mj_model, self._addresses
@@ -334,7 +356,7 @@ class BounceBall:
 
         Args:
           state: before the step.
-          action: clipped [6].
+          action: clipped [n].
           physics: after the step, from any engine.
         """
         config = self.config
@@ -442,7 +464,7 @@ class BounceBall:
         return Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),
-            phases=noise.uniform(counter, _TARGET_STREAM, (3,), dtype),
+            phases=noise.uniform(counter, noise.Stream.TARGET, (3,), dtype),
             target_age=jnp.zeros((), dtype),
             target_range=None,
             actuation=actuation.start_actuation(
@@ -459,6 +481,11 @@ class BounceBall:
             )
             if self._needs_sensing
             else None,
+            estimate=None
+            if self._estimator is None
+            else self._estimator.start(
+                truth.ball_position, self._estimator.plane(state.physics.qpos)
+            ),
         )
 
     def _next_memory(self, state: BounceState, truth: Kinematics) -> Memory:
@@ -484,15 +511,25 @@ class BounceBall:
         angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
         paddle = truth.paddle_position
         if self._misjudges_paddle:
-            qpos = [state.physics.qpos[i] for i in range(self.mj_model.nq)]
-            for i, address in enumerate(self._addresses.arm_qpos):
-                qpos[address] = angles[i]
-            paddle = self.engine.paddle_position(MODEL_PARAMETERS, jnp.stack(qpos))
+            paddle = self.engine.paddle_position(
+                MODEL_PARAMETERS, self._measured_qpos(state.physics, angles)
+            )
+        ball_position, ball_velocity = picture.position, picture.velocity
+        if self._estimator is not None:
+            plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
+            estimate = self._estimator.next(
+                memory.estimate, state.world, past.picture, picture, plane
+            )
+            memory = memory._replace(estimate=estimate)
+            if config.observation.position == "filter":
+                ball_position = estimate.position
+            if config.observation.velocity == "filter":
+                ball_velocity = estimate.velocity
         measured = truth._asdict() | {
             "joint_angles": angles,
             "joint_velocities": velocities,
-            "ball_position": picture.position,
-            "ball_velocity": picture.velocity,
+            "ball_position": ball_position,
+            "ball_velocity": ball_velocity,
             "paddle_position": paddle,
             "target_height": state.task.target_height[None],
             "action": state.task.last_action,
@@ -504,6 +541,13 @@ class BounceBall:
                 past, measured, picture, near_height, state.task.target_height, config.control_dt
             )
         )
+
+    def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
+        """qpos [nq] with measured joint angles [6]."""
+        qpos = [physics.qpos[i] for i in range(self.mj_model.nq)]
+        for i, address in enumerate(self._addresses.arm_qpos):
+            qpos[address] = joint_angles[i]
+        return jnp.stack(qpos)
 
     @property
     def _misjudges_paddle(self) -> bool:
@@ -547,7 +591,7 @@ def update_task(
 
     Args:
       ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
-      action: clipped action [6] of the step.
+      action: clipped action [n] of the step.
 
     Returns:
       The new task state, and whether this step is a bounce [] (bool).

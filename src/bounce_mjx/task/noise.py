@@ -4,12 +4,23 @@ An environment's `step` takes no key, and JAX's generators are not available in 
 integer operations give numbers that are random enough for sensor noise.
 """
 
+import enum
 import math
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.physics.fused.scalars import sine_cosine
+
+
+class Stream(enum.IntEnum):
+    """Independent random numbers of one counter, by their use."""
+
+    BALL = 0
+    JOINTS = 1
+    FRAME_DROP = 2
+    PUSH = 3
+    TARGET = 4
 
 
 def next_counter(counter: jax.Array) -> jax.Array:

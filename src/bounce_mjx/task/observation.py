@@ -8,10 +8,20 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.settings import NonNegative, Positive, StrictModel
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
+
+
+class Quantity(NamedTuple):
+    """A quantity that an observation may contain."""
+
+    name: str
+    size: int | None
+    """Number of entries of one value; None for one entry for each acting joint."""
+    unit: str
+    """Unit of the entries; empty for a pure number."""
 
 
 class Part(NamedTuple):
@@ -25,25 +35,31 @@ class Part(NamedTuple):
 
 
 QUANTITIES = (
-    Part("joint_angles", 6, "rad"),
-    Part("ball_position", 3, "m"),
-    Part("ball_quaternion", 4, ""),
-    Part("joint_velocities", 6, "rad/s"),
-    Part("ball_velocity", 3, "m/s"),
-    Part("ball_angular_velocity", 3, "rad/s"),
-    Part("paddle_position", 3, "m"),
-    Part("target_height", 1, "m"),
-    Part("action", 6, ""),
-    Part("ball_age", 1, "s"),
-    Part("apex_error", 1, "m"),
-    Part("bounce_position", 2, "m"),
-    Part("bounce_interval", 1, "s"),
-    Part("bounce_joint_angles", 6, "rad"),
-    Part("bounce_joint_velocities", 6, "rad/s"),
+    Quantity("joint_angles", None, "rad"),
+    Quantity("ball_position", 3, "m"),
+    Quantity("ball_quaternion", 4, ""),
+    Quantity("joint_velocities", None, "rad/s"),
+    Quantity("ball_velocity", 3, "m/s"),
+    Quantity("ball_angular_velocity", 3, "rad/s"),
+    Quantity("paddle_position", 3, "m"),
+    Quantity("target_height", 1, "m"),
+    Quantity("action", None, ""),
+    Quantity("ball_age", 1, "s"),
+    Quantity("apex_error", 1, "m"),
+    Quantity("bounce_position", 2, "m"),
+    Quantity("bounce_interval", 1, "s"),
+    Quantity("bounce_joint_angles", None, "rad"),
+    Quantity("bounce_joint_velocities", None, "rad/s"),
 )
 """The quantities that an observation may contain, in order, and the size of one value of each."""
 
-BOUNCE_QUANTITIES = frozenset(part.name for part in QUANTITIES[10:])
+
+def parts(num_joints: int) -> tuple[Part, ...]:
+    """One value of each quantity for an arm with this number of acting joints, in order."""
+    return tuple(Part(q.name, num_joints if q.size is None else q.size, q.unit) for q in QUANTITIES)
+
+
+BOUNCE_QUANTITIES = frozenset(quantity.name for quantity in QUANTITIES[10:])
 """Quantities that have one value per bounce instead of one per control step."""
 
 
@@ -52,13 +68,13 @@ class ObservationConfig(StrictModel):
     newest, N for the last N, the newest first."""
 
     joint_angles: History = 1
-    """Measured angles of Joint1..Joint6."""
+    """Measured positions of the acting joints."""
     ball_position: History = 1
     """Measured position of the ball."""
     ball_quaternion: History = 1
     """Orientation of the ball, which no sensor of a robot measures."""
     joint_velocities: History = 1
-    """Measured velocities of Joint1..Joint6."""
+    """Measured velocities of the acting joints."""
     ball_velocity: History = 1
     """Measured or estimated velocity of the ball."""
     ball_angular_velocity: History = 1
@@ -82,21 +98,57 @@ class ObservationConfig(StrictModel):
     """Measured joint angles at the lowest points of the last bounces."""
     bounce_joint_velocities: History = 0
     """Measured joint velocities at the lowest points of the last bounces."""
-    velocity: Literal["measured", "differences"] = "measured"
-    """Source of ball_velocity: a sensor, or the differences between pictures."""
+    position: Literal["measured", "filter"] = "measured"
+    """Source of ball_position: the last picture, or the estimate of the Kalman filter
+    (env.estimator)."""
+    velocity: Literal["measured", "differences", "filter"] = "measured"
+    """Source of ball_velocity: a sensor, the differences between pictures, or the estimate of the
+    Kalman filter (env.estimator)."""
 
-    @functools.cached_property
-    def layout(self) -> ObservationLayout:
-        """The order of the entries."""
-        sizes = ((p, getattr(self, p.name)) for p in QUANTITIES)
-        return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in sizes if n))
+    def layout(self, num_joints: int) -> ObservationLayout:
+        """The order of the entries for an arm with this number of acting joints."""
+        values = ((part, getattr(self, part.name)) for part in parts(num_joints))
+        return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in values if n))
 
     @property
     def is_momentary(self) -> bool:
         """Whether the true state of one instant determines the whole observation."""
         past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
         remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
-        return not past and not remembered and self.velocity == "measured"
+        sources = {self.position, self.velocity}
+        return not past and not remembered and sources == {"measured"}
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether the policy sees an estimate of the Kalman filter."""
+        return bool(
+            (self.ball_position and self.position == "filter")
+            or (self.ball_velocity and self.velocity == "filter")
+        )
+
+
+class EstimatorConfig(StrictModel):
+    """The Kalman filter of a bouncing ball between camera and policy, which computes the sources
+    `filter` of env.observation."""
+
+    measurement_noise: Positive = 0.002
+    """Standard deviation of each measured ball coordinate, m."""
+    process_noise: NonNegative = 0.2
+    """Standard deviation that unknown forces give to each component of the ball's velocity within
+    1 s, m/s; it grows with the square root of the time."""
+    restitution: Annotated[float, Field(ge=0.1, le=1.0)] = 0.85
+    """Restitution of the ball on the paddle."""
+    restitution_noise: NonNegative = 0.05
+    """Standard deviation of the restitution."""
+    contact_time: Annotated[float, Field(ge=0.002, le=0.05)] = 0.01
+    """Time that the ball touches the paddle in a bounce, s."""
+    paddle_noise: NonNegative = 0.002
+    """Standard deviation of the paddle's height by forward kinematics, m."""
+    air_drag: NonNegative = 0.0
+    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
+    latency: NonNegative | None = None
+    """Expected time from a picture to its arrival, s, if the camera does not stamp its pictures;
+    null for pictures with the time at which they were taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,8 +180,8 @@ class ObservationLayout:
         return jnp.stack([values[part.name][i] for part in self.parts for i in range(part.size)])
 
 
-OBSERVATION = ObservationConfig().layout
-"""The layout of the original specification, the default."""
+OBSERVATION = ObservationConfig().layout(6)
+"""The layout of the original specification: the default quantities, and six joints."""
 
 
 class Kinematics(NamedTuple):
@@ -137,13 +189,13 @@ class Kinematics(NamedTuple):
     may have."""
 
     joint_angles: jax.Array
-    """Angles of Joint1..Joint6 [6], rad."""
+    """Positions of the acting joints [n], rad; of a slide, m."""
     ball_position: jax.Array
     """World position of the centre [3], m."""
     ball_quaternion: jax.Array
     """Orientation [4] in the order w, x, y, z."""
     joint_velocities: jax.Array
-    """Velocities of Joint1..Joint6 [6], rad/s."""
+    """Velocities of the acting joints [n], rad/s; of a slide, m/s."""
     ball_velocity: jax.Array
     """World velocity [3], m/s."""
     ball_angular_velocity: jax.Array

@@ -14,10 +14,10 @@ from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
 from bounce_mjx.lazy import jax, jnp, mujoco, np
-from bounce_mjx.robot.model import JOINT_NAMES, find_addresses
 
 if TYPE_CHECKING:
     from bounce_mjx.physics import PhysicsParameters
+    from bounce_mjx.physics.fused.scalars import Quaternion
 
 Range = tuple[Finite, Finite]
 
@@ -32,16 +32,19 @@ shape."""
 class Term(NamedTuple):
     """A quantity that may differ between episodes."""
 
-    shape: tuple[int, ...]
-    """Shape of one episode's draw."""
+    size: tuple[int, ...] | None
+    """Shape of one episode's draw; None for one entry for each acting joint."""
     nominal: float | None
     """Value without randomisation, from which the range grows during the warm-up; None for a range
     that does not grow."""
     limits: tuple[float, float]
     """Smallest and largest sensible value."""
 
+    def shape(self, num_joints: int) -> tuple[int, ...]:
+        """Shape of one episode's draw for an arm with this number of acting joints."""
+        return (num_joints,) if self.size is None else self.size
 
-_J = (len(JOINT_NAMES),)
+
 _ANY = (-math.inf, math.inf)
 _FACTOR = (1e-3, 1e3)
 _NOT_NEGATIVE = (0.0, math.inf)
@@ -52,14 +55,14 @@ TERMS: dict[str, Term] = {
     "ball_radius": Term((), 1.0, _FACTOR),
     "air_drag": Term((), 0.0, _NOT_NEGATIVE),
     "contact_friction": Term((), 0.0, _NOT_NEGATIVE),
-    "servo_gain": Term(_J, 1.0, _FACTOR),
-    "servo_damping": Term(_J, 1.0, _FACTOR),
+    "servo_gain": Term(None, 1.0, _FACTOR),
+    "servo_damping": Term(None, 1.0, _FACTOR),
     "servo_lag": Term((), 0.0, _NOT_NEGATIVE),
-    "torque_limit": Term(_J, None, (1e-3, math.inf)),
-    "joint_damping": Term(_J, 0.0, _NOT_NEGATIVE),
-    "joint_frictionloss": Term(_J, 0.0, _NOT_NEGATIVE),
-    "armature": Term(_J, 1.0, _FACTOR),
-    "link_mass": Term(_J, 1.0, _FACTOR),
+    "torque_limit": Term(None, None, (1e-3, math.inf)),
+    "joint_damping": Term(None, 0.0, _NOT_NEGATIVE),
+    "joint_frictionloss": Term(None, 0.0, _NOT_NEGATIVE),
+    "armature": Term(None, 1.0, _FACTOR),
+    "link_mass": Term(None, 1.0, _FACTOR),
     "paddle_offset": Term((3,), 0.0, _ANY),
     "paddle_tilt": Term((2,), 0.0, _ANY),
     "gravity_tilt": Term((2,), 0.0, _ANY),
@@ -72,15 +75,15 @@ TERMS: dict[str, Term] = {
     "ball_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
     "ball_velocity_bias": Term((3,), 0.0, _ANY),
     "joint_angle_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "encoder_bias": Term(_J, 0.0, _ANY),
+    "encoder_bias": Term(None, 0.0, _ANY),
     "joint_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "joint_velocity_bias": Term(_J, 0.0, _ANY),
+    "joint_velocity_bias": Term(None, 0.0, _ANY),
     "push_speed": Term((), 0.0, _NOT_NEGATIVE),
     "push_interval": Term((), None, (0.01, math.inf)),
     "target_height": Term((), None, (1e-3, math.inf)),
     "target_interval": Term((), None, (0.01, math.inf)),
     "ball_start": Term((3,), 0.0, _ANY),
-    "joint_start": Term(_J, 0.0, _ANY),
+    "joint_start": Term(None, 0.0, _ANY),
 }
 """All terms of `RandomizationConfig`."""
 
@@ -198,21 +201,27 @@ class RandomizationConfig(StrictModel):
 
 
 def draw_world(
-    ranges: Ranges, key: jax.Array, dtype: jnp.dtype, share: float | jax.Array = 1.0
+    ranges: Ranges,
+    key: jax.Array,
+    dtype: jnp.dtype,
+    num_joints: int,
+    share: float | jax.Array = 1.0,
 ) -> World:
     """Draws the world of one episode; consumes the key.
 
     Args:
+      num_joints: number of acting joints.
       share: probability [] that each term with a nominal value is drawn.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
-    sizes = {name: int(np.prod(TERMS[name].shape)) for name in TERMS if name in ranges}
+    shapes = {name: TERMS[name].shape(num_joints) for name in TERMS if name in ranges}
+    sizes = {name: math.prod(shape) for name, shape in shapes.items()}
     # One draw for all numbers, because splitting the key costs more than drawing.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
         term, (low, high) = TERMS[name], ranges[name]
-        shares = uniform[start : start + size].reshape(term.shape)
+        shares = uniform[start : start + size].reshape(shapes[name])
         drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
         if term.nominal is not None:
             drawn = jnp.where(uniform[i] < share, drawn, jnp.asarray(term.nominal, dtype))
@@ -224,11 +233,12 @@ def draw_world(
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref
+    from bounce_mjx.physics.fused.scalars import quaternion_product
+    from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
+    from bounce_mjx.robot.model import find_addresses
 
     m, addresses = mj_model, find_addresses(mj_model)
     servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
-    links = m.jnt_bodyid[list(addresses.arm_joints)]
     paddle = addresses.paddle_geom
     given = {}
     if "restitution" in world:
@@ -240,7 +250,7 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         "servo_gain": ("servo_gain", m.actuator_gainprm[servos, 0]),
         "servo_damping": ("servo_damping", -m.actuator_biasprm[servos, 2]),
         "armature": ("armature", m.dof_armature[dofs]),
-        "link_mass": ("link_mass", m.body_mass[links]),
+        "link_mass": ("link_mass", link_masses(m)),
     }
     for term, (parameter, model_value) in scaled.items():
         if term in world:
@@ -261,7 +271,8 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         given["paddle_position"] = offset + _array(m.geom_pos[paddle], offset)
     if "paddle_tilt" in world:
         tilt = world["paddle_tilt"]
-        given["paddle_rotation"] = _product(_array(m.geom_quat[paddle], tilt), _rotation_xy(tilt))
+        own = _array(m.geom_quat[paddle], tilt)
+        given["paddle_rotation"] = jnp.stack(quaternion_product(tuple(own), _rotation_xy(tilt)))
     if "gravity_tilt" in world:
         about_x, about_y = world["gravity_tilt"]
         strength = float(np.linalg.norm(m.opt.gravity))
@@ -293,24 +304,11 @@ def _array(values: np.ndarray, like: jax.Array) -> jax.Array:
     return jnp.asarray(values, like.dtype)
 
 
-def _rotation_xy(angles: jax.Array) -> jax.Array:
+def _rotation_xy(angles: jax.Array) -> Quaternion:
     """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
     a, b = 0.5 * angles[0], 0.5 * angles[1]
-    zero = jnp.zeros_like(a)
-    about_x = jnp.stack([jnp.cos(a), jnp.sin(a), zero, zero])
-    about_y = jnp.stack([jnp.cos(b), zero, jnp.sin(b), zero])
-    return _product(about_x, about_y)
+    from bounce_mjx.physics.fused.scalars import quaternion_product
 
-
-def _product(p: jax.Array, q: jax.Array) -> jax.Array:
-    """Product of two quaternions [w, x, y, z]."""
-    w, x, y, z = p
-    a, b, c, d = q
-    return jnp.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
+    about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
+    about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
+    return quaternion_product(about_x, about_y)

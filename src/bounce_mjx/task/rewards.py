@@ -33,11 +33,11 @@ class RewardInputs(NamedTuple):
     bounced: jax.Array
     """Whether this step is a bounce [], bool."""
     action: jax.Array
-    """Clipped action [6]."""
+    """Clipped action [n]."""
     last_action: jax.Array
-    """Clipped action of the previous step [6]."""
+    """Clipped action of the previous step [n]."""
     joint_velocity: jax.Array
-    """Arm joint velocities [6], rad/s."""
+    """Arm joint velocities [n], rad/s."""
 
 
 class Geometry(NamedTuple):

@@ -9,10 +9,8 @@ import jax.numpy as jnp
 
 from bounce_mjx.task import noise
 from bounce_mjx.task.actuation import taken
-from bounce_mjx.task.observation import BOUNCE_QUANTITIES, QUANTITIES, Kinematics, ObservationConfig
+from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics, ObservationConfig, parts
 from bounce_mjx.task.randomization import RandomizationConfig, World
-
-_BALL_STREAM, _JOINT_STREAM, _DROP_STREAM = 0, 1, 2
 
 SENSOR_TERMS = frozenset(
     "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
@@ -67,10 +65,7 @@ def start_sensing(
 ) -> Sensing:
     """Memory at a reset: the history repeats the present state, measured without error."""
     dtype = truth.ball_position.dtype
-    latest = (randomization.ball_latency or (0.0, 0.0))[1]
-    if randomization.camera_rate is not None:
-        latest += 1.0 / randomization.camera_rate[0]
-    length = math.ceil(latest / control_dt - 1e-6) + 1
+    length = math.ceil(oldest_picture(randomization) / control_dt - 1e-6) + 1
     ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
     zero = jnp.zeros((), dtype)
     values = truth._asdict() | {
@@ -92,17 +87,27 @@ def start_sensing(
         flight_time=zero,
         seen={
             part.name: jnp.broadcast_to(values[part.name], (n, part.size))
-            for part in QUANTITIES
+            for part in parts(len(truth.joint_angles))
             if (n := getattr(observation, part.name))
         },
     )
 
 
-def joint_angle_noise(world: World, counter: jax.Array, dtype: jnp.dtype) -> jax.Array | None:
-    """Noise [6] of the measured joint angles of a control step, rad; None if there is no noise."""
+def oldest_picture(randomization: RandomizationConfig) -> float:
+    """Greatest age of the last picture if none is lost, s."""
+    latency = (randomization.ball_latency or (0.0, 0.0))[1]
+    rate = randomization.camera_rate
+    return latency if rate is None else latency + 1.0 / rate[0]
+
+
+def joint_angle_noise(
+    world: World, counter: jax.Array, num_joints: int, dtype: jnp.dtype
+) -> jax.Array | None:
+    """Noise [n] of the measured joint angles of a control step, rad; None if there is no noise."""
     if "joint_angle_noise" not in world:
         return None
-    return world["joint_angle_noise"] * noise.normal(counter, _JOINT_STREAM, (12,), dtype)[:6]
+    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)
+    return world["joint_angle_noise"] * noises[:num_joints]
 
 
 def take_picture(
@@ -116,9 +121,10 @@ def take_picture(
 ) -> Picture:
     """Last picture that has arrived at a control step.
 
-    A camera takes pictures at its own rate, independent of the control steps; between two control
-    steps the ball is assumed to move in a straight line. Each picture arrives after the latency or
-    is lost.
+    A camera takes pictures at its own rate, independent of the control steps. Between two control
+    steps, the ball's path is the cubic with the true positions and velocities at both, which is
+    exact in free flight; the velocity is interpolated linearly. Each picture arrives after the
+    latency or is lost.
 
     Args:
       sensing: the memory, including the ball of this control step.
@@ -138,15 +144,15 @@ def take_picture(
     age = jnp.maximum(age, 0.0)
     whole = jnp.floor(age)
     newer, older = taken(sensing.balls, whole), taken(sensing.balls, whole + 1.0)
-    ball = newer + (age - whole) * (older - newer)
+    share = age - whole
+    position, velocity = _between(newer, older, share, control_dt)
 
-    noises = noise.normal(counter, _BALL_STREAM, (6,), dtype)
-    position, velocity = ball[:3], ball[3:]
+    noises = noise.normal(counter, noise.Stream.BALL, (6,), dtype)
     position = _disturbed(world, "ball_position", position, noises[:3])
     due = number > last.number
     arrived = due
     if "frame_drop" in world:
-        lost = noise.uniform(counter, _DROP_STREAM, (), dtype) < world["frame_drop"]
+        lost = noise.uniform(counter, noise.Stream.FRAME_DROP, (), dtype) < world["frame_drop"]
         arrived = due & ~lost
     held_age = last.age + control_dt
     if observation.velocity == "differences":
@@ -157,6 +163,22 @@ def take_picture(
     # A lost picture stays lost.
     held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
     return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
+
+
+def _between(
+    newer: jax.Array, older: jax.Array, share: jax.Array, control_dt: float
+) -> tuple[jax.Array, jax.Array]:
+    """Position [3] and velocity [3] between two control steps (cubic Hermite interpolation).
+
+    Args:
+      newer, older: position and velocity [6] at each.
+      share: time before the newer one as a share of the control step [].
+    """
+    change = older[:3] - newer[:3]
+    start, end = -control_dt * newer[3:], -control_dt * older[3:]
+    curve = (1.0 - share) * (start - change) - share * (end - change)
+    position = newer[:3] + share * (change + (1.0 - share) * curve)
+    return position, newer[3:] + share * (older[3:] - newer[3:])
 
 
 def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:
@@ -170,14 +192,14 @@ def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> 
 def measured_joints(
     world: World, counter: jax.Array, truth: Kinematics
 ) -> tuple[jax.Array, jax.Array]:
-    """Measured joint angles [6] (rad) and joint velocities [6] (rad/s)."""
-    dtype = truth.joint_angles.dtype
-    angles, error = truth.joint_angles, joint_angle_noise(world, counter, dtype)
+    """Measured joint angles [n] (rad) and joint velocities [n] (rad/s)."""
+    dtype, num_joints = truth.joint_angles.dtype, len(truth.joint_angles)
+    angles, error = truth.joint_angles, joint_angle_noise(world, counter, num_joints, dtype)
     if error is not None:
         angles = angles + error
     if "encoder_bias" in world:
         angles = angles + world["encoder_bias"]
-    noises = noise.normal(counter, _JOINT_STREAM, (12,), dtype)[6:]
+    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)[num_joints:]
     return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, noises)
 
 

@@ -1,5 +1,6 @@
 """Shared by the commands that train: their flags, the start of the job, and the printed results."""
 
+import importlib.util
 import shlex
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from bounce_mjx.task.config import EnvConfig
 if TYPE_CHECKING:
     from bounce_mjx.task.env import BounceBall
     from bounce_mjx.training.job import Outcome
-    from bounce_mjx.training.trainer import Trainer
+    from bounce_mjx.training.trainer import Trainer, Watcher
 
 
 class TrainingCommand(TrainConfig):
@@ -29,14 +30,20 @@ class TrainingCommand(TrainConfig):
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
-    """Preset: a YAML file such as configs/seed.yaml. The default is configs/default.yaml on an
-    accelerator, and configs/cpu.yaml on a CPU."""
+    """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
+    The default is default on an accelerator, and cpu on a CPU."""
+    robot: Path | None = None
+    """Config of a robot, such as configs/robots/ur5e.yaml or the file that bounce-mjx adopt wrote,
+    on top of the preset."""
     resume: Path | None = None
-    """Folder of a run to continue, in place, from its latest checkpoint. The other flags may then
-    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
-    stop-when-solved, num-devices and log-dir, and mjcf if that file has moved."""
+    """Folder of a run, or latest for the newest run, to continue in place from its latest
+    checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
+    screening-episodes, eval-seed, stop-when-solved, num-devices and log-dir. With total-steps, a
+    run that has met all results goes on."""
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
+    wandb: str | None = None
+    """Project of Weights & Biases to log to, beside TensorBoard; needs the extra wandb."""
 
 
 CommandT = TypeVar("CommandT", bound=TrainingCommand)
@@ -55,23 +62,31 @@ def read_command(
         stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
-    if config_path and resume:
-        raise UserError("--config and --resume exclude each other; a resumed run has its config")
+    robot = path_flag(args, "--robot")
+    for given, flag in ((config_path, "--config"), (robot, "--robot")):
+        if given and resume:
+            raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
     if resume:
-        from bounce_mjx.runs.folders import find_run
+        from bounce_mjx.runs.folders import find_run, named_run
         from bounce_mjx.runs.reading import RESUMABLE_KEYS
 
-        base = load_run_config(find_run(resume))
-    else:
-        base = read_preset(config_path)
+        log_dir = path_flag(args, "--log-dir") or TrainConfig().log_dir
+        resume = find_run(named_run(resume, log_dir))
+    base = load_run_config(resume) if resume else read_preset(config_path, robot)
+    start = base
+    if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
+        start = base.model_copy(update={"stop_when_solved": False})
     command = parse(
         command_class,
         args,
         prog=prog,
         description=description,
-        default=command_class(**dict(base), config=config_path, resume=resume, **defaults),
+        default=command_class(
+            **dict(start), config=config_path, robot=robot, resume=resume, **defaults
+        ),
     )
     if resume:
+        command = command.model_copy(update={"resume": resume})
         changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS
         if changed:
             raise UserError(
@@ -81,20 +96,34 @@ def read_command(
     return command
 
 
+def _is_solved(run: Path) -> bool:
+    """Whether every seed of a run has met all five results."""
+    from bounce_mjx.runs.folders import runs_of_seeds
+    from bounce_mjx.runs.progress import load_results
+
+    results = [load_results(seed) for seed in runs_of_seeds(run)]
+    return all(found is not None and found.solved_steps is not None for found in results)
+
+
 def run_command(
     command: TrainingCommand,
     make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
+    watcher: "Watcher | None" = None,
 ) -> None:
     """Trains according to the command, and prints the results.
 
     Raises:
-      UserError: see `train`.
+      UserError: see `train`; or a package that the command asks for is missing.
     """
     from bounce_mjx.training import hosts
     from bounce_mjx.training.console import say
     from bounce_mjx.training.job import TrainingStopped, train
 
+    if command.wandb is not None and importlib.util.find_spec("wandb") is None:
+        raise UserError(
+            "--wandb needs the package wandb; install it with: pip install 'bounce_mjx[wandb]'"
+        )
     console = Console(quiet=not hosts.is_leader())
     try:
         outcomes = train(
@@ -104,6 +133,8 @@ def run_command(
             command=prog,
             resume=command.resume,
             report=command.report,
+            wandb=command.wandb,
+            watcher=watcher,
         )
     except TrainingStopped as stopped:
         say(console, str(stopped))
@@ -112,6 +143,9 @@ def run_command(
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
         leave_report(best, console)
+    run = shlex.quote(str(best.run))
+    say(console, f"measure it: bounce-mjx eval {run}")
+    say(console, f"watch it: bounce-mjx play {run}")
 
 
 def show(outcomes: "Sequence[Outcome]", console: Console) -> "Outcome":
@@ -128,7 +162,7 @@ def show(outcomes: "Sequence[Outcome]", console: Console) -> "Outcome":
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
     say(console, f"time: {spent}")
     label = "run" if len(outcomes) == 1 else f"best seed: {best.seed}  run"
-    say(console, f"{label}: {best.run}  (bounce-mjx eval {shlex.quote(str(best.run))})")
+    say(console, f"{label}: {best.run}")
     return best
 
 

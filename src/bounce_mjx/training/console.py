@@ -1,16 +1,19 @@
 """Output of a running training: the progress line and the TensorBoard log."""
 
 import math
+import time
 import typing
 from collections.abc import Sequence
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.training.log import Logs
+from bounce_mjx.training.trainer import Watcher
 
 if typing.TYPE_CHECKING:
     from tensorboardX import SummaryWriter
@@ -22,30 +25,31 @@ class Reporter:
 
     def __init__(
         self,
-        logs: Sequence["SummaryWriter"],
+        logs: Sequence["SummaryWriter | Logs"],
         console: Console,
         config: TrainConfig,
         first_step: int,
+        watcher: Watcher | None = None,
     ):
         """
         Args:
           logs: one log per seed; none in a process that writes nothing.
         """
-        self._console = console
+        self._console, self._watcher = console, watcher
         self._logs = logs
         self._progress = Progress(
             TextColumn("[bold]training"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}% {task.fields[figures]}"),
             TimeElapsedColumn(),
-            TextColumn("<"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=console,
             disable=not console.is_terminal,
         )
-        self._total_steps = config.total_steps
+        self._config, self._first_step = config, first_step
+        self._started = time.monotonic()
         self._task = self._progress.add_task(
-            "training", total=config.total_steps, completed=first_step, figures=""
+            "training", total=config.total_steps, completed=first_step, figures="", left=""
         )
         unknown = np.full(config.num_seeds, math.nan)
         self._last = {"episode/return": unknown, "episode/bounces": unknown}
@@ -76,6 +80,8 @@ class Reporter:
             for log, value in zip(self._logs, seed_values, strict=False):
                 if math.isfinite(value):
                     log.add_scalar(name, float(value), steps)
+        if self._watcher is not None:
+            self._watcher.block(steps, {name: float(values[0]) for name, values in means.items()})
         for name, last in self._last.items():
             self._last[name] = np.where(np.isfinite(means[name]), means[name], last)
         rate = means["speed/steps_per_second"][0]
@@ -84,17 +90,24 @@ class Reporter:
             f"return {_mean_and_deviation(self._last['episode/return'], 0)}  "
             f"bounces {_mean_and_deviation(self._last['episode/bounces'], 1)}"
         )
-        self._progress.update(self._task, completed=steps, figures=figures)
+        left = self._time_left(steps)
+        self._progress.update(self._task, completed=steps, figures=figures, left=left)
         if not self._console.is_terminal:
-            # The last block may exceed the total.
-            left = max(0, self._total_steps - steps) * len(non_finite) / rate
-            self.say(f"{figures}  {seconds:.1f} s, {left:.0f} s left")
+            self.say(f"{figures}  {seconds:.1f} s, {left}")
 
         if total := int(non_finite.sum()):
             had = "environment had a state that was not finite, and was reset"
             if total > 1:
                 had = "environments had a state that was not finite, and were reset"
             self.say(f"{total:,} {had}")
+
+    def _time_left(self, steps: int) -> str:
+        """The time until the last step, at the mean speed so far with its evaluations; an upper
+        bound if the training may end earlier."""
+        # The last block may exceed the total.
+        share = max(0, self._config.total_steps - steps) / (steps - self._first_step)
+        left = f"{share * (time.monotonic() - self._started):.0f} s left"
+        return f"at most {left}" if self._config.stop_when_solved else left
 
     def say(self, line: str) -> None:
         """Prints a line."""
@@ -136,11 +149,10 @@ class Reporter:
             log.add_text(group, results_markdown(report), steps)
         if len(reports) == 1:
             (report,) = reports
-            met = sum(result.passed is not False for result in report.results)
             figures = ", ".join(
                 f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
             )
-            line = f"{met} of {len(report.results)} results met ({figures})"
+            line = f"{report.summary} ({figures})"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
             line = f"{solved} of {len(reports)} seeds meet all results"

@@ -67,8 +67,10 @@ def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> Trai
     if num_seeds > 1:
         return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)
     shardings = jax.tree.map(lambda _: replicated(mesh), state)
+
+    def batch_last(x: jax.Array) -> NamedSharding:
+        return NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS))
+
     return shardings._replace(
-        env=jax.tree.map(
-            lambda x: NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS)), state.env
-        )
+        env=jax.tree.map(batch_last, state.env), memory=jax.tree.map(batch_last, state.memory)
     )

@@ -41,9 +41,9 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.log import open_log
+from bounce_mjx.training.log import Logs, WandbLog, open_log
 from bounce_mjx.training.signals import StopRequest
-from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, iterations_per_block
+from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
@@ -88,6 +88,8 @@ def train(
     command: str,
     resume: Path | None = None,
     report: bool = True,
+    wandb: str | None = None,
+    watcher: Watcher | None = None,
 ) -> list[Outcome]:
     """Trains with a config, and returns an outcome for each seed.
 
@@ -96,6 +98,8 @@ def train(
       command: the user's command, to which `--resume` may be added.
       resume: the run to continue, in place.
       report: whether to import the modules of the report during the compilation.
+      wandb: project of Weights & Biases to log to, beside TensorBoard.
+      watcher: receives the progress of the first seed.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -108,6 +112,7 @@ def train(
         pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         job = _Job(config, console, make_trainer, command, resume, stop, pool, stack)
+        job.wandb, job.watcher = wandb, watcher
         job.compile(report)
         job.train()
         job.finish()
@@ -156,6 +161,8 @@ class _Job:
         self.config, self.console, self.resumed = config, console, resume is not None
         self.command, self.stop, self.pool, self.stack = command, stop, pool, stack
         self.run: Path | None = resume
+        self.wandb: str | None = None
+        self.watcher: Watcher | None = None
         self.clock = Clock()
         hosts.connect(self._advice)
         self.env = BounceBall(config.env)
@@ -239,6 +246,18 @@ class _Job:
         ]
         if hosts.is_leader():
             _write_config(self.run, self.config)
+        self._say_how_far()
+
+    def _say_how_far(self) -> None:
+        """Says if the resumed training has nothing to do, or was solved before."""
+        steps, total = f"{self.steps:,} steps", f"{self.config.total_steps:,} steps"
+        how = "add --total-steps N to train on"
+        if self.steps >= self.config.total_steps:
+            say(self.console, f"{self.run} has been trained to its end, {steps}; {how}")
+        elif self._is_solved():
+            met = f"{self.run} has met all results after {steps}"
+            goes_on = f"it goes on to {total}"
+            say(self.console, f"{met}; {how if self.config.stop_when_solved else goes_on}")
 
     def compile(self, report: bool) -> None:
         """Compiles the programs; during the compilation it opens logs and imports modules."""
@@ -269,7 +288,7 @@ class _Job:
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.reporter = self.stack.enter_context(
-            Reporter(opening.result(), self.console, self.config, self.steps)
+            Reporter(opening.result(), self.console, self.config, self.steps, self.watcher)
         )
         self.clock.lap("compile")
 
@@ -285,10 +304,16 @@ class _Job:
         compiling.result()
         return opening
 
-    def _open_logs(self, first_step: int | None) -> list["SummaryWriter"]:
+    def _open_logs(self, first_step: int | None) -> list["SummaryWriter | Logs"]:
         if not hosts.is_leader():
             return []
-        return [open_log(m.run, first_step, config=m.config) for m in self.members]
+        logs = [open_log(m.run, first_step, config=m.config) for m in self.members]
+        if self.wandb is None:
+            return logs
+        return [
+            Logs([log, WandbLog(m.run, self.wandb, m.config)])
+            for log, m in zip(logs, self.members, strict=True)
+        ]
 
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
@@ -304,9 +329,9 @@ class _Job:
             if self._is_due():
                 if not self._evaluate():
                     break
-                if self.config.stop_when_solved and self._all_solved():
-                    break
             if self.steps >= self.config.total_steps:
+                break
+            if self.config.stop_when_solved and self._is_solved():
                 break
             self._run_block()
 
@@ -348,7 +373,7 @@ class _Job:
     def _healthy(self) -> list[_Member]:
         return [member for member in self.members if member.progress.fault is None]
 
-    def _all_solved(self) -> bool:
+    def _is_solved(self) -> bool:
         return all(member.progress.solved_steps is not None for member in self._healthy())
 
     def _evaluated(self) -> bool:
@@ -368,6 +393,8 @@ class _Job:
             return False
         healthy = [member.progress.fault is None for member in self.members]
         self.reporter.evaluation(self.steps, reports, healthy)
+        if self.watcher is not None:
+            self.watcher.evaluation(self.steps, reports[0], self._of_seed(snapshot.policy, 0))
         best = []
         for i, member in enumerate(self.members):
             if healthy[i] and member.progress.improves(reports[i], self.steps):
@@ -427,14 +454,21 @@ class _Job:
 
     def _run_block(self) -> None:
         started = time.perf_counter()
-        block = self.pool.submit(self.trainer.run)
+        # A training that was stopped inside a block first completes that block.
+        rest = self.block_steps - self.steps % self.block_steps
+        block = self.pool.submit(
+            self.trainer.run,
+            rest // self.config.ppo.batch_steps,
+            lambda: self.stop.requested and jax.process_count() == 1,
+        )
         if not self.stop.wait_for(block):
             self.reporter.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
         faults = metrics.pop("fault")
-        self.steps += self.block_steps
-        rate = self.block_steps * self.config.num_seeds / seconds
+        done = faults.shape[1] * self.config.ppo.batch_steps
+        self.steps += done
+        rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         self.reporter.block(self.steps, seconds, metrics)
         problems = [writer.problem(wait=False) for writer in self.writers]
@@ -449,7 +483,7 @@ class _Job:
         Args:
           faults: the metric "fault" of a block [seeds, I].
         """
-        before = (self.steps - self.block_steps) // self.config.ppo.batch_steps
+        before = self.steps // self.config.ppo.batch_steps - faults.shape[1]
         for member, block_faults in zip(self.members, faults, strict=True):
             if member.progress.fault is not None or not block_faults.any():
                 continue

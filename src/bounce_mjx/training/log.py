@@ -1,10 +1,13 @@
-"""The TensorBoard log of a training."""
+"""The logs of a training: TensorBoard, and Weights & Biases if it is asked for."""
 
 import contextlib
+import hashlib
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
 
 if typing.TYPE_CHECKING:
@@ -40,6 +43,71 @@ def open_log(
     if config is not None:
         log.add_text("config", f"```yaml\n{dump_config(config)}```", first_step or 0)
     return log
+
+
+class WandbLog:
+    """A run of Weights & Biases, with the methods of `SummaryWriter` that a training uses. A
+    resumed training continues its run."""
+
+    def __init__(self, run: Path, project: str, config: TrainConfig):
+        """
+        Raises:
+          UserError: Weights & Biases refuses the run, for example without an account.
+        """
+        # Imported only when it is asked for; it is optional and takes seconds.
+        import wandb
+
+        try:
+            self._run = wandb.init(
+                project=project,
+                name=run.name,
+                id=hashlib.sha256(str(run.absolute()).encode()).hexdigest()[:16],
+                resume="allow",
+                reinit="create_new",
+                dir=run,
+                config=config.model_dump(mode="json"),
+            )
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            raise UserError(
+                f"--wandb {project} is refused ({reason}); run wandb login, or set WANDB_MODE to "
+                "offline"
+            ) from error
+
+    def add_scalar(self, name: str, value: float, steps: int) -> None:
+        self._run.log({name: value}, step=steps)
+
+    def add_text(self, name: str, text: str, steps: int) -> None:
+        """Text stays in TensorBoard; the config and the results are in the run already."""
+
+    def flush(self) -> None:
+        """Weights & Biases sends its data by itself."""
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class Logs:
+    """Several logs that receive the same."""
+
+    def __init__(self, logs: Sequence["SummaryWriter | WandbLog"]):
+        self._logs = logs
+
+    def add_scalar(self, name: str, value: float, steps: int) -> None:
+        for log in self._logs:
+            log.add_scalar(name, value, steps)
+
+    def add_text(self, name: str, text: str, steps: int) -> None:
+        for log in self._logs:
+            log.add_text(name, text, steps)
+
+    def flush(self) -> None:
+        for log in self._logs:
+            log.flush()
+
+    def close(self) -> None:
+        for log in self._logs:
+            log.close()
 
 
 _LOG_PREFIX = "bounce_mjx"

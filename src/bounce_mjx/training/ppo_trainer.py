@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import functools
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -27,6 +28,7 @@ class PPOTrainer:
           UserError: the config does not fit the devices or the environment.
         """
         self._config, self._observation_size = config, env.observation_size
+        self._compiled_iterations = _iterations_at_once(config, env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = make_trainer(config.ppo, env, episode_steps(config))
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
@@ -49,7 +51,7 @@ class PPOTrainer:
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         sharding = self._sharding
         run = jax.jit(
-            lambda state: self._trainer.run(state, iterations_per_block(self._config)),
+            lambda state: self._trainer.run(state, self._compiled_iterations),
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,
@@ -66,10 +68,15 @@ class PPOTrainer:
         else:
             self.state = hosts.distribute(state, self._sharding)
 
-    def run(self) -> Metrics:
-        self.state, metrics = self._run.result()(self.state)
-        shape = (self._config.num_seeds, -1)
-        return {name: np.asarray(value).reshape(shape) for name, value in metrics.items()}
+    def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
+        program, parts = self._run.result(), []
+        for _ in range(iterations // self._compiled_iterations):
+            self.state, metrics = program(self.state)
+            shape = (self._config.num_seeds, -1)
+            parts.append({name: np.asarray(x).reshape(shape) for name, x in metrics.items()})
+            if stopping():
+                break
+        return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
@@ -79,6 +86,12 @@ class PPOTrainer:
         """The first training state of one seed [] or of S seeds [S]."""
         key = jax.random.PRNGKey
         return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
+
+
+def _iterations_at_once(config: TrainConfig, env: BounceBall) -> int:
+    """Iterations in one program: a whole block, but one on MJX, which may take minutes for a block
+    and could not be stopped before its end."""
+    return 1 if env.engine.name == "mjx" else iterations_per_block(config)
 
 
 def episode_steps(config: TrainConfig) -> int:

@@ -1,11 +1,13 @@
-"""The interface between the job and an algorithm that trains policies."""
+"""The interfaces between the job, an algorithm that trains policies, and an onlooker."""
 
 import concurrent.futures
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jax.sharding import Mesh
 
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 
@@ -51,8 +53,12 @@ class Trainer(Protocol):
     def start(self, state: Any | None = None) -> None:
         """Starts from the seeds, or from the state of a `snapshot`."""
 
-    def run(self) -> Metrics:
-        """Trains for a block of I iterations.
+    def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
+        """Trains for I iterations, or fewer where a slow trainer sees between two of them that
+        `stopping` is true.
+
+        Args:
+          iterations: a block's, or the rest of a block that was stopped.
 
         Returns: Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of
           `checked` that was not finite in an iteration; 0 if all were finite.
@@ -60,3 +66,18 @@ class Trainer(Protocol):
 
     def snapshot(self) -> Snapshot:
         """The policy and the whole state."""
+
+
+class Watcher(Protocol):
+    """An onlooker of a training. Its methods are called between blocks and must return at once."""
+
+    def block(self, steps: int, means: dict[str, float]) -> None:
+        """A block has ended.
+
+        Args:
+          steps: environment steps so far.
+          means: the metrics of the block's iterations; NaN where there was nothing to measure.
+        """
+
+    def evaluation(self, steps: int, report: Report, policy: Policy) -> None:
+        """A policy was evaluated; its arrays are NumPy arrays."""

@@ -2,9 +2,11 @@
 
 import collections
 import html
+import json
 import socket
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import viser
@@ -15,18 +17,28 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers.controls import Controls
 from bounce_mjx.viewers.pace import Pace
-from bounce_mjx.viewers.page import open_server
+from bounce_mjx.viewers.page import open_server, replay
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import Frame, Simulation
+from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation
 
 # Pictures and plots per second.
 _PICTURE_RATE = 50.0
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
+_SAVED_SECONDS = 10.0
+AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
+"""Style of the axes of a plot."""
+_LEGEND = """<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
+<b style="color:#2b8a3e">green disc</b> target height<br>
+<b style="color:#1c6ad6">blue frame</b> home of the paddle<br>
+<b style="color:#e8590c">orange line</b> path of the ball, 0.6 s<br>
+<b>space</b> pause, <b>R</b> reset, <b>T G</b> target height, <b>M N</b> speed,
+<b>I K J L</b> push the ball, <b>Ctrl-K</b> all keys
+</div>"""
 
 
 def run_browser(
-    simulation: Simulation,
+    simulation: Simulation | SideBySide,
     *,
     num_shown: int,
     speed: float,
@@ -35,19 +47,22 @@ def run_browser(
     port: int,
     title: str,
     console: Console,
+    names: Sequence[str] | None = None,
 ) -> None:
     """Serves the page until the simulated `seconds` are over (None: until Ctrl-C).
 
     Args:
       num_shown: environments shown at first; the page's slider goes up to all of the simulation.
       port: a free port of this machine.
+      names: see `Scene`.
     """
     with open_server(host, port) as server:
-        page = _Page(server, simulation, num_shown=num_shown, speed=speed, title=title)
-        address = f"[{host}]" if ":" in host else host
+        page = LivePage(
+            server, simulation, num_shown=num_shown, speed=speed, title=title, names=names
+        )
         # A host name may look like rich's markup.
         console.print(
-            f"viewer: http://{address}:{server.get_port()}  (Ctrl-C ends it)",
+            f"viewer: {address(host, server.get_port())}  (Ctrl-C ends it)",
             markup=False,
             highlight=False,
             soft_wrap=True,
@@ -55,20 +70,38 @@ def run_browser(
         page.run(seconds)
 
 
-class _Page:
+def address(host: str, port: int) -> str:
+    """Address of the page."""
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def _window_title(title: str) -> str:
+    """HTML that sets the title of the browser's tab, for which viser has no setting."""
+    script = html.escape(f"document.title = {json.dumps(title)}")
+    return f'<img src="data:," alt="" hidden onerror="{script}">'
+
+
+class LivePage:
     """A simulation in real time on a server."""
 
     def __init__(
         self,
         server: viser.ViserServer,
-        simulation: Simulation,
+        simulation: Simulation | SideBySide,
         *,
         num_shown: int,
         speed: float,
         title: str,
+        names: Sequence[str] | None = None,
+        side: viser.PanelHandle | None = None,
     ):
+        """
+        Args:
+          side: the left panel, if it has tabs already.
+        """
         self._server = server
         self._simulation = simulation
+        self._names = names
         gui = server.gui
         gui.configure_theme(
             show_logo=False, show_share_button=False, control_width="medium",
@@ -77,33 +110,49 @@ class _Page:
         gui.set_panel_label("bounce_mjx")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(280)
+        gui.add_html(_window_title(f"bounce_mjx: {title}"))
         self._controls = Controls(server, simulation, title=title, speed=speed, num_shown=num_shown)
         self._settings = self._controls.read()
-        self._scene = Scene(server, simulation.env, num_shown)
+        self._scene = Scene(server, simulation.env, num_shown, names)
         self._history: collections.deque[Frame] = collections.deque(
             maxlen=round(_PLOT_SECONDS / simulation.env.dt)
         )
-        self._add_plots()
+        self._seen: collections.deque[Frame] = collections.deque(
+            maxlen=round(_SAVED_SECONDS / simulation.env.dt)
+        )
+        side = side or gui.add_panel()
+        side.dock_left()
+        side.set_width(300)
+        self._add_plots(side)
 
-    def run(self, seconds: float | None) -> None:
-        """Steps the simulation and sends pictures and plots."""
+    def run(self, seconds: float | None, between: Callable[[], None] = lambda: None) -> None:
+        """Steps the simulation and sends pictures and plots.
+
+        Args:
+          seconds: simulated time; None for no end.
+          between: called between two pictures.
+        """
         simulation = self._simulation
         pace = Pace(simulation.env.dt)
         self._scene.update([simulation.frame])
         steps_left = float("inf") if seconds is None else round(seconds / simulation.env.dt)
         next_plot = 0.0
         while steps_left > 0:
+            between()
             changed = self._obey_controls()
             due = 0 if self._settings.paused else pace.due(self._settings.speed)
             due = min(due, steps_left)
             frames = [simulation.step() for _ in range(due)]
             steps_left -= due
             self._history.extend(frames)
+            self._seen.extend(frames)
             if frames or changed:
                 self._scene.update(frames or [simulation.frame])
                 if time.monotonic() >= next_plot:
                     self._update_plots()
                     next_plot = time.monotonic() + 1.0 / _PLOT_RATE
+            if self._settings.following:
+                self._scene.follow(simulation.frame)
             time.sleep(1.0 / _PICTURE_RATE)
             if self._settings.paused:
                 pace.forget()
@@ -125,15 +174,26 @@ class _Page:
             self._history.clear()
         if push is not None:
             self._simulation.push(push)
+        for client in self._controls.take_saving():
+            # Writing a page takes seconds.
+            threading.Thread(
+                target=self._save, args=(client, list(self._seen)), daemon=True
+            ).start()
         return now != before or reset or push is not None
 
-    def _add_plots(self) -> None:
+    def _save(self, client: viser.ClientHandle, frames: list[Frame]) -> None:
+        """Sends a page that replays the last seconds."""
+        if not frames:
+            return
+        shown = self._settings.num_shown
+        recording = Frame(*(np.stack(values)[:, :shown] for values in zip(*frames, strict=True)))
+        text = replay(self._simulation.env, recording, names=self._names)
+        client.send_file_download("bounce.html", text.encode())
+
+    def _add_plots(self, side: viser.PanelHandle) -> None:
         gui = self._server.gui
-        axis = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
-        panel = gui.add_panel()
-        panel.dock_left()
-        panel.set_width(300)
-        with panel.add_tab("robot 1", viser.Icon.CHART_LINE):
+        first = "robot 1" if self._names is None else self._names[0]
+        with side.add_tab(first, viser.Icon.CHART_LINE):
             gui.add_markdown("height, m, over the last seconds")
             self._heights = gui.add_uplot(
                 (np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)),
@@ -143,13 +203,14 @@ class _Page:
                     {"label": "target", "stroke": "#2b8a3e", "width": 2, "dash": [6, 4]},
                     {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
                 ),
-                axes=({**axis, "size": 30}, {**axis, "size": 40}),
+                axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
                 scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
                 legend={"live": False},
                 height=190,
             )
             gui.add_markdown("reward, by term")
             self._terms = gui.add_html(reward_bars(dict.fromkeys(TERM_NAMES, 0.0)))
+            gui.add_html(_LEGEND)
 
     def _update_plots(self) -> None:
         if not self._history:
@@ -175,9 +236,10 @@ def reward_bars(terms: Mapping[str, float]) -> str:
         color = "#2b8a3e" if value >= 0.0 else "#c92a2a"
         lines.append(
             f'<div style="display:flex;align-items:center;height:15px">'
-            f'<span style="width:44%">{html.escape(name.replace("_", " "))}</span>'
+            f'<span style="width:48%;white-space:nowrap;overflow:hidden;text-overflow:ellipsis">'
+            f"{html.escape(name.replace('_', ' '))}</span>"
             f'<span style="width:16%;text-align:right;padding-right:6px">{_rounded(value)}</span>'
-            f'<span style="width:40%;height:9px;position:relative;background:#eef0f3">'
+            f'<span style="width:36%;height:9px;position:relative;background:#eef0f3">'
             f'<span style="position:absolute;height:9px;left:{left:.1f}%;'
             f'width:{50.0 * abs(share):.1f}%;background:{color}"></span></span></div>'
         )

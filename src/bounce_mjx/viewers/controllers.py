@@ -1,16 +1,25 @@
 """Controllers of the arm: random, zero or scripted actions, or a trained policy."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Memory, Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
 
-Controller = Callable[[State, jax.Array], jax.Array]
-"""(states of N environments, batch last; key, which is consumed) -> actions [6, N]."""
+
+class Controller(NamedTuple):
+    """A controller of N environments."""
+
+    act: Callable[[Policy | None, State, jax.Array, Memory], tuple[jax.Array, Memory]]
+    """(policy if it is exchangeable; states, batch last; key, which is consumed; memory) ->
+    actions [n, N], memory."""
+    start_memory: Callable[[tuple[int, ...]], Memory]
+    """Shape of the batch -> memory at the start of an episode."""
+
 
 # Gains of the scripted controller, found by a scan: it keeps 64 of 64 balls up for 10 s, with
 # a mean apex error of 8 cm.
@@ -26,19 +35,34 @@ _FALLING_WIDTH = 0.2
 
 def make_policy_controller(networks: Networks, policy: Policy) -> Controller:
     """The policy's most likely action."""
-    return lambda states, key: act(networks, policy, states.obs.T).T
+    exchangeable = make_exchangeable_controller(networks)
+    return exchangeable._replace(act=lambda _, *args: exchangeable.act(policy, *args))
+
+
+def make_exchangeable_controller(networks: Networks) -> Controller:
+    """The most likely action of a policy that is an argument."""
+
+    def control(
+        policy: Policy, states: State, key: jax.Array, memory: Memory
+    ) -> tuple[jax.Array, Memory]:
+        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
+        return actions.T, memory
+
+    return Controller(control, networks.policy_network.start_memory)
 
 
 def make_random_controller(env: BounceBall) -> Controller:
     """Uniform in [-1, 1]."""
-    return lambda states, key: jax.random.uniform(
-        key, (env.action_size, states.obs.shape[-1]), minval=-1.0, maxval=1.0
+    return _without_memory(
+        lambda states, key: jax.random.uniform(
+            key, (env.action_size, states.obs.shape[-1]), minval=-1.0, maxval=1.0
+        )
     )
 
 
 def make_zero_controller(env: BounceBall) -> Controller:
     """Zero: the servos hold the measured angles."""
-    return lambda states, key: jnp.zeros((env.action_size, states.obs.shape[-1]))
+    return _without_memory(lambda states, key: jnp.zeros((env.action_size, states.obs.shape[-1])))
 
 
 def make_scripted_controller(env: BounceBall) -> Controller:
@@ -69,4 +93,11 @@ def make_scripted_controller(env: BounceBall) -> Controller:
         posture = home + jnp.stack([zero, zero, -lift, zero, lift - pitch, roll])
         return jnp.clip((posture - kinematics.joint_angles) / config.action_scale, -1.0, 1.0)
 
-    return control
+    return _without_memory(control)
+
+
+def _without_memory(control: Callable[[State, jax.Array], jax.Array]) -> Controller:
+    return Controller(
+        act=lambda _, states, key, memory: (control(states, key), memory),
+        start_memory=lambda batch: (),
+    )

@@ -4,26 +4,24 @@ Anyone who can reach the port can send any value for any control, whatever its s
 values are therefore checked when they are read.
 """
 
+import contextlib
 import html
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import viser
 
 from bounce_mjx.viewers.pace import SPEED_RANGE
-from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import sliders_for
 
 _PUSH_RANGE = (0.05, 1.0)
 _DEFAULT_PUSH = 0.2
-_DIRECTIONS = {
-    "up": (0, 0, 1),
-    "away": (1, 0, 0),
-    "back": (-1, 0, 0),
-    "left": (0, 1, 0),
-    "right": (0, -1, 0),
-}
+_DIRECTIONS = ("up", "away", "back", "left", "right")
+_TARGET_STEP = 0.05
+_SPEED_STEP = 0.1
 
 
 class Settings(NamedTuple):
@@ -38,6 +36,8 @@ class Settings(NamedTuple):
     """Target height of all environments, m; None for the height drawn at each reset."""
     world: dict[str, tuple[float, ...]] | None
     """See `Simulation.world`."""
+    following: bool
+    """Whether the camera follows the first ball."""
 
 
 class Controls:
@@ -46,7 +46,7 @@ class Controls:
     def __init__(
         self,
         server: viser.ViserServer,
-        simulation: Simulation,
+        simulation: Simulation | SideBySide,
         *,
         title: str,
         speed: float,
@@ -56,12 +56,13 @@ class Controls:
         low, high = simulation.env.config.target_height_range
         target = simulation.target_height or 0.5 * (low + high)
         self._initial = Settings(
-            False, speed, num_shown, simulation.target_height, simulation.world
+            False, speed, num_shown, simulation.target_height, simulation.world, False
         )
         self._max_shown = simulation.num_envs
         self._height_range = min(0.3, low, target), max(0.8, high, target)
         self._reset_requested = False
         self._requested_push: np.ndarray | None = None
+        self._saving: list[viser.ClientHandle] = []
 
         gui.add_html(f'<div style="padding:0 12px"><b>{html.escape(title)}</b></div>')
         self._paused = gui.add_checkbox("pause", False)
@@ -69,13 +70,15 @@ class Controls:
         self._num_shown = gui.add_slider(
             "robots", 1, max(2, self._max_shown), 1, num_shown, disabled=self._max_shown == 1
         )
+        self._following = gui.add_checkbox("follow the ball", False)
         reset = gui.add_button("reset", icon=viser.Icon.REFRESH)
+        save = gui.add_button("save the last 10 s", icon=viser.Icon.DOWNLOAD)
         with gui.add_folder("target height"):
             self._drawn = gui.add_checkbox("drawn at each reset", simulation.target_height is None)
             self._height = gui.add_slider("height, m", *self._height_range, 0.01, target)
         with gui.add_folder("push the ball"):
             self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, _DEFAULT_PUSH)
-            push = gui.add_button_group("towards", tuple(_DIRECTIONS))
+            push = gui.add_button_group("towards", _DIRECTIONS)
         self._sliders = {}
         if sliders := sliders_for(simulation.env.config.randomization):
             is_drawn = simulation.world is None
@@ -111,11 +114,69 @@ class Controls:
             self._drawn.value = False
 
         @push.on_click
-        def _(_) -> None:
-            direction = _DIRECTIONS.get(push.value)
-            if direction is not None:
-                speed = _number_within(self._push_speed.value, _PUSH_RANGE, _DEFAULT_PUSH)
-                self._requested_push = speed * np.array(direction)
+        def _(event) -> None:
+            self._push(push.value, event.client)
+
+        @save.on_click
+        def _(event) -> None:
+            self._saving.append(event.client)
+
+        self._add_keys(gui)
+
+    def _add_keys(self, gui: viser.GuiApi) -> None:
+        """The keys of MuJoCo's window (`native`), which Ctrl-K also lists. The arrows and W, A, S,
+        D, Q and E move viser's camera."""
+
+        def pause(_) -> None:
+            self._paused.value = not self._paused.value
+
+        def reset(_) -> None:
+            self._reset_requested = True
+
+        def target(step: float) -> Callable[[viser.CommandEvent], None]:
+            def change(_) -> None:
+                low, high = self._height_range
+                height = _number_within(self._height.value, self._height_range, low)
+                self._height.value = min(max(height + step, low), high)
+                self._drawn.value = False
+
+            return change
+
+        def speed(step: float) -> Callable[[viser.CommandEvent], None]:
+            def change(_) -> None:
+                slowest, fastest = SPEED_RANGE
+                now = _number_within(self._speed.value, SPEED_RANGE, self._initial.speed)
+                self._speed.value = min(max(round(now + step, 1), slowest), fastest)
+
+            return change
+
+        def push(towards: str) -> Callable[[viser.CommandEvent], None]:
+            return lambda event: self._push(towards, event.client)
+
+        for label, key, change in (
+            ("pause", "space", pause),
+            ("reset", "R", reset),
+            ("target height up", "T", target(_TARGET_STEP)),
+            ("target height down", "G", target(-_TARGET_STEP)),
+            ("faster", "M", speed(_SPEED_STEP)),
+            ("slower", "N", speed(-_SPEED_STEP)),
+            ("push the ball up", "I", push("up")),
+            ("push the ball back", "K", push("back")),
+            ("push the ball left", "J", push("left")),
+            ("push the ball right", "L", push("right")),
+        ):
+            gui.add_command(label, hotkey=key).on_trigger(change)
+
+    def _push(self, towards: object, client: viser.ClientHandle | None) -> None:
+        """Requests a push in a direction as a page sees it."""
+        if towards not in _DIRECTIONS:
+            return
+        view = np.zeros(3)
+        # A page whose own camera is invalid has no direction of view.
+        with contextlib.suppress(ValueError, TypeError, AssertionError, AttributeError):
+            view = np.asarray(client.camera.look_at - client.camera.position, float)
+        speed = _number_within(self._push_speed.value, _PUSH_RANGE, _DEFAULT_PUSH)
+        self._requested_push = speed * direction(towards, view)
 
     def read(self) -> Settings:
         """The current settings."""
@@ -128,6 +189,7 @@ class Controls:
             num_shown=round(shown),
             target_height=None if self._drawn.value else height,
             world=self._read_world(),
+            following=bool(self._following.value),
         )
 
     def _read_world(self) -> dict[str, tuple[float, ...]] | None:
@@ -151,6 +213,30 @@ class Controls:
         """The velocity [3] (m/s) of the last push that was requested since the last call."""
         push, self._requested_push = self._requested_push, None
         return push
+
+    def take_saving(self) -> list[viser.ClientHandle]:
+        """The pages that asked for a recording since the last call."""
+        pages, self._saving = self._saving, []
+        return [page for page in pages if page is not None]
+
+
+def direction(towards: str, view: np.ndarray) -> np.ndarray:
+    """Unit vector [3] in the world for a direction on the screen: up, or horizontally away from the
+    camera, back to it, left or right.
+
+    Args:
+      view: direction in which the camera looks [3]; if it has no horizontal part, away is +x.
+    """
+    length = np.hypot(view[0], view[1])
+    x, y = view[:2] / length if 1e-9 < length < np.inf else (1.0, 0.0)
+    directions = {
+        "up": (0.0, 0.0, 1.0),
+        "away": (x, y, 0.0),
+        "back": (-x, -y, 0.0),
+        "left": (-y, x, 0.0),
+        "right": (y, -x, 0.0),
+    }
+    return np.array(directions[towards])
 
 
 def _number_within(value: object, limits: tuple[float, float], default: float) -> float:

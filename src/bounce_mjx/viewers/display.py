@@ -6,15 +6,21 @@ import mujoco
 import numpy as np
 import trimesh
 
-from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import compile_spec
+from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 
 TARGET_SITE = "target_height"
 HOME_SITE = "paddle_home"
+HOME_EDGES = tuple(f"{HOME_SITE}_edge{i}" for i in range(4))
+"""Markers of the home's outline; a plate would hide the paddle."""
+MARKERS = (TARGET_SITE, *HOME_EDGES)
 # By default MuJoCo shows the geom groups 0 to 2.
 _SHOWN_GROUPS = 3
 _SEGMENTS = 40
+# Width of the outline of the paddle's home, m.
+_EDGE = 0.004
 _CREASE_ANGLE = np.radians(30.0)
 
 
@@ -44,7 +50,7 @@ class Display:
 
 def _with_markers(config: EnvConfig) -> mujoco.MjModel:
     """The config's model, with the two marker sites added if it lacks them."""
-    spec = mujoco.MjSpec.from_file(str(config.mjcf or resource_path("mjcf/bounce_ball.xml")))
+    spec, path = scene_spec(config.mjcf, config.robot)
     sites = {site.name for site in spec.sites}
     reward = config.reward
     if TARGET_SITE not in sites:
@@ -62,7 +68,35 @@ def _with_markers(config: EnvConfig) -> mujoco.MjModel:
             pos=[reward.target_x, reward.target_y, reward.paddle_home_height],
             rgba=[0.15, 0.45, 1.0, 0.45],
         )
-    return spec.compile()
+    _add_outline(spec)
+    return compile_spec(spec, path)
+
+
+def _add_outline(spec: mujoco.MjSpec) -> None:
+    """Replaces the plate of the paddle's home by the four edges around it."""
+    home = spec.site(HOME_SITE)
+    (x, y, z), material = home.size, spec.material(home.material)
+    rgba = home.rgba.copy() if material is None else material.rgba.copy()
+    home.rgba = [*rgba[:3], 0.0]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, home.quat)
+    half = _EDGE / 2.0
+    edges = (
+        ([x + half, 0.0], [half, y + _EDGE]),
+        ([-x - half, 0.0], [half, y + _EDGE]),
+        ([0.0, y + half], [x, half]),
+        ([0.0, -y - half], [x, half]),
+    )
+    for name, (middle, size) in zip(HOME_EDGES, edges, strict=True):
+        spec.worldbody.add_site(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=home.pos + rotation.reshape(3, 3) @ [*middle, 0.0],
+            quat=home.quat,
+            size=[*size, z],
+            rgba=[*rgba[:3], 0.9],
+            group=home.group,
+        )
 
 
 def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:

@@ -2,6 +2,7 @@
 
 import os
 import queue
+import subprocess
 import sys
 import time
 
@@ -10,6 +11,7 @@ import mujoco.viewer
 import numpy as np
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.pace import Pace
@@ -19,21 +21,27 @@ _PICTURE_RATE = 60.0
 _TRAIL_SECONDS = 0.5
 _TARGET_STEP = 0.05
 _PUSH = 0.2
-# GLFW's key codes.
-_SPACE, _RIGHT, _LEFT, _DOWN, _UP = 32, 262, 263, 264, 265
+_KEYS = "RTGMNIKJL"
 _HELP = {
     "space": "pause",
     "R": "reset",
-    "up / down": "target height",
-    "left / right": "speed",
+    "T / G": "target height",
+    "M / N": "speed",
     "I K J L": "push the ball",
 }
+# Flags that MuJoCo's window toggles with the same keys.
+_OPTION_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjVISSTRING) if key and key in _KEYS]
+_SCENE_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjRNDSTRING) if key and key in _KEYS]
+_SPACE = 32  # GLFW's code; the code of a letter is its character.
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, according to the environment variables."""
+    """Whether a window can be opened."""
     if sys.platform == "linux":
-        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        # The display may be dead. A separate process tries it, as a failure may stay.
+        probe = [sys.executable, "-c", "import glfw, sys; sys.exit(not glfw.init())"]
+        return bool(named) and subprocess.run(probe, capture_output=True).returncode == 0
     # On a Mac, MuJoCo's viewer needs its own interpreter, mjpython.
     return sys.platform != "darwin" or "MJPYTHON_BIN" in os.environ
 
@@ -45,7 +53,11 @@ def check_display() -> None:
     if not has_display():
         raise UserError(
             "--viewer native needs a display"
-            + (" and mjpython" if sys.platform == "darwin" else ", but DISPLAY is not set")
+            + (
+                " and mjpython"
+                if sys.platform == "darwin"
+                else ", but DISPLAY names none that works"
+            )
             + "; use --viewer browser"
         )
 
@@ -61,6 +73,7 @@ class _Window:
         self._simulation = simulation
         self._display = Display(simulation.env)
         self._paused, self._speed = False, speed
+        self._camera = mujoco.MjvCamera()
         # Keys arrive in the window's thread and take effect between two steps.
         self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
 
@@ -79,6 +92,8 @@ class _Window:
         ) as viewer:
             with viewer.lock():
                 mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
+            self._camera = viewer.cam
+            flags = viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS]
             while viewer.is_running() and steps_left > 0:
                 while not self._keys.empty():
                     self._press(self._keys.get())
@@ -92,6 +107,7 @@ class _Window:
                 del trail[: -round(_TRAIL_SECONDS / dt)]
                 frame = simulation.frame
                 with viewer.lock():
+                    viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS] = flags
                     display.pose(frame.qpos[0], frame.target_height[0])
                     viewer.user_scn.ngeom = 0
                     draw_trail(viewer.user_scn, np.array(trail))
@@ -103,19 +119,22 @@ class _Window:
 
     def _press(self, key: int) -> None:
         simulation = self._simulation
-        pushes = {"I": (0, 0, _PUSH), "K": (-_PUSH, 0, 0), "J": (0, _PUSH, 0), "L": (0, -_PUSH, 0)}
+        pushes = {"I": "up", "K": "back", "J": "left", "L": "right"}
         if key == _SPACE:
             self._paused = not self._paused
         elif key == ord("R"):
             simulation.reset()
-        elif key in (_UP, _DOWN):
-            step = _TARGET_STEP if key == _UP else -_TARGET_STEP
+        elif key in (ord("T"), ord("G")):
+            step = _TARGET_STEP if key == ord("T") else -_TARGET_STEP
             height = float(simulation.frame.target_height[0])
             simulation.target_height = max(_TARGET_STEP, height + step)
-        elif key in (_RIGHT, _LEFT):
-            self._speed = float(np.clip(self._speed * (1.25 if key == _RIGHT else 0.8), 0.1, 4.0))
+        elif key in (ord("M"), ord("N")):
+            factor = 1.25 if key == ord("M") else 0.8
+            self._speed = float(np.clip(self._speed * factor, 0.1, 4.0))
         elif chr(key) in pushes:
-            simulation.push(pushes[chr(key)])
+            azimuth = np.radians(self._camera.azimuth)
+            view = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            simulation.push(_PUSH * direction(pushes[chr(key)], view))
 
     def _texts(self) -> list[tuple]:
         frame = self._simulation.frame

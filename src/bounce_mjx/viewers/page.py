@@ -3,37 +3,40 @@
 import contextlib
 import io
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import viser
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.files import replace_file
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
+_VISER_TITLE = "<title>Viser</title>"
 # viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
 _STOP_SECONDS = 1.0
 
 
-def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | None) -> None:
+def write_page(
+    path: Path,
+    simulation: Simulation | SideBySide,
+    recording: Frame,
+    fps: int | None,
+    names: Sequence[str] | None = None,
+) -> None:
     """Writes a recording of all environments of the simulation as a page.
+
+    Args:
+      names: see `Scene`.
 
     Raises:
       UserError: the file cannot be written.
     """
-    fps = fps or _DEFAULT_FPS
-    frames = resample(recording, simulation.env.dt, fps)
-    with open_server("127.0.0.1", 0) as server:
-        scene = Scene(server, simulation.env, simulation.num_envs)
-        recorder = server.get_scene_serializer()
-        for i in range(len(frames.time)):
-            scene.update([Frame(*(values[i] for values in frames))])
-            recorder.insert_sleep(1.0 / fps)
-        text = recorder.as_html()
+    text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
     unfinished = path.with_name(f".unfinished-{path.name}")
     try:
         unfinished.write_text(text, encoding="utf-8")
@@ -44,6 +47,20 @@ def write_page(path: Path, simulation: Simulation, recording: Frame, fps: int | 
         ) from error
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def replay(
+    env: BounceBall, recording: Frame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
+) -> str:
+    """A page (HTML) that replays a recording [T, N, ...]."""
+    frames = resample(recording, env.dt, fps)
+    with open_server("127.0.0.1", 0) as server:
+        scene = Scene(server, env, frames.time.shape[1], names)
+        recorder = server.get_scene_serializer()
+        for i in range(len(frames.time)):
+            scene.update([Frame(*(values[i] for values in frames))])
+            recorder.insert_sleep(1.0 / fps)
+        return recorder.as_html().replace(_VISER_TITLE, "<title>bounce_mjx</title>", 1)
 
 
 @contextlib.contextmanager

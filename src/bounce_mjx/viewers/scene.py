@@ -9,27 +9,51 @@ import numpy as np
 import viser
 
 from bounce_mjx.task.env import BounceBall
-from bounce_mjx.viewers.display import HOME_SITE, TARGET_SITE, Display, body_scenes, site_mesh
+from bounce_mjx.viewers.display import MARKERS, TARGET_SITE, Display, body_scenes, site_mesh
 from bounce_mjx.viewers.simulation import Frame
 
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
+# Distance of a label above its target, which the ball may exceed.
+_LABEL_DISTANCE = 0.14
+_ANNOUNCED_SECONDS = 1.5
 _TRAIL_SECONDS = 0.6
 _TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
 # The camera sees one arm, its ball and the highest targets.
-_LOOK_AT = np.array([0.34, 0.0, 0.38])
-_VIEW = np.array([0.95, -1.05, 0.40])
+_LOOK_AT = np.array([0.34, 0.0, 0.44])
+_VIEW = np.array([1.06, -1.17, 0.42])
 _FIELD_OF_VIEW = math.radians(40.0)
+# A canvas that is narrower than this, such as a phone's, needs a more distant camera.
+_FULL_ASPECT = 0.9
+# On a page with fewer pixels across, viser's controls cover the lower part: the camera looks down
+# by this share of its field of view.
+_PHONE_WIDTH = 576
+_PHONE_SHIFT = 0.27
+# Where there are more robots than this, their labels are short.
+_MAX_LONG_LABELS = 4
+_FOLLOWING = 0.1
 
 
 class Scene:
     """Up to 16 environments side by side on a viser server."""
 
-    def __init__(self, server: viser.ViserServer, env: BounceBall, num_envs: int):
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        env: BounceBall,
+        num_envs: int,
+        names: Sequence[str] | None = None,
+    ):
+        """
+        Args:
+          names: a name of each environment for its label; by default their numbers.
+        """
         self._server = server
         self._env = env
+        self._names = names
         self._display = Display(env)
+        server.on_client_connect(self._frame)
         self.show(num_envs)
 
     def show(self, num_envs: int) -> None:
@@ -61,7 +85,7 @@ class Scene:
             for body, shapes in body_scenes(model)
         }
         self._markers = {}
-        for name in (TARGET_SITE, HOME_SITE):
+        for name in MARKERS:
             mesh, rgba = site_mesh(model, name)
             self._markers[name] = scene.add_batched_meshes_simple(
                 f"/markers/{name}",
@@ -70,7 +94,7 @@ class Scene:
                 batched_wxyzs=upright,
                 batched_positions=home,
                 batched_colors=np.round(rgba[:3] * 255.0).astype(np.uint8),
-                opacity=0.55,
+                opacity=0.55 if name == TARGET_SITE else 0.9,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,
@@ -82,17 +106,24 @@ class Scene:
             np.zeros((num_envs * (length - 1), 2, 3), np.uint8),
             thickness=0.006,
         )
+        self._label_places = self._offsets + (reward.target_x, reward.target_y, 0.0)
         self._labels = [
             scene.add_label(
                 f"/labels/{i}",
                 "",
-                position=offset + (reward.target_x, reward.target_y, _LABEL_HEIGHT),
+                position=place + (0.0, 0.0, _LABEL_HEIGHT),
                 anchor="bottom-center",
-                font_screen_scale=1.4 if num_envs == 1 else 1.0,
+                font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.8,
             )
-            for i, offset in enumerate(self._offsets)
+            for i, place in enumerate(self._label_places)
         ]
-        self._look()
+        self._lost = np.zeros(num_envs, bool)
+        self._gaze = _LOOK_AT
+        for client in self._server.get_clients().values():
+            self._frame(client)
+        initial = self._server.initial_camera
+        initial.position, initial.look_at = map(tuple, camera_pose(self._offsets))
+        initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
 
     def update(self, frames: Sequence[Frame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
@@ -114,12 +145,41 @@ class Scene:
             for name, handle in self._markers.items():
                 handle.batched_positions = sites[name] + self._offsets
             self._line.points, self._line.colors = self._trails(frames)
+            for seen in frames:
+                over = seen.over[:number]
+                self._lost = np.where(over, seen.lost[:number], self._lost)
             for i, label in enumerate(self._labels):
-                robot = f"{i + 1}:  " if number > 1 else ""
-                count, height = frame.n_bounces[i], frame.target_height[i]
-                text = f"{robot}bounces {count:.0f}   target {height:.2f} m"
+                text = self._label(frame, i)
                 if label.text != text:
                     label.text = text
+                height = max(_LABEL_HEIGHT, frame.target_height[i] + _LABEL_DISTANCE)
+                position = self._label_places[i] + (0.0, 0.0, height)
+                if not np.array_equal(label.position, position):
+                    label.position = position
+
+    def follow(self, frame: Frame) -> None:
+        """Moves the camera of every page smoothly with the first ball."""
+        gaze = self._gaze + _FOLLOWING * (frame.ball[0] + self._offsets[0] - self._gaze)
+        for client in self._server.get_clients().values():
+            with contextlib.suppress(ValueError, TypeError, AssertionError):
+                # The user may have turned the camera around the ball.
+                view = client.camera.position - client.camera.look_at
+                with client.atomic():
+                    client.camera.position, client.camera.look_at = gaze + view, gaze
+        self._gaze = gaze
+
+    def _label(self, frame: Frame, index: int) -> str:
+        """An environment's name if there are several, and its bounces or the loss of its ball."""
+        name = "" if self._num_envs == 1 else f"{index + 1}:  "
+        if self._names is not None:
+            name = f"{self._names[index]}:  "
+        short = self._num_envs > _MAX_LONG_LABELS
+        if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
+            return f"{name}LOST" if short else f"{name}BALL LOST"
+        count, height = frame.n_bounces[index], frame.target_height[index]
+        if short:
+            return f"{name}{count:.0f}"
+        return f"{name}bounces {count:.0f}   target {height:.2f} m"
 
     def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
         """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
@@ -140,17 +200,30 @@ class Scene:
         )
         return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
-    def _look(self) -> None:
-        """Turns the camera of every page towards the environments."""
-        extent = 1.0 + 1.25 * np.linalg.norm(np.ptp(self._offsets, axis=0))
-        position = _LOOK_AT + extent * _VIEW
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = tuple(position), tuple(_LOOK_AT)
-        camera.up, camera.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
-        for client in self._server.get_clients().values():
-            # A page whose own camera is invalid keeps it.
-            with contextlib.suppress(ValueError, TypeError, AssertionError):
-                client.camera.position, client.camera.look_at = position, _LOOK_AT
+    def _frame(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a page towards the environments."""
+        # A page whose own camera is invalid keeps it.
+        with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
+            aspect, width = client.camera.aspect, client.camera.image_width
+            position, gaze = camera_pose(self._offsets, aspect, width)
+            if np.all(np.isfinite(position)):
+                client.camera.position, client.camera.look_at = position, gaze
+
+
+def camera_pose(
+    offsets: np.ndarray, aspect: float = 1.0, width: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
+
+    Args:
+      offsets: positions of the environments [N, 3], m.
+      aspect: width / height of the picture.
+      width: width of the picture in pixels.
+    """
+    extent = 1.0 + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
+    view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
+    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if width < _PHONE_WIDTH else 0.0
+    return _LOOK_AT + view, _LOOK_AT - (0.0, 0.0, down * np.linalg.norm(view))
 
 
 def _grid(number: int) -> np.ndarray:

@@ -1,7 +1,9 @@
 """The viewers and recordings that `view` and `play` start."""
 
 import contextlib
-from collections.abc import Callable
+import string
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -13,25 +15,36 @@ from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
-from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
 
 _RECORDED_SECONDS = 10.0
 
 
+class Shown(NamedTuple):
+    """An environment to show, and its controller."""
+
+    config: EnvConfig
+    make_controller: Callable[[BounceBall], Controller]
+    title: str
+
+
 def show(
-    config: EnvConfig,
-    make_controller: Callable[[BounceBall], Controller],
+    shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    title: str,
     target_height: float | None,
     console: Console,
 ) -> None:
-    """Shows or records an environment under a controller; Ctrl-C closes a viewer.
+    """Shows or records environments under their controllers; Ctrl-C closes a viewer.
+
+    Args:
+      shown: one, or several with the same robot side by side, on the page or in its recording. The
+        labels of several are A, B, ...
 
     Raises:
-      UserError: a file cannot be written, or the viewer does not work here.
+      UserError: a file cannot be written, or the viewer does not work here, or it shows only one
+        of several.
       KeyboardInterrupt: Ctrl-C came during the compilation or the recording.
     """
     recorded = options.video is not None or options.html is not None
@@ -39,9 +52,13 @@ def show(
         raise UserError(
             f"--viewer {options.viewer} and --video or --html exclude each other; give only one"
         )
-    viewer = options.viewer
+    viewer, several = options.viewer, len(shown) > 1
+    if several and (viewer == "native" or options.video is not None):
+        raise UserError("a window or a video shows one policy; show several with --viewer browser")
+    if several and len({one.config.mjcf for one in shown}) > 1:
+        raise UserError("the policies have different robots; show one at a time")
     if viewer == "auto":
-        viewer = "native" if has_display() else "browser"
+        viewer = "native" if not several and has_display() else "browser"
     film = None
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
@@ -59,18 +76,33 @@ def show(
 
         port = free_port(options.host, options.port)
 
-    env, num_envs, ranges = BounceBall(config), options.num_envs, None
-    if not recorded and viewer == "browser":
-        env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
-        # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
-        if env.engine.name == "fused":
-            num_envs = MAX_ENVS
-    with console.status("compiling"):
+    on_page = not recorded and viewer == "browser"
+    title, names = shown[0].title, None
+    if several:
+        each = max(1, options.num_envs // len(shown))
+        letters = string.ascii_uppercase[: len(shown)]
+        names = [letter for letter in letters for _ in range(each)]
+        titles = zip(letters, shown, strict=True)
+        title = ", ".join(f"{letter}: {one.title}" for letter, one in titles)
+
+    def simulate(one: Shown) -> Simulation:
+        config, num_envs = one.config, each if several else options.num_envs
+        env, ranges = BounceBall(config), None
+        if on_page:
+            env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
+            # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
+            if env.engine.name == "fused" and not several:
+                num_envs = MAX_ENVS
         simulation = run_interruptible(
-            Simulation, env, make_controller(env), num_envs, options.seed, ranges
+            Simulation, env, one.make_controller(env), num_envs, options.seed, ranges
         )
         simulation.target_height = target_height
         simulation.world = None if config.randomization.terms else {}
+        return simulation
+
+    with console.status("compiling"):
+        simulations = [simulate(one) for one in shown]
+    simulation = SideBySide(simulations) if several else simulations[0]
 
     if recorded:
         with console.status("recording"):
@@ -78,7 +110,7 @@ def show(
             if film is not None:
                 film.write(simulation, recording)
             if options.html is not None:
-                write_page(options.html, simulation, recording, options.fps)
+                write_page(options.html, simulation, recording, options.fps, names)
         for path in (options.video, options.html):
             if path is not None:
                 # rich would read brackets in a path as markup.
@@ -90,11 +122,12 @@ def show(
         else:
             run_browser(
                 simulation,
-                num_shown=options.num_envs,
+                num_shown=simulation.num_envs if several else options.num_envs,
                 speed=options.speed,
                 seconds=options.seconds,
                 host=options.host,
                 port=port,
                 title=title,
                 console=console,
+                names=names,
             )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bounce_mjx.learning.policy import Policy, forget
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.randomization import TERMS, Ranges, World, physics_parameters
@@ -36,6 +37,9 @@ class Frame(NamedTuple):
     over: np.ndarray
     """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
     episode."""
+    lost: np.ndarray
+    """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
+    fast."""
 
 
 class Simulation:
@@ -48,16 +52,19 @@ class Simulation:
         num_envs: int,
         seed: int,
         ranges: Ranges | None = None,
+        policy: Policy | None = None,
     ):
         """Compiles the programs, which takes seconds, and resets all environments.
 
         Args:
           ranges: from which the resets draw the worlds, see `BounceBall.reset`.
+          policy: the first value of `policy`, for an exchangeable controller.
         """
         self.env = env
         self.num_envs = num_envs
-        self.target_height: float | None = None
-        """Target height of all environments, m; None for the height drawn at each reset."""
+        self.policy = policy
+        """The policy that acts; another one of the same shapes may replace it between two steps."""
+        self._target_height: float | None = None
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for the world drawn at each reset."""
@@ -68,6 +75,7 @@ class Simulation:
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
         self._steps = np.zeros(num_envs, np.int32)
+        self._memory = controller.start_memory((num_envs,))
         over = np.ones(num_envs, bool)
         programs = (
             jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
@@ -80,6 +88,22 @@ class Simulation:
             )
         self.reset()
 
+    @property
+    def target_height(self) -> float | None:
+        """Target height of all environments, m; None for the height drawn at each reset."""
+        return self._target_height
+
+    @target_height.setter
+    def target_height(self, height: float | None) -> None:
+        self._target_height = height
+        self.frame = self._with_target(self.frame)
+
+    def _with_target(self, frame: Frame) -> Frame:
+        """A frame that already shows the target height that the next step sets."""
+        if self._target_height is None:
+            return frame
+        return frame._replace(target_height=np.full_like(frame.target_height, self._target_height))
+
     def reset(self) -> Frame:
         """Starts a new episode in every environment; returns the first frame."""
         self.frame = self._reset(np.ones(self.num_envs, bool))
@@ -91,7 +115,9 @@ class Simulation:
 
     def step(self) -> Frame:
         """Advances one control step."""
-        self._key, self._states, self._steps, frame = self._step_program(*self._inputs())
+        self._key, self._states, self._steps, self._memory, frame = self._step_program(
+            *self._inputs()
+        )
         self._push = np.zeros(3, np.float32)
         self.frame = jax.device_get(frame)
         if self.frame.over.any():
@@ -105,13 +131,13 @@ class Simulation:
         return Frame(*(np.stack(values) for values in zip(*frames, strict=True)))
 
     def _target(self) -> np.float32:
-        return np.float32(np.nan if self.target_height is None else self.target_height)
+        return np.float32(np.nan if self._target_height is None else self._target_height)
 
     def _world(self) -> World:
         """The terms that have a nominal value; nan where the drawn ones stay."""
         values = {}
         for name in self.env.config.randomization.terms:
-            shape, nominal, _ = TERMS[name]
+            shape, nominal = TERMS[name].shape(self.env.action_size), TERMS[name].nominal
             if nominal is not None:
                 entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
                 values[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
@@ -120,13 +146,14 @@ class Simulation:
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
         changes = self._target(), self._push, self._world()
-        return self._key, self._states, self._steps, *changes
+        state = self._key, self._states, self._steps, self._memory
+        return self.policy, *state, *changes
 
     def _reset(self, over: np.ndarray) -> Frame:
         """Starts a new episode in some environments [N]; the frame of all."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
-        return jax.device_get(frame)
+        return self._with_target(jax.device_get(frame))
 
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
@@ -139,14 +166,71 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, key, states, steps, target, push, world):
+    def _advance(self, policy, key, states, steps, memory, target, push, world):
         key, action_key = jax.random.split(key)
         states = _influence(self.env, states, target, push, world)
-        actions = self._controller(states, action_key)
+        memory = forget(memory, steps == 0)
+        actions, memory = self._controller.act(policy, states, action_key, memory)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
-        return key, after, steps, _view(self.env, after, steps, over)
+        return key, after, steps, memory, _view(self.env, after, steps, over)
+
+
+class SideBySide:
+    """Several simulations of one robot, shown as one; the environments of the first come first."""
+
+    def __init__(self, simulations: Sequence[Simulation]):
+        self._simulations = simulations
+        self.env = simulations[0].env
+        self.num_envs = sum(simulation.num_envs for simulation in simulations)
+
+    @property
+    def frame(self) -> Frame:
+        """The current frame of all environments."""
+        frames = [simulation.frame for simulation in self._simulations]
+        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+
+    @property
+    def target_height(self) -> float | None:
+        """See `Simulation.target_height`."""
+        return self._simulations[0].target_height
+
+    @target_height.setter
+    def target_height(self, height: float | None) -> None:
+        for simulation in self._simulations:
+            simulation.target_height = height
+
+    @property
+    def world(self) -> dict[str, Sequence[float]] | None:
+        """See `Simulation.world`."""
+        return self._simulations[0].world
+
+    @world.setter
+    def world(self, world: dict[str, Sequence[float]] | None) -> None:
+        for simulation in self._simulations:
+            simulation.world = world
+
+    def reset(self) -> Frame:
+        """See `Simulation.reset`."""
+        for simulation in self._simulations:
+            simulation.reset()
+        return self.frame
+
+    def push(self, velocity: tuple[float, float, float]) -> None:
+        """See `Simulation.push`."""
+        for simulation in self._simulations:
+            simulation.push(velocity)
+
+    def step(self) -> Frame:
+        """See `Simulation.step`."""
+        frames = [simulation.step() for simulation in self._simulations]
+        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+
+    def record(self, seconds: float) -> Frame:
+        """See `Simulation.record`."""
+        recordings = [simulation.record(seconds) for simulation in self._simulations]
+        return Frame(*(np.concatenate(values, axis=1) for values in zip(*recordings, strict=True)))
 
 
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
@@ -220,4 +304,5 @@ def _view(env: BounceBall, states: State, steps: jax.Array, over: jax.Array) -> 
         n_bounces=task.n_bounces,
         reward_terms=jnp.stack(terms, axis=-1),
         over=over,
+        lost=over & (states.done > 0),
     )

@@ -33,7 +33,7 @@ class WorldSlider(NamedTuple):
 
     def world_value(self, position: float) -> tuple[float, ...]:
         """Entries of the term at a slider position; the slider moves the first entry."""
-        others = math.prod(TERMS[self.term].shape) - 1
+        others = math.prod(TERMS[self.term].size) - 1
         return (position * self.scale, *(TERMS[self.term].nominal,) * others)
 
 

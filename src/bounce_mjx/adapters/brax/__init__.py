@@ -1,7 +1,8 @@
 """brax: importing this package registers the environment as "bounce_ball".
 
-Then `brax.envs.get_environment("bounce_ball")` returns a `BounceBall`, and brax's wrappers and
-trainers accept every `BounceBall`. Needs the extra `brax`.
+Then `brax.envs.get_environment("bounce_ball", target_height_range=(0.3, 0.8))` returns a
+`BraxBounceBall` with these settings. brax's wrappers and trainers accept it, and also every
+`BounceBall`. Needs the extra `brax`.
 """
 
 import contextlib
@@ -18,13 +19,21 @@ except ImportError as error:
         f"brax cannot be imported ({error}); install it with pip install 'bounce_mjx[brax]'"
     ) from error
 
+from bounce_mjx.adapters.brax.checkpoints import load_policy
+from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
 from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
+from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
 from bounce_mjx.task.env import BounceBall
 
-__all__ = ["ENV_NAME", "device_put_replicated"]
-
-ENV_NAME = "bounce_ball"
+__all__ = [
+    "ENV_NAME",
+    "BraxBounceBall",
+    "device_put_replicated",
+    "load_policy",
+    "network_settings",
+    "ppo_settings",
+]
 
 # BounceBall has the interface of brax's Env; this lets it pass brax's isinstance checks.
 brax.envs.Env.register(BounceBall)
-brax.envs.register_environment(ENV_NAME, BounceBall)
+brax.envs.register_environment(ENV_NAME, BraxBounceBall)

@@ -15,16 +15,19 @@ from gymnasium.vector import AutoresetMode
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.model import JOINT_NAMES
 from bounce_mjx.task import vector
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.state import State
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
-ACTION_SPACE = gymnasium.spaces.Box(-1.0, 1.0, (len(JOINT_NAMES),), np.float32)
 _FRAMES_PER_SECOND = 50
 _HEIGHT, _WIDTH = 480, 640
+
+
+def action_space(task: BounceBall) -> gymnasium.spaces.Box:
+    """The space of the actions of one environment."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 
 def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
@@ -51,7 +54,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.task = BounceBall(validate(EnvConfig, settings, ENV_ID))
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
         self.render_mode = render_mode
-        self.action_space = ACTION_SPACE
+        self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
         self._reset = jax.jit(self.task.reset)
         self._step = jax.jit(self.task.step)
@@ -62,7 +65,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode: its first observation [29] and an empty info."""
+        """Starts an episode: its first observation [N] and an empty info."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
         self._length = 0
@@ -71,10 +74,10 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances one control step under the action [6].
+        """Advances one control step under the action [n].
 
         Returns:
-          Observation [29], reward, terminated, truncated, and the environment's metrics.
+          Observation [N], reward, terminated, truncated, and the environment's metrics.
         """
         self._state = self._step(self._state, np.asarray(action, np.float32))
         self._length += 1
@@ -99,7 +102,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """B environments; an ended episode is reset within the step that ends it.
 
-    `info["final_obs"]` [B, 29] is every environment's observation after the step, before any reset;
+    `info["final_obs"]` [B, N] is every environment's observation after the step, before any reset;
     `info["_final_obs"]` [B] is true where the episode ended.
     """
 
@@ -116,9 +119,9 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.single_action_space = ACTION_SPACE
+        self.single_action_space = action_space(self.task)
         self.single_observation_space = observation_space(self.task)
-        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
@@ -131,7 +134,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a new episode in every environment: observations [B, 29] and an empty info."""
+        """Starts a new episode in every environment: observations [B, N] and an empty info."""
         super().reset(seed=seed)
         self._key, key = jax.random.split(_key(self.np_random))
         self._state = self._reset(key)
@@ -143,7 +146,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         """Advances every environment under the actions [B, 6].
 
         Returns:
-          Observations [B, 29], rewards [B], terminated [B], truncated [B], and an info of the
+          Observations [B, N], rewards [B], terminated [B], truncated [B], and an info of the
           environments' metrics and the final observations.
         """
         self._state, self._key, result = self._step(

@@ -5,30 +5,32 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 from ml_collections import config_dict
 from mujoco import mjx
 
+from bounce_mjx.adapters.opengl import choose_opengl
+from bounce_mjx.adapters.randomization import parameters_of
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
+from bounce_mjx.physics import PhysicsState
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import state as core
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.env import BounceBall, BounceState
 
 try:
-    from mujoco_playground import MjxEnv, State, manipulation, render_array
+    from mujoco_playground import MjxEnv, State
 except ImportError as error:
     raise UserError(
         f"MuJoCo Playground cannot be imported ({error}); install it with pip install playground"
     ) from error
 
 ENV_NAME = "BounceBall"
-_NO_RANDOMIZATION = (
-    "Playground's randomization_fn changes an MJX model, which this environment does not use, "
-    "so it would have no effect; train without it"
-)
 
 
 def default_config() -> config_dict.ConfigDict:
@@ -39,6 +41,8 @@ def default_config() -> config_dict.ConfigDict:
         sim_dt=config.physics_dt,
         episode_length=config.episode_steps,
         action_repeat=1,
+        # Of `mjx_model` alone; Playground's scripts set it.
+        impl="jax",
         task=config_dict.ConfigDict(
             config.model_dump(
                 mode="json", exclude={"control_dt", "physics_dt", "episode_seconds", "mjcf"}
@@ -47,8 +51,31 @@ def default_config() -> config_dict.ConfigDict:
     )
 
 
+@struct.dataclass
+class BounceData:
+    """The state of the physics and the task, with those names of MJX's data that wrappers and
+    renderers read."""
+
+    qpos: jax.Array
+    """Positions [nq]."""
+    qvel: jax.Array
+    """Velocities [nv]."""
+    act: jax.Array | None
+    """Activations [na] of the actuators; None if the model has none."""
+    time: jax.Array
+    """Time since the reset [], s."""
+    ctrl: jax.Array
+    """Servo targets [nu] of the last action, without any latency."""
+    mocap_pos: jax.Array
+    mocap_quat: jax.Array
+    xfrc_applied: jax.Array
+    """Zero [nbody, 6]."""
+    task: BounceState
+    """Everything else that the next step depends on."""
+
+
 class PlaygroundBounceBall(MjxEnv):
-    """One environment with Playground's interface."""
+    """One environment with Playground's interface; `task` is the `BounceBall` in it."""
 
     def __init__(
         self,
@@ -67,14 +94,69 @@ class PlaygroundBounceBall(MjxEnv):
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
         self.task = BounceBall(validate(EnvConfig, settings, ENV_NAME))
+        self._randomized: mjx.Model | None = None
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
-        return _to_playground(self.task.reset(rng))
+        task = self.task
+        if self._randomized is not None:
+            parameters = parameters_of(self.mj_model, self._own_mjx_model, self._randomized)
+            if parameters != MODEL_PARAMETERS:
+                task = BounceBall(task.config, randomize=lambda key: parameters)
+        state = task.reset(rng)
+        m, (qpos, qvel, act) = self.mj_model, state.pipeline_state.physics
+        dtype = qpos.dtype
+        data = BounceData(
+            qpos=qpos,
+            qvel=qvel,
+            act=act,
+            time=jnp.zeros((), dtype),
+            ctrl=self.task.servo_targets(
+                state.pipeline_state.physics, jnp.zeros(self.action_size, dtype)
+            ),
+            mocap_pos=jnp.zeros((m.nmocap, 3), dtype),
+            mocap_quat=jnp.zeros((m.nmocap, 4), dtype),
+            xfrc_applied=jnp.zeros((m.nbody, 6), dtype),
+            task=state.pipeline_state._replace(physics=None),
+        )
+        return State(
+            data=data,
+            obs=state.obs,
+            reward=state.reward,
+            done=state.done,
+            metrics=state.metrics,
+            info=state.info,
+        )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [6]."""
-        return _to_playground(self.task.step(_from_playground(state), action))
+        """Advances one control step under the action [action_size]."""
+        data = state.data
+        physics = PhysicsState(data.qpos, data.qvel, data.act)
+        before = core.State(
+            pipeline_state=data.task._replace(physics=physics),
+            obs=state.obs,
+            reward=state.reward,
+            done=state.done,
+            metrics=state.metrics,
+            info=state.info,
+        )
+        after = self.task.step(before, action)
+        moved = after.pipeline_state.physics
+        return state.replace(
+            data=data.replace(
+                qpos=moved.qpos,
+                qvel=moved.qvel,
+                act=moved.act,
+                time=data.time + self.task.dt,
+                ctrl=self.task.servo_targets(physics, jnp.clip(action, -1.0, 1.0)),
+                task=after.pipeline_state._replace(physics=None),
+            ),
+            obs=after.obs,
+            reward=after.reward,
+            done=after.done,
+            metrics=after.metrics,
+            info=after.info,
+        )
 
     @property
     def xml_path(self) -> str:
@@ -93,54 +175,30 @@ class PlaygroundBounceBall(MjxEnv):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The model in MJX, for reading only; the environment does not step it."""
+        """The model in MJX; the environment reads the fields that a `randomization_fn` changes."""
         return self._mjx_model
 
-    @functools.cached_property
+    @property
     def _mjx_model(self) -> mjx.Model:
-        return mjx.put_model(self.mj_model)
+        return self._own_mjx_model if self._randomized is None else self._randomized
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Playground's domain randomisation assigns a model here, which no step would use."""
-        if name == "_mjx_model":
-            raise UserError(_NO_RANDOMIZATION)
-        super().__setattr__(name, value)
+    @_mjx_model.setter
+    def _mjx_model(self, model: mjx.Model) -> None:
+        """Playground's domain randomisation assigns one environment's model here; its fields act
+        from the next reset (`adapters/randomization.py`)."""
+        self._randomized = None if model is self._own_mjx_model else model
 
-    def render(self, trajectory: list[State] | State, *args: Any, **kwargs: Any) -> Sequence[Any]:
-        """Renders one state or a list of states with Playground's renderer."""
-        states = trajectory if isinstance(trajectory, list) else [trajectory]
-        with_data = [state.replace(data=self._mj_data(state)) for state in states]
-        drawable = with_data if isinstance(trajectory, list) else with_data[0]
-        return render_array(self.mj_model, drawable, *args, **kwargs)
+    @functools.cached_property
+    def _own_mjx_model(self) -> mjx.Model:
+        return mjx.put_model(self.mj_model, impl=self._config.impl)
 
-    def _mj_data(self, state: State) -> mujoco.MjData:
-        data = mujoco.MjData(self.mj_model)
-        data.qpos[:] = np.asarray(state.data.physics.qpos)
-        data.qvel[:] = np.asarray(state.data.physics.qvel)
-        return data
+    def render(
+        self, trajectory: list[State] | State, *args: Any, **kwargs: Any
+    ) -> Sequence[np.ndarray] | np.ndarray:
+        """Pictures of one state or a list of states, with Playground's renderer.
 
-
-def _to_playground(state: core.State) -> State:
-    """Converts a state; its field `data` holds a `BounceState`, not MJX's data."""
-    return State(
-        data=state.pipeline_state,
-        obs=state.obs,
-        reward=state.reward,
-        done=state.done,
-        metrics=state.metrics,
-        info=state.info,
-    )
-
-
-def _from_playground(state: State) -> core.State:
-    return core.State(
-        pipeline_state=state.data,
-        obs=state.obs,
-        reward=state.reward,
-        done=state.done,
-        metrics=state.metrics,
-        info=state.info,
-    )
-
-
-manipulation.register_environment(ENV_NAME, PlaygroundBounceBall, default_config)
+        Raises:
+          UserError: no OpenGL library works here.
+        """
+        choose_opengl()
+        return super().render(trajectory, *args, **kwargs)

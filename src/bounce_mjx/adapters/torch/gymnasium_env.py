@@ -6,7 +6,7 @@ import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.environments import ACTION_SPACE, observation_space
+from bounce_mjx.adapters.gymnasium.environments import action_space, observation_space
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
@@ -22,9 +22,11 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def __init__(self, env: TorchVectorEnv):
         self.env = env
         self.num_envs = env.num_envs
-        self.single_action_space = ACTION_SPACE
+        self.single_action_space = action_space(env.env)
         self.single_observation_space = observation_space(env.env)
-        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, env.num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(
+            self.single_action_space, env.num_envs
+        )
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, env.num_envs
         )

@@ -18,7 +18,6 @@ from bounce_mjx.learning import statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD, MIN_VARIANCE
-from bounce_mjx.robot.model import JOINT_NAMES
 
 
 class Normalizer(nn.Module):
@@ -90,7 +89,7 @@ def to_policy(
     Args:
       normalizer: normaliser of the observation [N].
       linears: hidden layers and output layer of the mean network.
-      log_std: logarithm of the standard deviation [6].
+      log_std: logarithm of the standard deviation [n].
 
     Raises:
       UserError: the layers differ from the config's layers.
@@ -105,7 +104,7 @@ def to_policy(
             "std_logparam": {"log_value": _array(log_std)},
         }
     }
-    networks = make_networks(config, len(normalizer.mean), len(JOINT_NAMES))
+    networks = make_networks(config, len(normalizer.mean), len(log_std))
     expected = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
     shapes, expected_shapes = (jax.tree.map(lambda x: x.shape, tree) for tree in (params, expected))
     if shapes != expected_shapes:

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from bounce_mjx.learning.metrics import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.devices import make_mesh
-from bounce_mjx.training.trainer import Metrics, Snapshot, iterations_per_block
+from bounce_mjx.training.trainer import Metrics, Snapshot
 
 _LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
 
@@ -36,9 +37,13 @@ class TorchTrainer:
                 f"num_devices is {config.num_devices}, but PyTorch trains on one device here; "
                 "leave it out, or train with bounce-mjx train"
             )
+        if config.ppo.network != "mlp":
+            raise UserError(
+                f"ppo.network is {config.ppo.network}, but PyTorch trains an mlp here; choose mlp, "
+                "or train with bounce-mjx train"
+            )
         self.library = library
         self.mesh: Mesh = make_mesh(1, config.ppo)
-        self._iterations = iterations_per_block(config)
         first = make_vector_env(config.ppo, env, config.seed)
         self.learners: list[Learner] = []
         for seed in range(config.seed, config.seed + config.num_seeds):
@@ -63,8 +68,8 @@ class TorchTrainer:
                 one = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
             learner.restore(one)
 
-    def run(self) -> Metrics:
-        blocks = [summarize(learner.learn(self._iterations)) for learner in self.learners]
+    def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
+        blocks = [summarize(learner.learn(iterations)) for learner in self.learners]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:

@@ -1,11 +1,13 @@
-"""Rigid-body dynamics of a serial chain of hinges, unrolled into scalar arithmetic.
+"""Rigid-body dynamics of a serial chain of hinges and slides, unrolled into scalar arithmetic.
 
-Quantities of link i are in the frame of link i, with its origin on the axis of joint i, unless
-their names say `world`. Source: Featherstone, Rigid Body Dynamics Algorithms (2008), table 5.1
+Quantities of link i are in the frame of link i, unless their names say `world`. The origin of the
+frame is on the axis of joint i and moves with the link. Joint forces are torques (N m) of hinges
+and forces (N) of slides. Source: Featherstone, Rigid Body Dynamics Algorithms (2008), table 5.1
 (recursive Newton-Euler) and table 6.2 (composite rigid bodies), in three-dimensional form.
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -22,6 +24,7 @@ from bounce_mjx.physics.fused.scalars import (
     congruence,
     cross,
     dot,
+    is_constant,
     matmul,
     matvec,
     mul,
@@ -38,16 +41,18 @@ SquareMatrix = list[list[Scalar]]
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """One hinge and its link."""
+    """One joint and the bodies that move with it."""
 
     offset: tuple[float, float, float]
-    """Origin of the link in the frame of its parent, m."""
+    """Origin of the link in the frame of its parent at the joint position `zero_position`, m."""
     rotation: tuple[tuple[float, float, float], ...]
-    """Orientation of the link in the frame of its parent at the joint angle `zero_angle`."""
+    """Orientation of the link in the frame of its parent at the joint position `zero_position`."""
     axis: tuple[float, float, float]
-    """Unit axis of the hinge."""
-    zero_angle: float
-    """Joint angle of the orientation `rotation`, rad."""
+    """Unit axis of the joint."""
+    slides: bool
+    """Whether the joint is a slide, not a hinge."""
+    zero_position: float
+    """Joint position at which `offset` and `rotation` hold, rad or m."""
     mass: Scalar
     """Mass, kg."""
     first_moment: Vec3
@@ -55,9 +60,17 @@ class Link:
     inertia: Mat3
     """Rotational inertia about the origin of the link, kg m^2."""
     armature: Scalar
-    """Rotor inertia reflected to the joint, kg m^2."""
+    """Rotor inertia reflected to the joint, kg m^2 or kg."""
     damping: Scalar
-    """Viscous damping of the joint, N m s/rad."""
+    """Viscous damping of the joint, N m s/rad or N s/m."""
+    stiffness: float = 0.0
+    """Stiffness of the joint's spring, N m/rad or N/m."""
+    spring_position: float = 0.0
+    """Joint position at which the spring is at rest, rad or m."""
+    floating_mass: Scalar = 0.0
+    """Mass whose weight `gravcomp` carries, kg."""
+    floating_moment: Vec3 = ZERO3
+    """First moment of this mass, kg m."""
 
 
 class Pose(NamedTuple):
@@ -69,41 +82,53 @@ class Pose(NamedTuple):
     """Orientation of each link in the world."""
     world_origin: list[Vec3]
     """Origin of each link in the world, m."""
+    offset: list[Vec3]
+    """Origin of each link in its parent's frame, m."""
 
 
 def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
-    """Pose of every link at the joint angles q (rad)."""
-    rotation, world_rotation, world_origin = [], [], []
+    """Pose of every link at the joint positions q (rad, m)."""
+    rotation, world_rotation, world_origin, offset = [], [], [], []
     parent_rotation, parent_origin = IDENTITY3, ZERO3
-    for link, angle in zip(links, q, strict=True):
-        turned = sub(angle, link.zero_angle)
-        sine, cosine = sine_cosine(turned)
-        joint = axis_rotation(link.axis, cosine, sine)
-        rotation.append(matmul(link.rotation, joint))
-        parent_origin = vadd(parent_origin, matvec(parent_rotation, link.offset))
+    for link, position in zip(links, q, strict=True):
+        moved = sub(position, link.zero_position)
+        if link.slides:
+            rotation.append(link.rotation)
+            offset.append(vadd(link.offset, scale(matvec(link.rotation, link.axis), moved)))
+        else:
+            sine, cosine = sine_cosine(moved)
+            joint = axis_rotation(link.axis, cosine, sine)
+            rotation.append(matmul(link.rotation, joint))
+            offset.append(link.offset)
+        parent_origin = vadd(parent_origin, matvec(parent_rotation, offset[-1]))
         parent_rotation = matmul(parent_rotation, rotation[-1])
         world_origin.append(parent_origin)
         world_rotation.append(parent_rotation)
-    return Pose(rotation, world_rotation, world_origin)
+    return Pose(rotation, world_rotation, world_origin, offset)
 
 
 def bias_force(
     links: Sequence[Link], pose: Pose, v: Sequence[Scalar], gravity: Vec3
 ) -> list[Scalar]:
-    """Joint torques (N m) that balance gravity, Coriolis and centrifugal effects at zero joint
+    """Joint forces that balance gravity, Coriolis and centrifugal effects at zero joint
     acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
     omega, alpha, acceleration = ZERO3, ZERO3, scale(gravity, -1.0)
     forces, moments = [], []
-    for link, rotation, speed in zip(links, pose.rotation, v, strict=True):
+    for link, rotation, offset, speed in zip(links, pose.rotation, pose.offset, v, strict=True):
         to_link = transpose(rotation)
         at_origin = vadd(
-            acceleration, vadd(cross(alpha, link.offset), cross(omega, cross(omega, link.offset)))
+            acceleration, vadd(cross(alpha, offset), cross(omega, cross(omega, offset)))
         )
-        spin = scale(link.axis, speed)
+        motion = scale(link.axis, speed)
         omega_of_parent = matvec(to_link, omega)
-        alpha = vadd(matvec(to_link, alpha), cross(omega_of_parent, spin))
-        omega = vadd(omega_of_parent, spin)
-        acceleration = matvec(to_link, at_origin)
+        alpha, omega = matvec(to_link, alpha), omega_of_parent
+        if link.slides:
+            coriolis = scale(cross(omega_of_parent, motion), 2.0)
+            acceleration = vadd(matvec(to_link, at_origin), coriolis)
+        else:
+            alpha = vadd(alpha, cross(omega_of_parent, motion))
+            omega = vadd(omega_of_parent, motion)
+            acceleration = matvec(to_link, at_origin)
         about_origin = vadd(
             cross(alpha, link.first_moment), cross(omega, cross(omega, link.first_moment))
         )
@@ -111,17 +136,40 @@ def bias_force(
         turning = vadd(matvec(link.inertia, alpha), cross(omega, matvec(link.inertia, omega)))
         moments.append(vadd(turning, cross(link.first_moment, acceleration)))
 
-    torques: list[Scalar] = [0.0] * len(links)
+    along_joints: list[Scalar] = [0.0] * len(links)
     force, moment = ZERO3, ZERO3
     for i in reversed(range(len(links))):
         force, moment = vadd(forces[i], force), vadd(moments[i], moment)
-        torques[i] = dot(links[i].axis, moment)
-        force, moment = _to_parent(links[i], pose.rotation[i], force, moment)
-    return torques
+        along_joints[i] = _along_joint(links[i], force, moment)
+        force, moment = _to_parent(pose.rotation[i], pose.offset[i], force, moment)
+    return along_joints
+
+
+def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec3) -> list[Scalar]:
+    """Joint forces of MuJoCo's gravity compensation, which carries the weight of each link's
+    `floating_mass`."""
+    upward = scale(gravity, -1.0)
+    along_joints = []
+    mass: Scalar = 0.0
+    world_moment = ZERO3
+    for link, rotation, origin in reversed(
+        list(zip(links, pose.world_rotation, pose.world_origin, strict=True))
+    ):
+        mass = add(mass, link.floating_mass)
+        about_origin = matvec(rotation, link.floating_moment)
+        about_world = vadd(scale(origin, link.floating_mass), about_origin)
+        world_moment = vadd(world_moment, about_world)
+        axis = matvec(rotation, link.axis)
+        if link.slides:
+            along_joints.append(mul(dot(axis, upward), mass))
+        else:
+            moment = vsub(world_moment, scale(origin, mass))
+            along_joints.append(dot(axis, cross(moment, upward)))
+    return along_joints[::-1]
 
 
 def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
-    """Joint-space inertia matrix [n, n] (kg m^2), armature included: composite rigid bodies."""
+    """Joint-space inertia matrix [n, n], armature included: composite rigid bodies."""
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
     mass: Scalar = 0.0
@@ -132,14 +180,17 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
         first_moment = vadd(first_moment, link.first_moment)
         inertia = tuple(vadd(a, b) for a, b in zip(inertia, link.inertia, strict=True))
 
-        force, moment = cross(link.axis, first_moment), matvec(inertia, link.axis)
-        matrix[i][i] = add(dot(link.axis, moment), link.armature)
+        if link.slides:
+            force, moment = scale(link.axis, mass), cross(first_moment, link.axis)
+        else:
+            force, moment = cross(link.axis, first_moment), matvec(inertia, link.axis)
+        matrix[i][i] = add(_along_joint(link, force, moment), link.armature)
         for j in range(i, 0, -1):
-            force, moment = _to_parent(links[j], pose.rotation[j], force, moment)
-            matrix[i][j - 1] = matrix[j - 1][i] = dot(links[j - 1].axis, moment)
+            force, moment = _to_parent(pose.rotation[j], pose.offset[j], force, moment)
+            matrix[i][j - 1] = matrix[j - 1][i] = _along_joint(links[j - 1], force, moment)
         if i > 0:
             first_moment, inertia = _inertia_to_parent(
-                link, pose.rotation[i], mass, first_moment, inertia
+                pose.rotation[i], pose.offset[i], mass, first_moment, inertia
             )
     return matrix
 
@@ -154,11 +205,11 @@ def point_velocities(links: Sequence[Link], pose: Pose, point: Vec3) -> Iterator
     """Velocity of a point fixed to the last link, per unit velocity of each joint; all in the
     world."""
     for link, rotation, origin in zip(links, pose.world_rotation, pose.world_origin, strict=True):
-        arm = vsub(point, origin)
-        yield cross(matvec(rotation, link.axis), arm)
+        axis = matvec(rotation, link.axis)
+        yield axis if link.slides else cross(axis, vsub(point, origin))
 
 
-def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
+def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[Scalar]]:
     """Lower Cholesky factor of a symmetric positive definite matrix, and the reciprocals of its
     diagonal."""
     n = len(matrix)
@@ -168,7 +219,8 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
         pivot = matrix[j][j]
         for k in range(j):
             pivot = sub(pivot, mul(triangle[j][k], triangle[j][k]))
-        inverse_diagonal.append(jax.lax.rsqrt(pivot))
+        root = 1.0 / math.sqrt(pivot) if is_constant(pivot) else jax.lax.rsqrt(pivot)
+        inverse_diagonal.append(root)
         for i in range(j + 1, n):
             entry = matrix[i][j]
             for k in range(j):
@@ -177,7 +229,7 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[jax.Array]]:
     return triangle, inverse_diagonal
 
 
-def solve_lower(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
+def solve_lower(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-1 b for the factor L of `cholesky`."""
     triangle, inverse_diagonal = factor
     x: list[Scalar] = []
@@ -188,7 +240,7 @@ def solve_lower(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar
     return x
 
 
-def solve_upper(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar]) -> list[Scalar]:
+def solve_upper(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-T b for the factor L of `cholesky`."""
     triangle, inverse_diagonal = factor
     n = len(b)
@@ -201,22 +253,27 @@ def solve_upper(factor: tuple[SquareMatrix, list[jax.Array]], b: Sequence[Scalar
     return x
 
 
-def _to_parent(link: Link, rotation: Mat3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
+def _along_joint(link: Link, force: Vec3, moment: Vec3) -> Scalar:
+    """Joint force that a force and its moment about the link's origin exert."""
+    return dot(link.axis, force if link.slides else moment)
+
+
+def _to_parent(rotation: Mat3, offset: Vec3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
     """A force and its moment about the link's origin, transformed to the parent's frame and
     origin."""
     force = matvec(rotation, force)
-    return force, vadd(matvec(rotation, moment), cross(link.offset, force))
+    return force, vadd(matvec(rotation, moment), cross(offset, force))
 
 
 def _inertia_to_parent(
-    link: Link, rotation: Mat3, mass: Scalar, first_moment: Vec3, inertia: Mat3
+    rotation: Mat3, offset: Vec3, mass: Scalar, first_moment: Vec3, inertia: Mat3
 ) -> tuple[Vec3, Mat3]:
     """First moment and inertia of the composite body in the parent's frame, about the parent's
     origin (parallel-axis theorem with the offset p of the link's origin)."""
-    p = link.offset
+    p = offset
     h = matvec(rotation, first_moment)
     rotated = congruence(rotation, inertia)
-    diagonal = add(mul(2.0, dot(p, h)), mul(mass, sum(x * x for x in p)))
+    diagonal = add(mul(2.0, dot(p, h)), mul(mass, dot(p, p)))
 
     def entry(i: int, j: int) -> Scalar:
         off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mul(mul(mass, p[i]), p[j]))

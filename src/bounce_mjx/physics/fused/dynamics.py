@@ -24,8 +24,11 @@ from bounce_mjx.physics.fused.scalars import (
     dot,
     matmul,
     matvec,
+    mul,
+    quaternion_product,
     scale,
     stored,
+    sub,
     vadd,
 )
 from bounce_mjx.physics.parameters import PhysicsParameters
@@ -196,14 +199,17 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
     """One physics step: the equivalent of `mj_step`."""
     keep = stored if motion.turning is not None else lambda values: values
     pose = keep(chain.forward_kinematics(model.links, motion.q))
-    bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
+    arm_gravity = scale(model.gravity, model.weight)
+    bias = keep(chain.bias_force(model.links, pose, motion.v, arm_gravity))
     inertia = keep(chain.mass_matrix(model.links, pose))
+    floating = chain.floating_force(model.links, pose, model.gravity)
     applied, servo_damping = [], []
-    for link, servo, target, q, v, b in zip(
-        model.links, model.servos, targets, motion.q, motion.v, bias, strict=True
+    for link, servo, target, q, v, b, carried in zip(
+        model.links, model.servos, targets, motion.q, motion.v, bias, floating, strict=True
     ):
-        torque, derivative = servo_torque(servo, target, q, v)
-        applied.append(torque - link.damping * v - b)
+        force, derivative = servo_force(servo, target, q, v)
+        spring = mul(link.stiffness, sub(q, link.spring_position))
+        applied.append(joint_force(servo, force, carried) - link.damping * v - add(b, spring))
         servo_damping.append(derivative)
     contact_torque, ball_acceleration, spin_acceleration = contact_response(
         model, motion, pose, inertia, applied
@@ -219,17 +225,31 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
     )
 
 
-def servo_torque(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
-    """Torque (N m) of MuJoCo's affine actuator for the servo target (rad), and its derivative with
-    respect to the velocity; the derivative is 0 at the torque limit."""
+def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+    """Force of MuJoCo's affine actuator at its joint (N m, N) for the servo target, and the force's
+    derivative with respect to the velocity; the derivative is 0 at the force limit."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    torque = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
-    if servo.torque_range is None:
-        return torque, servo.damping
-    least, most = servo.torque_range
-    free = (torque > least) & (torque < most)
-    return jnp.clip(torque, least, most), jnp.where(free, servo.damping, 0.0)
+    gain, damping = servo.gain, servo.damping
+    if servo.gain_stiffness or servo.gain_damping:
+        gain = gain + servo.gain_stiffness * q + servo.gain_damping * v
+        damping = damping + servo.gain_damping * target
+    force = gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+    if servo.force_range is None:
+        return force, damping
+    least, most = servo.force_range
+    free = (force > least) & (force < most)
+    return jnp.clip(force, least, most), jnp.where(free, damping, 0.0)
+
+
+def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
+    """Force of the servo and of gravity compensation on the joint. The limit of the joint does not
+    change MuJoCo's derivative of the force."""
+    if servo.joint_range is None:
+        return add(force, carried)
+    if servo.carries_weight:
+        return jnp.clip(add(force, carried), *servo.joint_range)
+    return add(jnp.clip(force, *servo.joint_range), carried)
 
 
 def contact_response(
@@ -239,7 +259,7 @@ def contact_response(
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
 ) -> tuple[list[Scalar], Vec3, Vec3 | None]:
-    """Joint torques (N m) from the contact, total acceleration of the ball (m/s^2) and angular
+    """Joint forces from the contact, total acceleration of the ball (m/s^2) and angular
     acceleration of the ball (rad/s^2, world); the last is None without friction."""
     contact = sphere_box(
         model.contact,
@@ -247,7 +267,8 @@ def contact_response(
         _paddle_origin(model, pose),
         matmul(pose.world_rotation[-1], model.paddle_rotation),
     )
-    ball_free = vadd(model.gravity, scale(model.ball_force, 1.0 / model.ball_mass))
+    ball_gravity = scale(model.gravity, model.ball_weight)
+    ball_free = vadd(ball_gravity, scale(model.ball_force, 1.0 / model.ball_mass))
     if motion.turning is not None:
         factor = stored(chain.cholesky(inertia))
         response = friction.contact_response(
@@ -294,12 +315,16 @@ def integrate(
     ball_acceleration: Vec3,
     spin_acceleration: Vec3 | None,
 ) -> Motion:
-    """MuJoCo's implicitfast integrator: semi-implicit Euler, implicit in the velocity-dependent
-    torques of servos and joint damping (documentation, "Computation", numerical integration)."""
+    """MuJoCo's integrators implicitfast and Euler: semi-implicit Euler, implicit in the
+    velocity-dependent forces of joint damping and, with implicitfast, of servos (documentation,
+    "Computation", numerical integration)."""
     dt = model.dt
     implicit = [list(row) for row in inertia]
     for i, (link, derivative) in enumerate(zip(model.links, servo_damping, strict=True)):
-        implicit[i][i] = add(implicit[i][i], dt * (link.damping - derivative))
+        damping = link.damping if model.implicit_damping else 0.0
+        if model.implicit_servos:
+            damping = damping - derivative
+        implicit[i][i] = add(implicit[i][i], dt * damping)
     factor = chain.cholesky(implicit)
     if motion.turning is not None:
         factor = stored(factor)
@@ -319,20 +344,14 @@ def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[S
     product of MuJoCo's mju_quatIntegrate."""
     w, x, y, z = quaternion
     inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = (c * inverse_norm for c in quaternion)
+    unit = tuple(c * inverse_norm for c in quaternion)
     squared_speed = dot(spin, spin)
     still = squared_speed == 0.0
     speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
     half_angle = 0.5 * duration * speed
     sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
-    c = jnp.where(still, 1.0, jnp.cos(half_angle))
-    a, b, d = scale(spin, sine)
-    return (
-        w * c - x * a - y * b - z * d,
-        w * a + x * c + y * d - z * b,
-        w * b - x * d + y * c + z * a,
-        w * d + x * b - y * a + z * c,
-    )
+    cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
+    return quaternion_product(unit, (cosine, *scale(spin, sine)))
 
 
 def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:

@@ -24,6 +24,7 @@ from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import Contact, ContactModel, impedance, softness
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.scalars import (
+    Quaternion,
     Scalar,
     Vec3,
     add,
@@ -32,6 +33,7 @@ from bounce_mjx.physics.fused.scalars import (
     matvec,
     mul,
     quaternion_matrix,
+    quaternion_product,
     scale,
     sine_cosine,
     stored,
@@ -39,8 +41,6 @@ from bounce_mjx.physics.fused.scalars import (
     vadd,
     vsub,
 )
-
-Quaternion = tuple[Scalar, Scalar, Scalar, Scalar]
 
 # Newton iterations for the slip direction, and the longest step (rad). In the states of
 # test_friction.py two iterations reach rounding error with the shipped ball, and four with a ball
@@ -370,14 +370,5 @@ def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
     still = squared < _tiny(squared)
     inverse_speed = lax.rsqrt(jnp.where(still, 1.0, squared))
     sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
-    a, b, c = scale(spin, sine * inverse_speed)
-    w, x, y, z = turning.orientation
-    return Turning(
-        spin,
-        (
-            cosine * w - a * x - b * y - c * z,
-            cosine * x + a * w + b * z - c * y,
-            cosine * y + b * w + c * x - a * z,
-            cosine * z + c * w + a * y - b * x,
-        ),
-    )
+    rotation = (cosine, *scale(spin, sine * inverse_speed))
+    return Turning(spin, quaternion_product(rotation, turning.orientation))

@@ -1,6 +1,8 @@
 """Model of the fused engine: constants of a compiled MJCF, and parameters of one environment."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -9,14 +11,18 @@ import numpy as np
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.fused.scalars import (
+    IDENTITY3,
     ZERO3,
     Mat3,
     Scalar,
     Vec3,
+    matmul,
+    matvec,
     mul,
     neg,
     quaternion_matrix,
     scale,
+    vadd,
 )
 from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
@@ -26,18 +32,36 @@ from bounce_mjx.robot.model import Addresses, find_addresses
 _MIN_VALUE = 1e-15
 
 
+class Frame(NamedTuple):
+    """Position (m) and orientation of a body in the frame of its link."""
+
+    origin: Vec3 = ZERO3
+    rotation: Mat3 = IDENTITY3
+
+
 @dataclasses.dataclass(frozen=True)
 class Servo:
-    """A position servo: torque = gain * ctrl + bias + stiffness * angle + damping * velocity."""
+    """An affine servo. On a joint with position q and velocity v it exerts, in N m or N,
+
+    (gain + gain_stiffness * q + gain_damping * v) * ctrl
+    + bias + stiffness * q + damping * v
+    """
 
     gain: Scalar
     bias: float
     stiffness: Scalar
     damping: Scalar
     gear: float
-    """Length of the actuator per joint angle."""
+    """Length of the actuator per joint position."""
     ctrl_range: tuple[float, float] | None
-    torque_range: tuple[Scalar, Scalar] | None = None
+    force_range: tuple[Scalar, Scalar] | None = None
+    """Range of the servo's force at the joint (`forcerange`)."""
+    gain_stiffness: float = 0.0
+    gain_damping: float = 0.0
+    joint_range: tuple[float, float] | None = None
+    """Range of all forces of actuators at the joint (`actuatorfrcrange`)."""
+    carries_weight: bool = False
+    """Whether the gravity compensation counts as a force of an actuator (`actuatorgravcomp`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +81,8 @@ class FusedModel:
     """Centre of the paddle in the frame of the last link."""
     paddle_rotation: Mat3
     """Orientation of the paddle in the frame of the last link."""
+    paddle_body: Frame
+    """The paddle's body in the frame of the last link."""
     ball_mass: Scalar
     ball_inertia: Scalar
     """Inertia of the homogeneous ball about any axis through its centre, kg m^2."""
@@ -64,6 +90,14 @@ class FusedModel:
     addresses: Addresses
     nq: int
     nv: int
+    weight: float = 1.0
+    """Share of the links' weight that acts on the arm."""
+    ball_weight: float = 1.0
+    """Share of the ball's weight that acts on it."""
+    implicit_servos: bool = True
+    """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
+    implicit_damping: bool = True
+    """Whether the integrator is implicit in the joints' damping."""
     ball_force: Vec3 = ZERO3
     """External force on the ball, N."""
 
@@ -77,19 +111,36 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
     """
     addresses = find_addresses(mj_model)
     check_supported(mj_model, addresses)
+    m = mj_model
+    links, frames = _read_links(m, addresses)
+    compensated = _compensated_share(m, addresses)
+    if compensated is not None:
+        links = [dataclasses.replace(x, floating_mass=0.0, floating_moment=ZERO3) for x in links]
+    paddle_body = frames[int(m.geom_bodyid[addresses.paddle_geom])]
+    paddle = _geom_frame(m, addresses.paddle_geom)
+    implicit = m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    explicit_damping = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     return FusedModel(
-        dt=float(mj_model.opt.timestep),
-        gravity=_floats(mj_model.opt.gravity),
-        links=tuple(_read_link(mj_model, joint) for joint in addresses.arm_joints),
-        servos=tuple(_read_servo(mj_model, actuator) for actuator in addresses.actuators),
-        paddle_origin=_floats(mj_model.geom_pos[addresses.paddle_geom]),
-        paddle_rotation=_rotation(mj_model.geom_quat[addresses.paddle_geom]),
-        ball_mass=float(mj_model.body_mass[addresses.ball_body]),
-        ball_inertia=float(mj_model.body_inertia[addresses.ball_body, 0]),
-        contact=_read_contact(mj_model, addresses),
+        dt=float(m.opt.timestep),
+        gravity=_floats(m.opt.gravity),
+        links=tuple(links),
+        servos=tuple(
+            _read_servo(m, actuator, joint)
+            for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
+        ),
+        paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle.origin)),
+        paddle_rotation=_exact(matmul(paddle_body.rotation, paddle.rotation)),
+        paddle_body=paddle_body,
+        ball_mass=float(m.body_mass[addresses.ball_body]),
+        ball_inertia=float(m.body_inertia[addresses.ball_body, 0]),
+        contact=_read_contact(m, addresses),
         addresses=addresses,
-        nq=mj_model.nq,
-        nv=mj_model.nv,
+        nq=m.nq,
+        nv=m.nv,
+        weight=1.0 - (compensated or 0.0),
+        ball_weight=1.0 - float(m.body_gravcomp[addresses.ball_body]),
+        implicit_servos=implicit,
+        implicit_damping=implicit or not explicit_damping,
     )
 
 
@@ -132,14 +183,18 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
         p.force_limit or none,
         strict=True,
     )
-    rotation = p.paddle_rotation
+    body, origin, rotation = model.paddle_body, p.paddle_position, p.paddle_rotation
     return dataclasses.replace(
         model,
         gravity=_given(p.gravity, model.gravity),
         links=tuple(_link_in_world(*link) for link in links),
         servos=tuple(_servo_in_world(*servo) for servo in servos),
-        paddle_origin=_given(p.paddle_position, model.paddle_origin),
-        paddle_rotation=model.paddle_rotation if rotation is None else quaternion_matrix(rotation),
+        paddle_origin=model.paddle_origin
+        if origin is None
+        else vadd(body.origin, matvec(body.rotation, origin)),
+        paddle_rotation=model.paddle_rotation
+        if rotation is None
+        else matmul(body.rotation, quaternion_matrix(rotation)),
         ball_mass=_given(p.ball_mass, model.ball_mass),
         ball_inertia=ball_inertia,
         contact=contact,
@@ -149,13 +204,16 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
 def _link_in_world(
     link: chain.Link, mass: Scalar | None, armature: Scalar | None, damping: Scalar | None
 ) -> chain.Link:
-    if mass is not None:
+    # A body with several joints is the link of the last one; the others have no mass.
+    if mass is not None and link.mass != 0.0:
         ratio = mul(mass, 1.0 / link.mass)
         link = dataclasses.replace(
             link,
             mass=mass,
             first_moment=scale(link.first_moment, ratio),
             inertia=tuple(scale(row, ratio) for row in link.inertia),
+            floating_mass=mul(link.floating_mass, ratio),
+            floating_moment=scale(link.floating_moment, ratio),
         )
     return dataclasses.replace(
         link, armature=_given(armature, link.armature), damping=_given(damping, link.damping)
@@ -172,7 +230,7 @@ def _servo_in_world(
         servo = dataclasses.replace(servo, damping=mul(damping, -(servo.gear**2)))
     if force_limit is not None:
         limit = mul(force_limit, abs(servo.gear))
-        servo = dataclasses.replace(servo, torque_range=(neg(limit), limit))
+        servo = dataclasses.replace(servo, force_range=(neg(limit), limit))
     return servo
 
 
@@ -185,49 +243,151 @@ def _floats(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _rotation(quaternion: np.ndarray) -> Mat3:
-    """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
+    """Rotation matrix of a unit quaternion [w, x, y, z]."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
+    return _exact(matrix.reshape(3, 3))
+
+
+def _exact(rotation: Sequence[Sequence[float]]) -> Mat3:
+    """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
+    matrix = np.asarray(rotation)
     nearest = np.round(matrix)
-    matrix = np.where(np.abs(matrix - nearest) < 1e-12, nearest, matrix).reshape(3, 3)
+    matrix = np.where(np.abs(matrix - nearest) < 1e-12, nearest, matrix)
     return tuple(_floats(row) for row in matrix)
 
 
-def _read_link(mj_model: mujoco.MjModel, joint: int) -> chain.Link:
-    body = mj_model.jnt_bodyid[joint]
-    dof = mj_model.jnt_dofadr[joint]
-    mass = float(mj_model.body_mass[body])
-    centre = mj_model.body_ipos[body]
-    principal = np.array(_rotation(mj_model.body_iquat[body]))
-    about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
-    about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+def _read_links(
+    mj_model: mujoco.MjModel, addresses: Addresses
+) -> tuple[list[chain.Link], dict[int, Frame]]:
+    """Links of the chain, and the frame of each body in its link; bodies that do not move are in
+    the frame of the world. Welded bodies belong to the link of the last joint above them."""
+    m = mj_model
+    links: list[chain.Link] = []
+    frames, link_of = {0: Frame()}, {0: -1}
+    for body in range(1, m.nbody):  # parents come before their children
+        if m.body_weldid[body] == addresses.ball_body:
+            continue
+        parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
+        origin = vadd(parent.origin, matvec(parent.rotation, _floats(m.body_pos[body])))
+        rotation = _exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
+        frame = Frame(origin, rotation)
+        for joint in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
+            slides = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+            anchor = ZERO3 if slides else _floats(m.jnt_pos[joint])
+            origin = vadd(frame.origin, matvec(frame.rotation, anchor))
+            link_of[body] = len(links)
+            links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
+            frame = Frame(scale(anchor, -1.0))
+        frames[body] = frame
+        if link_of[body] >= 0:
+            links[link_of[body]] = _with_body(m, links[link_of[body]], body, frame)
+    return links, frames
+
+
+def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Link:
+    """Link without mass behind a joint, whose frame is given in the parent link."""
+    m = mj_model
+    dof, at = m.jnt_dofadr[joint], m.jnt_qposadr[joint]
+    springs = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
     return chain.Link(
-        offset=_floats(mj_model.body_pos[body]),
-        rotation=_rotation(mj_model.body_quat[body]),
-        axis=_floats(mj_model.jnt_axis[joint]),
-        zero_angle=float(mj_model.qpos0[mj_model.jnt_qposadr[joint]]),
-        mass=mass,
-        first_moment=_floats(mass * centre),
-        inertia=tuple(_floats(row) for row in about_origin),
-        armature=float(mj_model.dof_armature[dof]),
-        damping=float(mj_model.dof_damping[dof]),
+        offset=frame.origin,
+        rotation=frame.rotation,
+        axis=_floats(m.jnt_axis[joint]),
+        slides=bool(m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
+        zero_position=float(m.qpos0[at]),
+        mass=0.0,
+        first_moment=ZERO3,
+        inertia=(ZERO3,) * 3,
+        armature=float(m.dof_armature[dof]),
+        damping=float(m.dof_damping[dof]),
+        stiffness=float(m.jnt_stiffness[joint]) if springs else 0.0,
+        spring_position=float(m.qpos_spring[at]),
     )
 
 
-def _read_servo(mj_model: mujoco.MjModel, actuator: int) -> Servo:
-    gear = float(mj_model.actuator_gear[actuator, 0])
-    bias, stiffness, damping = (float(b) for b in mj_model.actuator_biasprm[actuator, :3])
-    limited = bool(mj_model.actuator_ctrllimited[actuator])
-    force_limited = bool(mj_model.actuator_forcelimited[actuator])
-    torques = np.sort(gear * mj_model.actuator_forcerange[actuator])
+def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
+    """Link with the mass of one more body, whose frame is given in the link."""
+    mass = float(mj_model.body_mass[body])
+    inertial = _inertial_frame(mj_model, body)
+    rotation = np.array(frame.rotation)
+    centre = np.array(frame.origin) + rotation @ np.array(inertial.origin)
+    principal = rotation @ np.array(inertial.rotation)
+    about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
+    about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    floating = float(mj_model.body_gravcomp[body])
+    return dataclasses.replace(
+        link,
+        mass=link.mass + mass,
+        first_moment=_floats(link.first_moment + mass * centre),
+        inertia=tuple(_floats(row) for row in link.inertia + about_origin),
+        floating_mass=link.floating_mass + floating * mass,
+        floating_moment=_floats(link.floating_moment + floating * mass * centre),
+    )
+
+
+def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
+    """Inertial frame of a body in the body's frame. Where the two are almost the same, MuJoCo flags
+    the body and computes as if they were the same."""
+    same = mj_model.body_sameframe[body]
+    frame = Frame(_floats(mj_model.body_ipos[body]), _rotation(mj_model.body_iquat[body]))
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
+        return Frame()
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
+        return Frame(frame.origin)
+    return frame
+
+
+def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
+    """Frame of a geom in its body's frame, with the same flags as for inertial frames."""
+    same = mj_model.geom_sameframe[geom]
+    origin, rotation = _floats(mj_model.geom_pos[geom]), _rotation(mj_model.geom_quat[geom])
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
+        return Frame()
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
+        return Frame(origin)
+    inertial = _inertial_frame(mj_model, int(mj_model.geom_bodyid[geom]))
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA:
+        return inertial
+    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT:
+        return Frame(origin, inertial.rotation)
+    return Frame(origin, rotation)
+
+
+def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float | None:
+    """Share of the arm's weight that gravity compensation carries; None if it differs between
+    bodies or counts for a joint's `actuatorfrcrange`. A common share costs no operation."""
+    m = mj_model
+    joints = list(addresses.arm_joints)
+    counts = m.jnt_actgravcomp[joints].astype(bool) & m.jnt_actfrclimited[joints].astype(bool)
+    moving = np.isin(m.body_weldid, m.jnt_bodyid[joints])
+    shares = np.unique(m.body_gravcomp[moving & (m.body_mass > 0.0)])
+    return float(shares[0]) if len(shares) == 1 and not (np.any(counts) and shares[0]) else None
+
+
+def _read_servo(mj_model: mujoco.MjModel, actuator: int, joint: int) -> Servo:
+    m = mj_model
+    gear = float(m.actuator_gear[actuator, 0])
+    gain, gain_stiffness, gain_damping = (float(g) for g in m.actuator_gainprm[actuator, :3])
+    if m.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED:
+        gain_stiffness = gain_damping = 0.0
+    bias, stiffness, damping = (float(b) for b in m.actuator_biasprm[actuator, :3])
+    limited = bool(m.actuator_ctrllimited[actuator])
+    force_limited = bool(m.actuator_forcelimited[actuator])
+    joint_limited = bool(m.jnt_actfrclimited[joint])
+    forces = np.sort(gear * m.actuator_forcerange[actuator])
     return Servo(
-        gain=gear * float(mj_model.actuator_gainprm[actuator, 0]),
+        gain=gear * gain,
         bias=gear * bias,
         stiffness=gear**2 * stiffness,
         damping=gear**2 * damping,
         gear=gear,
-        ctrl_range=_floats(mj_model.actuator_ctrlrange[actuator]) if limited else None,
-        torque_range=_floats(torques) if force_limited else None,
+        ctrl_range=_floats(m.actuator_ctrlrange[actuator]) if limited else None,
+        force_range=_floats(forces) if force_limited else None,
+        gain_stiffness=gear**2 * gain_stiffness,
+        gain_damping=gear**2 * gain_damping,
+        joint_range=_floats(m.jnt_actfrcrange[joint]) if joint_limited else None,
+        carries_weight=bool(m.jnt_actgravcomp[joint]),
     )
 
 

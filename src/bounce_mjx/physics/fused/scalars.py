@@ -17,6 +17,7 @@ Scalar = float | jax.Array
 Tree = Any
 Vec3 = tuple[Scalar, Scalar, Scalar]
 Mat3 = tuple[Vec3, Vec3, Vec3]
+Quaternion = tuple[Scalar, Scalar, Scalar, Scalar]
 
 ZERO3: Vec3 = (0.0, 0.0, 0.0)
 IDENTITY3: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -136,7 +137,19 @@ def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) ->
     )
 
 
-def quaternion_matrix(quaternion: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat3:
+def quaternion_product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Product of two quaternions [w, x, y, z]: the rotation q, then the rotation p."""
+    w, x, y, z = p
+    a, b, c, d = q
+    return (
+        sub(sub(sub(mul(w, a), mul(x, b)), mul(y, c)), mul(z, d)),
+        sub(add(add(mul(w, b), mul(x, a)), mul(y, d)), mul(z, c)),
+        add(add(sub(mul(w, c), mul(x, d)), mul(y, a)), mul(z, b)),
+        add(sub(add(mul(w, d), mul(x, c)), mul(y, b)), mul(z, a)),
+    )
+
+
+def quaternion_matrix(quaternion: Quaternion) -> Mat3:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     w, x, y, z = quaternion
 

@@ -36,7 +36,8 @@ def _require(condition: bool, feature: str) -> None:
         raise UnsupportedModelError(feature)
 
 
-# MJCF flags without effect on the models that the fused engine supports.
+_INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER)
+# MJCF flags that `read_model` obeys, or without effect on the supported models.
 _HARMLESS_DISABLED = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
     "autoreset nativeccd island multiccd".split()
@@ -49,8 +50,8 @@ _MIN_WIDTH = 1e-15
 def _check_options(m: mujoco.MjModel) -> None:
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
     _require(
-        integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-        f"the integrator {integrator.name} (only implicitfast)",
+        integrator in _INTEGRATORS,
+        f"the integrator {integrator.name} (only implicitfast and Euler)",
     )
     disabled = _flags(m.opt.disableflags, mujoco.mjtDisableBit) - _HARMLESS_DISABLED
     _require(not disabled, f"disabled parts of the engine ({', '.join(sorted(disabled))})")
@@ -75,30 +76,33 @@ def _flags(bits: int, kind: type) -> set[str]:
 def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     bodies = [int(m.jnt_bodyid[joint]) for joint in addresses.arm_joints]
     _require(
-        m.njnt == len(addresses.arm_joints) + 1, "joints other than Joint1..Joint6 and the ball's"
+        m.njnt == len(addresses.arm_joints) + 1, "joints other than the acting ones and the ball's"
     )
-    _require(m.nbody == len(bodies) + 2, "bodies other than the six links and the ball")
-    hinge = mujoco.mjtJoint.mjJNT_HINGE
+    hinge_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     _require(
-        all(m.jnt_type[j] == hinge for j in addresses.arm_joints), "arm joints that are not hinges"
+        all(int(m.jnt_type[j]) in hinge_or_slide for j in addresses.arm_joints),
+        "arm joints that are neither hinges nor slides",
+    )
+    parents = [m.body_weldid[m.body_parentid[body]] for body in bodies]
+    _require(
+        all(
+            body == before or parent == before
+            for before, body, parent in zip([0, *bodies[:-1]], bodies, parents, strict=True)
+        ),
+        "an arm that is not one serial chain",
+    )
+    _require(not np.any(m.body_mocapid >= 0), "bodies moved from outside (mocap)")
+    _require(
+        np.sum(m.body_weldid == addresses.ball_body) == 1, "bodies that are attached to the ball"
     )
     _require(
-        not np.any(m.jnt_pos[addresses.arm_joints,]), "a joint away from its body's origin (pos)"
-    )
-    parents = [0, *bodies[:-1]]
-    _require(
-        all(m.body_parentid[b] == p for b, p in zip(bodies, parents, strict=True)),
-        "an arm that is not one serial chain of Joint1..Joint6",
-    )
-    _require(
-        m.geom_bodyid[addresses.paddle_geom] == bodies[-1], "a paddle that is not on the last link"
+        m.body_weldid[m.geom_bodyid[addresses.paddle_geom]] == bodies[-1],
+        "a paddle that is not behind the last joint",
     )
     box = mujoco.mjtGeom.mjGEOM_BOX
     _require(m.geom_type[addresses.paddle_geom] == box, "a paddle that is not a box")
-    _require(not np.any(m.body_gravcomp), "gravity compensation (gravcomp)")
     nonlinear = np.any(m.jnt_stiffnesspoly)
     _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
-    _require(not np.any(m.jnt_stiffness), "joint springs (stiffness)")
     _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
     _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
@@ -110,8 +114,9 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
         and not np.any(m.geom_pos[addresses.ball_geom])
         and not np.any(m.dof_damping.reshape(m.nv, -1)[addresses.ball_qvel,])
         and not np.any(m.dof_armature[addresses.ball_qvel,])
+        and not m.jnt_stiffness[m.body_jntadr[addresses.ball_body]]
     )
-    _require(plain_ball, "a ball that is not one undamped homogeneous sphere")
+    _require(plain_ball, "a ball that is not one free homogeneous sphere")
 
 
 def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
@@ -138,14 +143,14 @@ def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
 
 def _check_actuators(m: mujoco.MjModel) -> None:
     _require(m.nu == m.njnt - 1, "actuators other than one position servo on each joint")
-    plain = (
+    affine_gain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+    servos = (
         np.all(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
-        and np.all(m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+        and all(int(gain) in affine_gain for gain in m.actuator_gaintype)
         and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     )
-    _require(bool(plain), "actuators that are not position servos")
-    _require(not np.any(m.jnt_actfrclimited), "force limits of joints (actuatorfrcrange)")
+    _require(bool(servos), "actuators that are not position servos")
     _require(not np.any(m.actuator_delay), "delayed actuators (delay)")
     rotor = (m.actuator_damping, m.actuator_dampingpoly, m.actuator_armature)
     _require(not any(map(np.any, rotor)), "damping or armature given to an actuator")

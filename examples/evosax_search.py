@@ -1,0 +1,41 @@
+"""Evolution of a linear policy with Evosax: 1,024 candidates, each in an environment of its own.
+
+`python examples/evosax_search.py` needs `pip install evosax`.
+"""
+
+import jax
+import jax.numpy as jnp
+from evosax.algorithms import Open_ES
+
+from bounce_mjx import BounceBall
+
+
+def main(population: int = 1024, generations: int = 200, steps: int = 200) -> list[float]:
+    """The best return of each generation."""
+    env = BounceBall()
+    zeros = jnp.zeros((env.action_size, env.observation_size + 1))
+    search = Open_ES(population_size=population, solution=zeros)
+
+    def episode_return(weights: jax.Array, key: jax.Array) -> jax.Array:
+        def act(state, _):
+            state = env.step(state, jnp.tanh(weights @ jnp.append(state.obs, 1.0)))
+            alive = state.info["alive"] * (1.0 - state.done)
+            return state.replace(info={"alive": alive}), alive * state.reward
+
+        state = env.reset(key).replace(info={"alive": jnp.ones(())})
+        return jax.lax.scan(act, state, length=steps)[1].sum()
+
+    def generation(state, key: jax.Array):
+        ask, reset, tell = jax.random.split(key, 3)
+        weights, state = search.ask(ask, state, search.default_params)
+        returns = jax.vmap(episode_return)(weights, jax.random.split(reset, population))
+        state, _ = search.tell(tell, weights, -returns, state, search.default_params)
+        return state, returns.max()
+
+    state = search.init(jax.random.key(0), zeros, search.default_params)
+    keys = jax.random.split(jax.random.key(1), generations)
+    return jax.jit(lambda: jax.lax.scan(generation, state, keys)[1])().tolist()
+
+
+if __name__ == "__main__":
+    print(main())

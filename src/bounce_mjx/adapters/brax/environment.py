@@ -1,0 +1,172 @@
+"""The environment for brax, with this project's physics."""
+
+import copy
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import brax.base
+import brax.envs
+import jax
+import mujoco
+import numpy as np
+from brax.io import image, mjcf
+from flax import struct
+
+from bounce_mjx.adapters.opengl import choose_opengl
+from bounce_mjx.adapters.randomization import parameters_of
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall, BounceState
+from bounce_mjx.task.state import State
+
+ENV_NAME = "bounce_ball"
+
+
+class _Model:
+    """A model as a static field of a state; equal only to itself."""
+
+    def __init__(self, mj_model: mujoco.MjModel):
+        self.mj_model = mj_model
+
+
+@struct.dataclass
+class PipelineState:
+    """The state of the physics and the task, with the names of brax's `base.State`."""
+
+    task: BounceState
+    """Everything that the next step depends on."""
+    model: _Model = struct.field(pytree_node=False)
+
+    @property
+    def q(self) -> jax.Array:
+        """Positions [nq]."""
+        return self.task.physics.qpos
+
+    @property
+    def qd(self) -> jax.Array:
+        """Velocities [nv]."""
+        return self.task.physics.qvel
+
+    @property
+    def x(self) -> brax.base.Transform:
+        """Positions [bodies, 3] and quaternions [bodies, 4] of the links in the world.
+
+        Raises:
+          UserError: the state has a batch axis.
+        """
+        if self.q.ndim != 1:
+            raise UserError(
+                f"the positions q have the shape {self.q.shape}, but the links of one environment "
+                "are computed at a time; take one with jax.tree.map(lambda x: x[0], state)"
+            )
+        data = mujoco.MjData(self.model.mj_model)
+        data.qpos[:] = np.asarray(self.q)
+        mujoco.mj_kinematics(self.model.mj_model, data)
+        return brax.base.Transform(pos=data.xpos[1:].copy(), rot=data.xquat[1:].copy())
+
+
+class BraxBounceBall(brax.envs.Env):
+    """One environment with brax's interface; `task` is the `BounceBall` in it."""
+
+    def __init__(self, config: EnvConfig | None = None, **settings: Any):
+        """Makes the environment.
+
+        Args:
+          config: all settings; None for the defaults.
+          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8), which replace
+            fields of `config`.
+
+        Raises:
+          UserError: a setting is wrong.
+        """
+        given = {} if config is None else config.model_dump()
+        self.task = BounceBall(validate(EnvConfig, given | settings, ENV_NAME))
+        self._model = _Model(self.task.mj_model)
+        self._base: brax.base.System | None = None
+        self._sys: brax.base.System | None = None
+
+    @property
+    def sys(self) -> brax.base.System:
+        """brax's system of the model. The fields of another system, such as `randomization_fn`
+        gives, act from the next reset (`adapters/randomization.py`)."""
+        if self._sys is None:
+            with warnings.catch_warnings():
+                # brax warns that it is no longer maintained.
+                warnings.simplefilter("ignore")
+                self._base = self._sys = mjcf.load_model(_drawable(self.task.mj_model))
+        return self._sys
+
+    @sys.setter
+    def sys(self, system: brax.base.System) -> None:
+        assert self.sys is not None  # the base to compare with
+        self._sys = system
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts an episode; consumes the key `rng`."""
+        task = self.task
+        if self._sys is not self._base:
+            parameters = parameters_of(self._base.mj_model, self._base, self._sys)
+            if parameters != MODEL_PARAMETERS:
+                task = BounceBall(task.config, randomize=lambda key: parameters)
+        return self._to_brax(task.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one control step under the action [action_size]."""
+        plain = state.replace(pipeline_state=state.pipeline_state.task)
+        return self._to_brax(self.task.step(plain, action))
+
+    def _to_brax(self, state: State) -> State:
+        return state.replace(pipeline_state=PipelineState(state.pipeline_state, self._model))
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return self.task.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+        return self.task.action_size
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics engine."""
+        return self.task.backend
+
+    @property
+    def dt(self) -> float:
+        """Time of one control step, s."""
+        return self.task.dt
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The model."""
+        return self.task.mj_model
+
+    def render(
+        self,
+        trajectory: list[PipelineState] | PipelineState,
+        height: int = 240,
+        width: int = 320,
+        camera: str | None = None,
+    ) -> Sequence[np.ndarray] | np.ndarray:
+        """Pictures [height, width, 3] of pipeline states.
+
+        Raises:
+          UserError: no OpenGL library works here.
+        """
+        choose_opengl()
+        return image.render_array(self.sys, trajectory, height, width, camera)
+
+
+def _drawable(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy with shapes that brax's viewer has: it has no ellipsoids, so they become spheres of
+    the same volume."""
+    model = copy.copy(mj_model)
+    ellipsoids = model.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    model.geom_size[ellipsoids, 0] = np.cbrt(model.geom_size[ellipsoids].prod(axis=1))
+    model.geom_type[ellipsoids] = mujoco.mjtGeom.mjGEOM_SPHERE
+    return model

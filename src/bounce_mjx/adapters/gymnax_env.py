@@ -1,0 +1,141 @@
+"""The environment with the interface of gymnax, which PureJaxRL also uses; gymnax is not needed.
+
+The functions are pure and take one environment: apply `jax.vmap` to batch them.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx.config.validation import validate
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.state import State
+
+
+class EnvParams(NamedTuple):
+    """Parameters of the environment."""
+
+    max_steps_in_episode: int | jax.Array
+    """Time limit in control steps."""
+
+
+class EnvState(NamedTuple):
+    """State of one environment."""
+
+    env: State
+    time: jax.Array
+    """Control steps since the reset [], int32."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """Arrays of one shape with entries from `low` to `high`."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: Any = jnp.float32
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """A uniform draw of a bounded box."""
+        return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+
+
+class GymnaxBounceBall:
+    """One environment in the form of gymnax 1.x; an ended episode is reset within the step."""
+
+    def __init__(self, **settings: Any):
+        """Makes the environment.
+
+        Args:
+          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+
+        Raises:
+          UserError: a setting is wrong.
+        """
+        self.task = BounceBall(validate(EnvConfig, settings, self.name))
+
+    @property
+    def name(self) -> str:
+        """Name of the environment."""
+        return "BounceBall"
+
+    @property
+    def default_params(self) -> EnvParams:
+        """The time limit of the settings."""
+        return EnvParams(self.task.config.episode_steps)
+
+    @property
+    def num_actions(self) -> int:
+        """Length of the action vector."""
+        return self.task.action_size
+
+    def action_space(self, params: EnvParams | None = None) -> Box:
+        """The space of the actions."""
+        return Box(-1.0, 1.0, (self.task.action_size,))
+
+    def observation_space(self, params: EnvParams | None = None) -> Box:
+        """The space of the observations, which has no limits."""
+        return Box(-jnp.inf, jnp.inf, (self.task.observation_size,))
+
+    def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, EnvState]:
+        """Starts an episode; consumes the key.
+
+        Returns:
+          The observation [N] and the state.
+        """
+        state = self.task.reset(key)
+        return state.obs, EnvState(state, jnp.zeros((), jnp.int32))
+
+    def step(
+        self,
+        key: jax.Array,
+        state: EnvState,
+        action: jax.Array,
+        params: EnvParams | None = None,
+    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
+        """Advances one control step; consumes the key, for the reset of an ended episode.
+
+        Args:
+          action: [A].
+
+        Returns:
+          The observation [N] for the next action, the state, the reward [], whether the task ended
+          the episode [], whether only the time limit ended it [], and an info: the metrics of the
+          step and the `final_observation` [N] before any reset.
+        """
+        limit = (params or self.default_params).max_steps_in_episode
+        stepped = self.task.step(state.env, action)
+        time = state.time + 1
+        terminated = stepped.done > 0
+        truncated = (time >= limit) & ~terminated
+        _, fresh = self.reset(key)
+        next_state = jax.tree.map(
+            lambda new, old: jnp.where(terminated | truncated, new, old),
+            fresh,
+            EnvState(stepped, time),
+        )
+        info = stepped.metrics | {"final_observation": stepped.obs}
+        return next_state.env.obs, next_state, stepped.reward, terminated, truncated, info
+
+
+class PureJaxRLBounceBall(GymnaxBounceBall):
+    """The same in the form of gymnax before 1.0, for which PureJaxRL is written."""
+
+    def step(
+        self,
+        key: jax.Array,
+        state: EnvState,
+        action: jax.Array,
+        params: EnvParams | None = None,
+    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, dict[str, Any]]:
+        """As in `GymnaxBounceBall`, but with one `done` [] for both ends; the info also holds
+        `terminated` and `truncated`."""
+        observation, state, reward, terminated, truncated, info = super().step(
+            key, state, action, params
+        )
+        info |= {"terminated": terminated, "truncated": truncated}
+        return observation, state, reward, terminated | truncated, info

@@ -1,0 +1,355 @@
+"""The domain randomisation of brax and MuJoCo Playground on this project's physics.
+
+Their `randomization_fn` returns a MuJoCo model with a batch axis in some fields. Here these fields
+become `PhysicsParameters`, and a field that no parameter expresses is refused by its name.
+
+| field                                  | parameter                                               |
+|----------------------------------------|---------------------------------------------------------|
+| `body_mass`                            | masses of the ball and the links, with their inertia    |
+| `geom_size`                            | radius of the ball, with its inertia                    |
+| `geom_friction`, `pair_friction`       | sliding friction of ball and paddle (`condim="3"`)      |
+| `geom_solref`, `pair_solref`           | stiffness and damping of the contact                    |
+| `geom_pos`, `geom_quat`                | pose of the paddle on the last link                     |
+| `actuator_gainprm`, `actuator_biasprm` | `kp` and `kv` of the servos                             |
+| `actuator_forcerange`                  | force limits of the servos                              |
+| `dof_armature`, `dof_damping`, `dof_frictionloss` | the same, of the arm's joints                |
+| `opt.gravity`                          | gravity                                                 |
+
+The fields of the two geoms act on the contact pair as if the pair had been made of these geoms.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics.parameters import PhysicsParameters, contact_pair, edited_fields
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.task.randomization import RandomizationConfig, draw_world, physics_parameters
+
+Fields = dict[str, Any]
+"""Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
+
+DEFAULT = RandomizationConfig(
+    restitution=(0.75, 0.95),
+    ball_mass=(0.7, 1.3),
+    ball_radius=(0.9, 1.1),
+    servo_gain=(0.8, 1.2),
+    gravity_tilt=(-0.035, 0.035),
+)
+"""The terms of `configs/robust.yaml` that change the model."""
+
+
+def domain_randomize(
+    mj_model: mujoco.MjModel,
+    model: Any,
+    rng: jax.Array,
+    config: RandomizationConfig = DEFAULT,
+) -> tuple[Any, Any]:
+    """A `randomization_fn` of brax and Playground that draws terms of `env.randomization`.
+
+    Args:
+      mj_model: the environment's model.
+      model: brax's system or MJX's model, made of it.
+      rng: keys [B].
+      config: ranges of the terms; only terms that change the physics act.
+
+    Returns:
+      The model with a batch axis in the changed fields, and the axes for `jax.vmap`.
+    """
+
+    def draw(key: jax.Array) -> Fields:
+        world = draw_world(config.ranges(), key, jnp.result_type(float))
+        fields, options = edited_fields(mj_model, physics_parameters(world, mj_model))
+        return fields | {f"opt.{name}": value for name, value in options.items()}
+
+    fields = jax.vmap(draw)(rng)
+    axes = jax.tree.map(lambda _: None, model)
+    return model.tree_replace(fields), axes.tree_replace(dict.fromkeys(fields, 0))
+
+
+def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsParameters:
+    """The physics parameters of one environment's randomised model.
+
+    Args:
+      mj_model: the environment's model.
+      base: brax's system or MJX's model, made of it.
+      model: `base` with other values, as in `jax.vmap` over a batch of models.
+
+    Raises:
+      UserError: a changed field does not correspond to a parameter.
+    """
+    changed = _changed_fields(base, model)
+    batches, base_fields = _batches(changed), dict(_fields_of(base))
+    varied = {
+        name: np.any(batch != np.asarray(base_fields[name]), axis=0)
+        for name, batch in batches.items()
+    }
+    varied = {name: mask for name, mask in varied.items() if mask.any()}
+    if not varied:
+        return PhysicsParameters()
+    contact = [name for name in varied if name in _CONTACT_FIELDS]
+    if len({name.split("_")[1] for name in contact}) < len(contact):
+        raise UserError(
+            f"randomization_fn changes {' and '.join(contact)}, and only the pair's value would "
+            "act; change one of them"
+        )
+    for name in sorted(varied.keys() - _FIELDS - _DERIVED):
+        raise UserError(
+            f"randomization_fn changes {name}, which this physics cannot vary between "
+            f"environments; leave it out, or change {', '.join(sorted(_FIELDS))}"
+        )
+    _check_effect(mj_model, base_fields, batches, varied)
+    return _read(mj_model, changed, varied)
+
+
+class _Source(NamedTuple):
+    """The entries of a field that hold a parameter."""
+
+    field: str
+    index: Any
+    sign: float = 1.0
+
+
+_FIELDS = frozenset(
+    (
+        "actuator_biasprm",
+        "actuator_forcerange",
+        "actuator_gainprm",
+        "body_mass",
+        "dof_armature",
+        "dof_damping",
+        "dof_frictionloss",
+        "geom_friction",
+        "geom_pos",
+        "geom_quat",
+        "geom_size",
+        "geom_solref",
+        "opt.gravity",
+        "pair_friction",
+        "pair_solref",
+    )
+)
+_CONTACT_FIELDS = ("geom_friction", "geom_solref", "pair_friction", "pair_solref")
+# Fields that follow from others, which a randomization_fn may keep consistent.
+_DERIVED = frozenset(
+    (
+        "body_inertia",
+        "body_invweight0",
+        "body_subtreemass",
+        "dof_M0",
+        "geom_aabb",
+        "geom_rbound",
+    )
+)
+
+
+def _sources(mj_model: mujoco.MjModel) -> dict[str, _Source]:
+    m, addresses = mj_model, find_addresses(mj_model)
+    links = m.jnt_bodyid[list(addresses.arm_joints)]
+    dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
+    paddle = addresses.paddle_geom
+    return {
+        "ball_mass": _Source("body_mass", addresses.ball_body),
+        "ball_radius": _Source("geom_size", (addresses.ball_geom, 0)),
+        "servo_gain": _Source("actuator_gainprm", (servos, 0)),
+        "servo_damping": _Source("actuator_biasprm", (servos, 2), -1.0),
+        "force_limit": _Source("actuator_forcerange", (servos, 1)),
+        "armature": _Source("dof_armature", dofs),
+        "damping": _Source("dof_damping", dofs),
+        "frictionloss": _Source("dof_frictionloss", dofs),
+        "link_mass": _Source("body_mass", links),
+        "paddle_position": _Source("geom_pos", paddle),
+        "paddle_rotation": _Source("geom_quat", paddle),
+        "gravity": _Source("opt.gravity", slice(None)),
+    }
+
+
+def _read(mj_model: mujoco.MjModel, changed: Fields, varied: Fields) -> PhysicsParameters:
+    """The parameters of one environment.
+
+    Args:
+      changed: fields of its model.
+      varied: mask of the entries of each field that differ between environments.
+    """
+    given = {
+        parameter: source.sign * jnp.asarray(changed[source.field])[source.index]
+        for parameter, source in _sources(mj_model).items()
+        if source.field in varied and varied[source.field][source.index].any()
+    }
+    addresses = find_addresses(mj_model)
+    geoms = addresses.ball_geom, addresses.paddle_geom
+    if "pair_friction" in varied:
+        given["contact_friction"] = changed["pair_friction"][contact_pair(mj_model), 0]
+    if "geom_friction" in varied and varied["geom_friction"][geoms, 0].any():
+        friction = changed["geom_friction"]
+        given["contact_friction"] = _combined(mj_model, *(friction[geom, 0] for geom in geoms))
+    solref = None
+    if "pair_solref" in varied:
+        solref = changed["pair_solref"][contact_pair(mj_model)]
+    if "geom_solref" in varied and varied["geom_solref"][geoms, :].any():
+        solref = _mixed(mj_model, *(changed["geom_solref"][geom] for geom in geoms))
+    if solref is not None:
+        first, second = solref
+        time_constant = jnp.maximum(first, 2.0 * mj_model.opt.timestep)
+        given["contact_stiffness"] = jnp.where(
+            first > 0.0, 1.0 / (time_constant * second) ** 2, -first
+        )
+        given["contact_damping"] = jnp.where(first > 0.0, 2.0 / time_constant, -second)
+    return PhysicsParameters(**given)
+
+
+def _combined(mj_model: mujoco.MjModel, ball: jax.Array, paddle: jax.Array) -> jax.Array:
+    """Friction of a contact: the larger value, or that of the geom with the higher priority."""
+    geoms = find_addresses(mj_model)
+    of_ball, of_paddle = (
+        mj_model.geom_priority[geom] for geom in (geoms.ball_geom, geoms.paddle_geom)
+    )
+    if of_ball == of_paddle:
+        return jnp.maximum(ball, paddle)
+    return ball if of_ball > of_paddle else paddle
+
+
+def _mixed(mj_model: mujoco.MjModel, ball: jax.Array, paddle: jax.Array) -> jax.Array:
+    """`solref` [2] of a contact of two geoms: the mean by `solmix` of two standard formats, and the
+    smaller values if one has the direct format (MuJoCo's documentation, "Contact parameters").
+    """
+    geoms = find_addresses(mj_model)
+    pair = [geoms.ball_geom, geoms.paddle_geom]
+    of_ball, of_paddle = mj_model.geom_priority[pair]
+    if of_ball != of_paddle:
+        return ball if of_ball > of_paddle else paddle
+    mix = mj_model.geom_solmix[pair]
+    share = mix[0] / mix.sum() if mix.sum() > 0.0 else 0.5
+    mean = share * ball + (1.0 - share) * paddle
+    return jnp.where((ball[0] > 0.0) & (paddle[0] > 0.0), mean, jnp.minimum(ball, paddle))
+
+
+def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varied: Fields) -> None:
+    """Checks that the parameters give each changed entry its new value.
+
+    Raises:
+      UserError: an entry with an effect in MuJoCo would have none here.
+    """
+
+    names = list(varied)
+    if "actuator_gainprm" in varied and "actuator_biasprm" not in varied:
+        # A position servo needs kp in both.
+        names.append("actuator_biasprm")
+
+    def effect(fields: Fields) -> Fields:
+        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied))
+        edited |= {f"opt.{name}": value for name, value in options.items()}
+        return {name: jnp.asarray(edited.get(name, base[name])) for name in names}
+
+    with jax.ensure_compile_time_eval():
+        effects = jax.jit(jax.vmap(effect))({name: batches[name] for name in varied})
+    for name in names:
+        wanted, given = batches.get(name, np.asarray(base[name])), np.asarray(effects[name])
+        wrong = np.any(np.abs(wanted - given) > 1e-4 * np.abs(wanted) + 1e-9, axis=0)
+        wrong &= ~_without_effect(mj_model, name)
+        if wrong.any():
+            index = tuple(int(i) for i in np.argwhere(wrong)[0])
+            raise UserError(
+                f"randomization_fn changes {name}{list(index)}{_owner(mj_model, name, index)} in "
+                "a way that no parameter of this physics expresses; leave it out, or see the "
+                "table in docs/jax.md"
+            )
+
+
+def _without_effect(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Mask of the entries of a field that have no effect of their own."""
+    m, addresses = mj_model, find_addresses(mj_model)
+    geoms = [addresses.ball_geom, addresses.paddle_geom]
+    mask = np.zeros(m.opt.gravity.shape if name == "opt.gravity" else getattr(m, name).shape, bool)
+    if name in ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0"):
+        mask[0] = True  # the world
+    elif name == "pair_friction":
+        mask[contact_pair(m), 2:] = True  # torsion and rolling, which need condim 4 and 6
+    elif name == "pair_solref":
+        mask[contact_pair(m)] = True  # read in both formats, written in the direct one
+    elif name in ("geom_friction", "geom_solref"):
+        collides = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+        mask[~collides] = True
+        mask[geoms] = True
+    return mask
+
+
+def _owner(mj_model: mujoco.MjModel, name: str, index: tuple[int, ...]) -> str:
+    """The name of the object to which an entry belongs, in brackets."""
+    kind = name.split("_")[0]
+    if kind == "dof":
+        kind, index = "joint", (int(mj_model.dof_jntid[index[0]]),)
+    if kind not in ("actuator", "body", "geom", "joint", "pair"):
+        return ""
+    owner = getattr(mj_model, kind)(index[0]).name
+    return f" ({owner})" if owner else ""
+
+
+def _fields_of(model: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and values of a model's fields, and of the structures in it."""
+    for field in dataclasses.fields(model):
+        value = getattr(model, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _fields_of(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value
+
+
+def _changed_fields(base: Any, model: Any) -> Fields:
+    """The fields of a model that differ from those of `base`, or may differ in a batch."""
+    before = dict(_fields_of(base))
+    changed = {}
+    for name, value in _fields_of(model):
+        old = before.get(name)
+        same = value is old
+        if not same and not isinstance(value, jax.core.Tracer):
+            same = _equal(value, old)
+        if not same:
+            changed[name] = value
+    return changed
+
+
+def _equal(a: Any, b: Any) -> bool:
+    leaves, others = jax.tree.leaves(a), jax.tree.leaves(b)
+    if any(isinstance(x, jax.core.Tracer) for x in leaves):
+        return False
+    return len(leaves) == len(others) and all(map(np.array_equal, leaves, others))
+
+
+def _batches(fields: Fields) -> Fields:
+    """The values of the fields in all environments, the batch in front.
+
+    Raises:
+      UserError: the values are not known while the program is traced.
+    """
+    batches = {}
+
+    @jax.custom_batching.custom_vmap
+    def probe(arrays: list[jax.Array]) -> list[jax.Array]:
+        return arrays
+
+    @probe.def_vmap
+    def look(axis_size: int, in_batched: Any, arrays: list[jax.Array]) -> Any:
+        for name, array, batched in zip(traced, arrays, in_batched[0], strict=True):
+            if isinstance(array, jax.core.Tracer):
+                break
+            batches[name] = np.asarray(array) if batched else np.asarray(array)[None]
+        return arrays, in_batched[0]
+
+    traced = [name for name, value in fields.items() if isinstance(value, jax.core.Tracer)]
+    if traced:
+        probe([fields[name] for name in traced])
+    if batches.keys() != set(traced):
+        raise UserError(
+            "randomization_fn was called inside jax.jit, so its values cannot be checked; wrap the "
+            "environment outside of it"
+        )
+    for name in fields.keys() - batches.keys():
+        batches[name] = np.asarray(fields[name])[None]
+    return batches

@@ -1,0 +1,160 @@
+"""Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+import yaml
+from rich.console import Console
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.config import EnvConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.robot.adopt import Adoption
+
+DEFAULT_SITE = "attachment_site"
+
+
+class AdoptCommand(StrictModel):
+    """The command line."""
+
+    mjcf: Annotated[Path, tyro.conf.Positional]
+    """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
+    menagerie:NAME for a model of MuJoCo Menagerie."""
+    site: str = DEFAULT_SITE
+    """Site or body that holds the paddle; its z points away from the arm."""
+    joints: tuple[str, ...] | None = None
+    """Acting joints; all hinges and slides from the world to the site by default."""
+    out: Path | None = None
+    """File for the config; by default, my_arm.yaml for my_arm.xml."""
+    paddle: PaddleConfig = PaddleConfig()
+    """The paddle; a given position or quaternion fixes the mount, which is searched otherwise."""
+    view: bool = True
+    """Show the arm afterwards."""
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Runs the command line; exits with 2 on a mistake."""
+    with exit_on_user_error():
+        command = parse(
+            AdoptCommand,
+            sys.argv[1:] if args is None else args,
+            prog="bounce-mjx adopt",
+            description="Finds the start pose and the servos of an arm, and writes its config.",
+        )
+        with interruptible_imports():
+            from bounce_mjx.robot.adopt import adopt
+            from bounce_mjx.task.env import BounceBall
+            from bounce_mjx.training.setup import set_up_jax
+
+        set_up_jax()
+        console = Console(soft_wrap=True, highlight=False)
+        default = EnvConfig()
+        paddle = command.paddle
+        fixed = (paddle.position, paddle.quaternion) != (
+            PaddleConfig().position,
+            PaddleConfig().quaternion,
+        )
+        robot = RobotConfig(site=command.site, joints=command.joints, paddle=paddle)
+        adoption = adopt(command.mjcf, robot, default.control_dt, fixed)
+        values = {"env": env_values(command.mjcf, adoption)}
+        config = validate(TrainConfig, values, str(command.mjcf))
+        env = BounceBall(config.env)
+        for line in described(adoption):
+            console.print(line, markup=False)
+        console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
+        out = command.out or Path(f"{command.mjcf.stem}.yaml")
+        write_config(out, values, command.mjcf, adoption)
+        console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
+        if command.view:
+            # The viewers import seconds of libraries.
+            from bounce_mjx.commands import view
+
+            view.main(["--robot", str(out), "--actions", "zero"])
+
+
+def env_values(mjcf: Path, adoption: "Adoption") -> dict[str, Any]:
+    """The settings of `EnvConfig` that belong to an adopted arm.
+
+    The task keeps its heights relative to the paddle's home; those of the default config are for a
+    home height of 0.05 m.
+    """
+    default, pose = EnvConfig(), adoption.pose
+    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle)
+    lift = z - default.reward.paddle_home_height
+    reward = default.reward
+    farthest = default.max_horizontal_distance - default.reward.target_x
+    path = EnvConfig(mjcf=mjcf).mjcf
+    return {
+        "mjcf": str(path),
+        "robot": _plain(adoption.config.model_dump(mode="json", exclude_defaults=True)),
+        "action_scale": adoption.action_scale,
+        "default_joint_angles": [round(angle, 5) for angle in pose.angles],
+        "ball_init_pos": [x, y, round(default.ball_init_pos[2] + lift, 4)],
+        "target_height_range": [round(h + lift, 4) for h in default.target_height_range],
+        "min_ball_height": round(default.min_ball_height + lift, 4),
+        "max_horizontal_distance": round(max(abs(x), abs(y)) + farthest, 4),
+        "reward": {
+            "target_x": x,
+            "target_y": y,
+            "paddle_home_height": z,
+            "height_progress": {"base_height": round(reward.height_progress.base_height + lift, 4)},
+        },
+    }
+
+
+def described(adoption: "Adoption") -> list[str]:
+    """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
+    from bounce_mjx.robot.arm import limit_words
+
+    pose, arm = adoption.pose, adoption.arm
+    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
+    kind = "kept" if adoption.are_kept else "made from the reflected inertia"
+    lines = [
+        f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
+        f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
+        f"strength: {pose.acceleration:.0f} m/s^2 upward beside holding the arm",
+        f"servos ({kind}), action scale {adoption.action_scale:g} rad:",
+    ]
+    for name, angle, inertia, servo in zip(
+        arm.joint_names, pose.angles, pose.inertia, adoption.servos, strict=True
+    ):
+        lines.append(
+            f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
+            f"kv {servo.damping:.4g}, {limit_words(servo.force_limit)}"
+        )
+    return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]
+
+
+def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adoption") -> None:
+    """Writes the YAML file of an adopted arm.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    from bounce_mjx.runs.files import write_atomically
+
+    site = adoption.config.site
+    head = f"# The arm of {mjcf} with a paddle at {site}: bounce-mjx adopt {mjcf} --site {site}\n"
+    text = head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    try:
+        write_atomically(out, text)
+    except OSError as error:
+        raise UserError(
+            f"{out} cannot be written ({error.strerror}); choose another --out"
+        ) from error
+
+
+def _plain(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {key: _plain(value) for key, value in values.items()}
+    return list(values) if isinstance(values, tuple) else values

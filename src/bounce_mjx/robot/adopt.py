@@ -1,0 +1,121 @@
+"""Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.arm import Arm, Servo, build_arm, compile_spec, locate
+from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.model import find_addresses, named
+from bounce_mjx.robot.pose import Mount, Pose, find_pose, mounts
+
+# Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
+# arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
+_HINGE_SPEED, _SLIDE_SPEED = 2.0, 0.6
+# A kept servo is at least this well damped, and answers within a factor of the others.
+_LEAST_DAMPING_RATIO = 0.5
+_LARGEST_SPREAD = 4.0
+# Torque of a kept servo at the action 1, in multiples of the torque that holds the arm.
+_LEAST_HOLD = 1.5
+
+
+class Adoption(NamedTuple):
+    """An adopted arm, and what the search found."""
+
+    config: RobotConfig
+    action_scale: float
+    """Change of the servo target for an action of 1, rad; of a slide, m."""
+    pose: Pose
+    arm: Arm
+    servos: tuple[Servo, ...]
+    """The servo of each acting joint."""
+    are_kept: bool
+    """Whether the servos are the MJCF's own."""
+
+
+def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bool) -> Adoption:
+    """Adopts the arm of an MJCF file.
+
+    Args:
+      mjcf: the file, as for `locate`.
+      config: the site, and wishes about the joints and the paddle; its servos are ignored.
+      control_dt: time between two actions, s.
+      is_mount_given: whether the paddle's position and orientation are wishes; if not, the search
+        also turns the paddle about the site's z, and lays it flat.
+
+    Raises:
+      UserError: the arm cannot do the task.
+    """
+    path = locate(mjcf)
+    config = config.model_copy(
+        update={"servo_stiffness": None, "servo_damping": None, "servo_force_limit": None}
+    )
+    try:
+        arm = build_arm(path, config)
+        arm.spec.compiler.discardvisual = True
+        model = compile_spec(arm.spec, path)
+        asked = Mount(config.paddle.position, config.paddle.quaternion)
+        pose = find_pose(model, arm.force_limits, (asked,) if is_mount_given else mounts())
+        servos, scale, are_kept = _servos(model, arm, pose, control_dt)
+        paddle = config.paddle.model_copy(
+            update={"position": pose.position, "quaternion": pose.quaternion}
+        )
+        adopted = _with_servos(config, paddle, None if are_kept else servos)
+        return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
+    except UserError as error:
+        raise named(path, error) from error
+
+
+def _with_servos(
+    config: RobotConfig, paddle: PaddleConfig, servos: Sequence[Servo] | None
+) -> RobotConfig:
+    update: dict = {"paddle": paddle}
+    if servos is not None:
+        update["servo_stiffness"] = tuple(servo.stiffness for servo in servos)
+        update["servo_damping"] = tuple(servo.damping for servo in servos)
+        update["servo_force_limit"] = tuple(servo.force_limit for servo in servos)
+    return RobotConfig.model_validate(config.model_copy(update=update).model_dump())
+
+
+def _servos(
+    model: mujoco.MjModel, arm: Arm, pose: Pose, control_dt: float
+) -> tuple[tuple[Servo, ...], float, bool]:
+    """The servos, the action scale, and whether the servos are the MJCF's own."""
+    addresses = find_addresses(model)
+    joints = list(addresses.arm_joints)
+    hinge = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
+    speed = np.where(hinge, _HINGE_SPEED, _SLIDE_SPEED)
+    passive = model.dof_damping.reshape(model.nv, -1)[list(addresses.arm_qvel), 0]
+    own = [servo for servo in arm.servos if servo is not None]
+    if len(own) == len(joints):
+        stiffness = np.array([servo.stiffness for servo in own])
+        damping = np.array([servo.damping for servo in own]) + passive
+        scales = speed * damping / stiffness
+        scale = float(np.exp(np.mean(np.log(np.maximum(scales, 1e-9)))))
+        ratio = damping / (2.0 * np.sqrt(stiffness * np.array(pose.inertia)))
+        suits = (
+            np.min(ratio) >= _LEAST_DAMPING_RATIO
+            and np.max(scales) <= _LARGEST_SPREAD * np.min(scales)
+            and np.all(stiffness * scale >= _LEAST_HOLD * np.abs(pose.holding))
+        )
+        if suits:
+            return tuple(own), _rounded(scale), True
+    # Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes
+    # to rest, and physics steps of a fifth of it are stable.
+    frequency = 1.0 / control_dt
+    scale = 2.0 * _HINGE_SPEED / frequency
+    damping = 2.0 * frequency * np.array(pose.inertia)
+    stiffness = damping * speed / scale
+    limits = arm.force_limits
+    made = zip(stiffness, damping, limits, strict=True)
+    servos = tuple(Servo(_rounded(k), _rounded(d), limit) for k, d, limit in made)
+    return servos, _rounded(scale), False
+
+
+def _rounded(value: float) -> float:
+    """The value with four digits."""
+    return float(f"{value:.4g}")

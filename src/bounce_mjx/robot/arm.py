@@ -1,0 +1,615 @@
+"""Adoption of an arm: from any MJCF with a serial arm in it to the task's scene, with MjSpec.
+
+Every change to the user's model is collected as one sentence.
+"""
+
+import contextlib
+import importlib.util
+import io
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers
+
+BALL_BODY_NAME = "ball_link"
+PADDLE_GEOM_NAME = "blocker"
+# Lifting and tilting the paddle about two axes takes three joints.
+MIN_JOINTS = 3
+
+_PADDLE_BODY_NAME = "paddle"
+# Viewers show the groups 0 to 2.
+_HIDDEN_GROUP = 3
+_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "target_height")
+_RESERVED += ("paddle_home",)
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+class Servo(NamedTuple):
+    """A position servo of one joint."""
+
+    stiffness: float
+    """N m/rad, or N/m."""
+    damping: float
+    """N m s/rad, or N s/m."""
+    force_limit: float | None
+    """N m, or N; None for no limit."""
+
+
+class Arm(NamedTuple):
+    """An arm in the task's scene."""
+
+    spec: mujoco.MjSpec
+    joint_names: tuple[str, ...]
+    """The acting joints, from the base to the paddle."""
+    servos: tuple[Servo | None, ...]
+    """The MJCF's own position servo of each acting joint; None for another actuator."""
+    force_limits: tuple[float | None, ...]
+    """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
+    changes: tuple[str, ...]
+    """Changes to the user's model, one sentence each."""
+
+
+def locate(mjcf: Path) -> Path:
+    """Path of an MJCF file, which may be named by a Python package.
+
+    `package:NAME/FILE` is a file of an installed package, and `menagerie:NAME` or
+    `menagerie:NAME/ENTRY` a model of the package mujoco-menagerie, which downloads it on first use.
+
+    Raises:
+      UserError: the package, the model or the file is missing.
+    """
+    scheme, colon, name = str(mjcf).partition(":")
+    if colon and scheme == "package":
+        path = _in_package(name)
+    elif colon and scheme == "menagerie":
+        path = _in_menagerie(name)
+    else:
+        path = mjcf
+    if not path.is_file():
+        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+    return path
+
+
+def _in_package(name: str) -> Path:
+    package, _, file = name.partition("/")
+    found = importlib.util.find_spec(package) if package.isidentifier() else None
+    if found is None or not found.submodule_search_locations:
+        raise UserError(
+            f"the package {shorten(package)!r} is not installed, which package:{shorten(name)} "
+            f"names; install it (pip install {shorten(package.replace('_', '-'))})"
+        )
+    return Path(found.submodule_search_locations[0]) / file
+
+
+def _in_menagerie(name: str) -> Path:
+    try:
+        import mujoco_menagerie
+    except ImportError as error:
+        raise UserError(
+            f"the package mujoco-menagerie is missing, which menagerie:{shorten(name)} needs; "
+            "pip install 'bounce_mjx[robots]'"
+        ) from error
+    robot, _, entry = name.partition("/")
+    try:
+        found = mujoco_menagerie.get(robot)
+        return Path(found.xml(entry or found.default_model))
+    except (mujoco_menagerie.MenagerieError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"menagerie:{shorten(name)} cannot be had ({shorten(reason, 300)}); give a model of "
+            "MuJoCo Menagerie, and connect to the network for its first use"
+        ) from error
+
+
+def build_arm(path: Path, config: RobotConfig) -> Arm:
+    """Puts the arm of an MJCF file into the task's scene, with a paddle at its site.
+
+    Raises:
+      UserError: the file does not compile, or holds no arm that can do the task.
+    """
+    arm = read_spec(path)
+    model = compile_spec(arm, path)
+    check_numbers(model)
+    try:
+        return _Builder(arm, model, config).build()
+    except (ValueError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"the arm of {path} cannot be put into the task's scene ({reason}); simplify the MJCF"
+        ) from error
+
+
+def read_spec(path: Path) -> mujoco.MjSpec:
+    """The spec of an MJCF file.
+
+    Raises:
+      UserError: the file is no MJCF.
+    """
+    try:
+        with _silent():
+            return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise _not_compiled(path, error) from error
+
+
+def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    """The compiled model of a spec that was read from a file.
+
+    Raises:
+      UserError: the file does not compile.
+    """
+    try:
+        with _silent():
+            return spec.compile()
+    except ValueError as error:
+        raise _not_compiled(path, error) from error
+
+
+def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
+    """The body that holds the paddle, and the site's position [3] and quaternion [4] in it.
+
+    Raises:
+      UserError: there is no such site or body.
+    """
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, config.site)
+    if site >= 0:
+        return int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site]
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, config.site)
+    if body > 0:
+        return body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    sites = _listed(model.site(i).name for i in range(model.nsite))
+    bodies = _listed(model.body(i).name for i in range(1, model.nbody))
+    raise UserError(
+        f"no site or body named {shorten(config.site)}; give --site one of the sites ({sites}) or "
+        f"bodies ({bodies})"
+    )
+
+
+class _Builder:
+    """The steps of one adoption; `_model` is the user's compiled model, whose ids are those of the
+    spec's elements."""
+
+    def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
+        self._arm, self._model, self._config = arm, model, config
+        self._changes: list[str] = []
+
+    def build(self) -> Arm:
+        model = self._model
+        if model.nflex or model.nskin or model.nplugin:
+            raise UserError(
+                "flexes, skins or plugins, which no arm of rigid links has; remove them"
+            )
+        end, position, quaternion = find_site(model, self._config)
+        chain = self._chain(end)
+        joints = self._acting_joints(chain)
+        actuators = self._actuators(joints)
+        servos = tuple(_servo(model, actuators[j]) for j in joints)
+        limits = tuple(_force_limit(model, actuators[j], j) for j in joints)
+        names = self._name(joints, end)
+        gripper = self._check_other_joints(chain, joints)
+        self._check_loops(joints)
+        self._strip(joints, gripper, actuators)
+        scene = self._attach(names, end, position, quaternion)
+        replaced = self._replace_servos(scene, names, servos)
+        return Arm(scene, names, servos, limits, (*self._changes, *replaced))
+
+    def _chain(self, end: int) -> list[int]:
+        """Bodies from the base to the paddle's."""
+        chain = [end]
+        while parent := self._model.body_parentid[chain[-1]]:
+            chain.append(int(parent))
+        return chain[::-1]
+
+    def _acting_joints(self, chain: list[int]) -> list[int]:
+        model, wanted = self._model, self._config.joints
+        on_chain = [j for body in chain for j in _joints_of(model, body)]
+        for joint in on_chain:
+            kind = mujoco.mjtJoint(model.jnt_type[joint])
+            if kind == mujoco.mjtJoint.mjJNT_BALL:
+                raise UserError(
+                    f"the ball joint {_name(model, joint)} in the arm; give an arm of hinges and "
+                    "slides"
+                )
+        hinges = [j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)]
+        site = shorten(self._config.site)
+        if wanted is None:
+            acting = hinges
+        else:
+            names = {_name(model, j): j for j in hinges}
+            for name in wanted:
+                if name not in names:
+                    raise UserError(
+                        f"no joint {shorten(name)} on the way to {site}; the joints there are "
+                        f"{_listed(names)}"
+                    )
+            acting = [j for j in hinges if _name(model, j) in wanted]
+        if len(acting) < MIN_JOINTS:
+            have = _listed(_name(model, j) for j in acting) if acting else "none"
+            raise UserError(
+                f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
+                f"the way to {site}, where at least {MIN_JOINTS} must act; give an arm with more, "
+                "or another --site"
+            )
+        return acting
+
+    def _actuators(self, joints: list[int]) -> dict[int, list[int]]:
+        """Actuators of each acting joint."""
+        model = self._model
+        if model.nu == 0:
+            raise UserError(
+                "no actuators; add a <position> or <motor> with a force limit for each joint"
+            )
+        actuators = {
+            joint: [
+                a
+                for a in range(model.nu)
+                if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
+                and model.actuator_trnid[a, 0] == joint
+            ]
+            for joint in joints
+        }
+        idle = [_name(model, joint) for joint, own in actuators.items() if not own]
+        if idle:
+            raise UserError(
+                f"no actuator of its own on {_listed(idle)}; add one, or name the acting joints "
+                "with --joints"
+            )
+        return actuators
+
+    def _name(self, joints: list[int], end: int) -> tuple[str, ...]:
+        """Gives the arm's parts names, and names that the scene does not use."""
+        arm = self._arm
+        for elements in (arm.bodies[1:], arm.geoms, arm.joints, arm.sites):
+            for element in elements:
+                if element.name in _RESERVED:
+                    element.name += "_of_arm"
+        for joint in joints:
+            arm.joints[joint].name = arm.joints[joint].name or f"joint{joint}"
+        arm.bodies[end].name = arm.bodies[end].name or "end_effector"
+        return tuple(arm.joints[joint].name for joint in joints)
+
+    def _check_other_joints(self, chain: list[int], joints: list[int]) -> list[int]:
+        """Bodies beyond the last acting joint that have joints of their own: a gripper.
+
+        Raises:
+          UserError: the model has driven joints beside the arm.
+        """
+        model = self._model
+        last = int(model.jnt_bodyid[joints[-1]])
+        driven = {
+            int(model.actuator_trnid[a, 0])
+            for a in range(model.nu)
+            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
+        }
+        beside, gripper = [], []
+        for joint in range(model.njnt):
+            body = int(model.jnt_bodyid[joint])
+            if body in chain:
+                continue
+            branch = body
+            while (parent := int(model.body_parentid[branch])) not in chain and parent:
+                branch = parent
+            if parent in chain[chain.index(last) :] if last in chain else False:
+                gripper.append(branch)
+            elif joint in driven:
+                beside.append(_name(model, joint))
+        if beside:
+            raise UserError(
+                f"{len(beside)} driven joints ({_listed(beside)}) beside the arm "
+                f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
+                "arm on a fixed base"
+            )
+        return sorted(set(gripper))
+
+    def _check_loops(self, joints: list[int]) -> None:
+        model, bodies = self._model, set(self._model.jnt_bodyid[joints].tolist())
+        kinds = mujoco.mjtEq
+        for i in range(model.neq):
+            kind = mujoco.mjtEq(model.eq_type[i])
+            ends = {int(model.eq_obj1id[i]), int(model.eq_obj2id[i])}
+            coupled = kind == kinds.mjEQ_JOINT and ends & set(joints)
+            loop = (
+                kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)
+                and int(model.eq_objtype[i]) == mujoco.mjtObj.mjOBJ_BODY
+                and ends & bodies
+            )
+            if coupled or loop:
+                name = model.equality(i).name or f"number {i}"
+                raise UserError(
+                    f"the equality constraint {name} on the arm, so it is no serial chain; remove "
+                    "it, or give a serial arm"
+                )
+
+    def _strip(
+        self, joints: list[int], gripper: list[int], actuators: dict[int, list[int]]
+    ) -> None:
+        """Removes all but the arm."""
+        arm, model = self._arm, self._model
+        own = {a for actuators_of_joint in actuators.values() for a in actuators_of_joint}
+        others = [a for i, a in enumerate(arm.actuators) if i not in own]
+        floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        self._remove("keyframe", arm.keys)
+        self._remove("sensor", arm.sensors)
+        self._remove("actuator beside the arm's", others)
+        self._remove("tendon", arm.tendons)
+        self._remove("equality constraint", arm.equalities)
+        self._remove("contact pair or exclusion", [*arm.pairs, *arm.excludes])
+        self._remove("light or camera", [*arm.lights, *arm.cameras])
+        self._remove("floor", [g for g in arm.geoms if g.type in floors])
+        bodies = {i: arm.bodies[i] for i in range(model.nbody)}
+        parts = {i: arm.joints[i] for i in range(model.njnt)}
+        loose = {
+            int(model.jnt_bodyid[j]): j
+            for j in range(model.njnt)
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
+        }
+        base = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
+        objects = [body for body in loose if model.body_rootid[body] != base]
+        removed = {body for body in range(model.nbody) if _is_below(model, body, gripper + objects)}
+        if gripper:
+            names = _listed(model.body(b).name or f"body {b}" for b in gripper)
+            self._changes.append(f"removed the gripper beyond the last joint: {names}")
+        if objects:
+            names = _listed(model.body(b).name or f"body {b}" for b in objects)
+            self._changes.append(f"removed the loose objects {names}")
+        fixed = [
+            j
+            for j in range(model.njnt)
+            if j not in joints and int(model.jnt_bodyid[j]) not in removed
+        ]
+        if fixed:
+            names = _listed(_name(model, j) for j in fixed)
+            self._changes.append(f"fixed the joints that do not act: {names}")
+        for joint in fixed:
+            arm.delete(parts[joint])
+        for body in (*gripper, *objects):
+            if not _is_below(model, int(model.body_parentid[body]), gripper + objects):
+                arm.delete(bodies[body])
+        self._disable_contacts_and_limits(joints, parts)
+
+    def _remove(self, noun: str, elements: Iterable) -> None:
+        elements = list(elements)
+        names = [element.name for element in elements]
+        for element in elements:
+            self._arm.delete(element)
+        if elements:
+            named = f" ({_listed(name for name in names if name)})" if any(names) else ""
+            plural = noun if len(elements) == 1 else noun.replace(" ", "s ", 1)
+            plural = plural if " " in noun or len(elements) == 1 else f"{noun}s"
+            self._changes.append(f"removed {len(elements)} {plural}{named}")
+
+    def _disable_contacts_and_limits(self, joints: list[int], parts: dict) -> None:
+        model = self._model
+        touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
+        if touching:
+            self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
+        self._hide_contact_shapes()
+        for geom in self._arm.geoms:
+            geom.contype = geom.conaffinity = 0
+        if np.any(model.jnt_limited[joints]):
+            self._changes.append("made the joint limits act by clipping the servo targets")
+        frictional = [j for j in joints if model.dof_frictionloss[model.jnt_dofadr[j]] != 0.0]
+        if frictional:
+            losses = ", ".join(
+                f"{model.dof_frictionloss[model.jnt_dofadr[j]]:g}" for j in frictional
+            )
+            self._changes.append(
+                f"removed the dry friction of {_listed(_name(model, j) for j in frictional)} "
+                f"({losses})"
+            )
+        for joint in joints:
+            parts[joint].limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            parts[joint].frictionloss = 0.0
+
+    def _hide_contact_shapes(self) -> None:
+        """Leaves only the pictured geoms of a body visible, where it has both kinds."""
+        for body in self._arm.bodies[1:]:
+            touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
+            if any(touching) and not all(touching):
+                for geom, touches in zip(body.geoms, touching, strict=True):
+                    geom.group = _HIDDEN_GROUP if touches else geom.group
+
+    def _attach(
+        self, names: tuple[str, ...], end: int, position: np.ndarray, quaternion: np.ndarray
+    ) -> mujoco.MjSpec:
+        """The scene with the arm, the paddle, and their contact pair."""
+        config, arm = self._config, self._arm
+        end_name = self._model.body(end).name or "end_effector"
+        end_name = f"{end_name}_of_arm" if end_name in _RESERVED else end_name
+        scene = read_spec(resource_path("mjcf/scene.xml"))
+        differing = _differing_options(self._model.opt, scene.option)
+        if differing:
+            self._changes.append(f"replaced the physics options by the task's ({differing})")
+        arm.option = scene.option
+        with _silent():
+            scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
+        holder = scene.body(end_name)
+        paddle = holder.add_body(name=_PADDLE_BODY_NAME, pos=position, quat=quaternion)
+        _add_paddle(paddle, config, scene.default)
+        ball = scene.geom("ball")
+        ball.size[0], ball.mass = config.ball.radius, config.ball.mass
+        scene.add_pair(
+            geomname1=PADDLE_GEOM_NAME,
+            geomname2="ball",
+            condim=1,
+            solref=[-98696, -31.4],
+            solimp=[0.95, 0.99, 0.001, 0.5, 2],
+        )
+        size = " x ".join(f"{200 * h:.3g}" for h in config.paddle.half_size)
+        self._changes.append(
+            f"added a paddle of {size} cm and {config.paddle.mass:g} kg at {config.site}, and a "
+            "ball"
+        )
+        return scene
+
+    def _replace_servos(
+        self, scene: mujoco.MjSpec, names: tuple[str, ...], servos: tuple[Servo | None, ...]
+    ) -> list[str]:
+        """Replaces the actuators if the config has servos; the changes."""
+        config = self._config
+        if config.servo_stiffness is None:
+            return []
+        if len(config.servo_stiffness) != len(names):
+            raise UserError(
+                f"{len(names)} acting joints ({_listed(names)}), but servo_stiffness has "
+                f"{len(config.servo_stiffness)} numbers; give one for each joint"
+            )
+        for actuator in list(scene.actuators):
+            scene.delete(actuator)
+        given = zip(
+            config.servo_stiffness, config.servo_damping, config.servo_force_limit, strict=True
+        )
+        changes = []
+        for name, (stiffness, damping, limit) in zip(names, given, strict=True):
+            actuator = scene.add_actuator(
+                name=f"servo/{name}",
+                target=name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            )
+            actuator.gainprm[0] = stiffness
+            actuator.biasprm[:3] = 0.0, -stiffness, -damping
+            if limit is not None:
+                actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+                actuator.forcerange = [-limit, limit]
+            changes.append(
+                f"replaced the actuator of {name} by a position servo: kp {stiffness:.4g}, "
+                f"kv {damping:.4g}, {limit_words(limit)}"
+            )
+        return changes
+
+
+def _add_paddle(
+    paddle: mujoco._specs.MjsBody, config: RobotConfig, default: mujoco._specs.MjsDefault
+) -> None:
+    """Adds the blade, with all the mass, and a handle for pictures to the paddle's body."""
+    blade = config.paddle
+    common = {"contype": 0, "conaffinity": 0, "friction": [0, 0, 0], "default": default}
+    paddle.add_geom(
+        name=PADDLE_GEOM_NAME,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=blade.half_size,
+        pos=blade.position,
+        quat=blade.quaternion,
+        mass=blade.mass,
+        rgba=[0.72, 0.05, 0.07, 1.0],
+        **common,
+    )
+    if np.linalg.norm(blade.position) > 2e-2:
+        paddle.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[0.0, 0.0, 0.0, *blade.position],
+            size=[0.011, 0.0, 0.0],
+            mass=0.0,
+            group=2,
+            rgba=[0.76, 0.57, 0.36, 1.0],
+            **common,
+        )
+
+
+def limit_words(limit: float | None) -> str:
+    """A force limit for a line of text."""
+    return "no force limit" if limit is None else f"force limit {limit:.4g}"
+
+
+def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
+    """The position servo that drives a joint alone; None for other actuators."""
+    actuator = actuators[0]
+    gear = float(model.actuator_gear[actuator, 0])
+    plain = (
+        len(actuators) == 1
+        and model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_gainprm[actuator, 0] > 0.0
+        and model.actuator_biasprm[actuator, 0] == 0.0
+        and model.actuator_biasprm[actuator, 1] == -model.actuator_gainprm[actuator, 0]
+    )
+    if not plain:
+        return None
+    joint = int(model.actuator_trnid[actuator, 0])
+    return Servo(
+        float(model.actuator_gainprm[actuator, 0] * gear**2),
+        float(-model.actuator_biasprm[actuator, 2] * gear**2),
+        _force_limit(model, actuators, joint),
+    )
+
+
+def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> float | None:
+    """Largest force of a joint's actuators, None for no limit: by the force range, by the control
+    range of a plain motor, or by the joint's own limit."""
+    total = 0.0
+    for actuator in actuators:
+        limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
+        if model.actuator_forcelimited[actuator]:
+            limit = float(np.min(np.abs(model.actuator_forcerange[actuator])))
+        is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+        if model.actuator_ctrllimited[actuator] and is_motor:
+            largest = float(np.min(np.abs(model.actuator_ctrlrange[actuator])))
+            limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
+        total = max(total, limit * gear)
+    if model.jnt_actfrclimited[joint]:
+        total = min(total, float(np.min(np.abs(model.jnt_actfrcrange[joint]))))
+    return total if np.isfinite(total) else None
+
+
+def _joints_of(model: mujoco.MjModel, body: int) -> range:
+    first = int(model.body_jntadr[body])
+    return range(first, first + int(model.body_jntnum[body]))
+
+
+def _is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
+    while body and body not in ancestors:
+        body = int(model.body_parentid[body])
+    return body in ancestors
+
+
+def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> str:
+    """The options of a file that differ from the task's, for the list of changes."""
+    different = []
+    if given.integrator != task.integrator:
+        different.append(mujoco.mjtIntegrator(given.integrator).name.removeprefix("mjINT_").lower())
+    if not np.allclose(given.gravity, task.gravity, atol=1e-2):
+        different.append(f"gravity {np.round(given.gravity, 3).tolist()}")
+    if given.density or given.viscosity or np.any(given.wind):
+        different.append("a medium")
+    return ", ".join(different)
+
+
+def _name(model: mujoco.MjModel, joint: int) -> str:
+    return model.joint(joint).name or f"joint{joint}"
+
+
+def _listed(names: Iterable[str], most: int = 8) -> str:
+    """Names with commas; a long list is cut."""
+    names = [name for name in names if name]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return (", ".join(shorten(name, 40) for name in names[:most]) or "none") + more
+
+
+def _not_compiled(path: Path, error: ValueError) -> UserError:
+    reason = " ".join(str(error).split())
+    return UserError(f"the MJCF file {path} does not compile ({reason}); correct it")
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        earlier = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda text: None)
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(earlier)

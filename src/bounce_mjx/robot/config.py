@@ -1,0 +1,69 @@
+"""Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
+
+from pathlib import Path
+
+import pydantic
+
+from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
+
+Vector = tuple[Finite, Finite, Finite]
+Quaternion = tuple[Finite, Finite, Finite, Finite]
+
+
+class PaddleConfig(StrictModel):
+    """The paddle: a box on a handle."""
+
+    half_size: tuple[Positive, Positive, Positive] = (0.05, 0.065, 0.0035)
+    """Half-sizes of the blade along its own x, y and z, m; z is the direction that must point
+    up."""
+    position: Vector = (0.0, 0.0, 0.19)
+    """Centre of the blade in the frame of the site, m; the handle runs to it from the site."""
+    quaternion: Quaternion = (0.7071067811865476, 0.0, -0.7071067811865476, 0.0)
+    """Orientation of the blade in the frame of the site: w, x, y, z."""
+    mass: Positive = 0.1
+    """Mass of the blade; the handle has none."""
+
+
+class BallConfig(StrictModel):
+    """The ball."""
+
+    radius: Positive = 0.019
+    """Radius, m."""
+    mass: Positive = 0.0027
+    """Mass, kg."""
+
+
+class RobotConfig(StrictModel):
+    """Adoption of an arm whose MJCF has no paddle and no ball."""
+
+    site: str | None = None
+    """Site or body of the arm that holds the paddle; null for an MJCF that is a whole scene, with
+    the ball's body ball_link and the paddle's geom blocker."""
+    joints: tuple[str, ...] | None = None
+    """Acting joints; null for all hinges and slides from the world to the site."""
+    paddle: PaddleConfig = PaddleConfig()
+    """The paddle of an adopted arm."""
+    ball: BallConfig = BallConfig()
+    """The ball of an adopted arm."""
+    servo_stiffness: tuple[Positive, ...] | None = None
+    """Stiffness of the position servo that replaces the actuator of each acting joint, N m/rad or
+    N/m; null keeps the MJCF's servos."""
+    servo_damping: tuple[NonNegative, ...] | None = None
+    """Damping of each replaced servo, N m s/rad or N s/m."""
+    servo_force_limit: tuple[Positive | None, ...] | None = None
+    """Force limit of each replaced servo, N m or N; null for a servo without one."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_servos(self):
+        servos = (self.servo_stiffness, self.servo_damping, self.servo_force_limit)
+        if len({None if numbers is None else len(numbers) for numbers in servos}) > 1:
+            raise ValueError(
+                "servo_stiffness, servo_damping and servo_force_limit differ in length; give one "
+                "number of each for each acting joint, or none of the three"
+            )
+        return self
+
+
+def is_packaged(mjcf: Path) -> bool:
+    """Whether `locate` finds the file by the name of a package."""
+    return str(mjcf).startswith(("package:", "menagerie:"))

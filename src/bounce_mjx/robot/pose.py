@@ -1,0 +1,327 @@
+"""Search of the start pose: a level paddle at a well-conditioned point in front of the robot.
+
+Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds; the best pose
+has the largest score of conditioning, distance to the joint limits and strength.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.model import Addresses, find_addresses, joint_name
+
+# Length that makes rotations comparable with displacements: about a forearm, m/rad.
+_LENGTH = 0.25
+# Upward acceleration of the paddle that a bounce needs, m/s^2, and one that is plenty.
+_LEAST_ACCELERATION, _AMPLE_ACCELERATION = 3.0, 20.0
+# Smallest singular value of a usable pose; 1 would be an arm that moves as a sphere.
+_LEAST_MANIPULABILITY = 0.02
+_LEVEL_TOLERANCE = 1e-9
+_DAMPING = 1e-3
+_ITERATIONS = 60
+_MAX_STEP = 0.4
+_CLEARANCE = 0.09
+# Least height of the lines between the joints beyond the first: half the thickness of a link, m.
+_FLOOR_CLEARANCE = 0.07
+# Heights above the paddle that must be free of the arm, m: the ball flies there.
+_HEADROOM = 1.0
+
+
+class Pose(NamedTuple):
+    """A start pose, with a level paddle."""
+
+    angles: tuple[float, ...]
+    """Positions of the acting joints, rad; of a slide, m."""
+    paddle: tuple[float, float, float]
+    """Centre of the paddle, m."""
+    quaternion: tuple[float, float, float, float]
+    """Orientation of the paddle in its site's frame, as searched."""
+    position: tuple[float, float, float]
+    """Position of the paddle in its site's frame, m."""
+    manipulability: float
+    """Smallest singular value of the scaled Jacobian of the task directions."""
+    acceleration: float
+    """Largest upward acceleration of the paddle by the actuators' force limits, m/s^2."""
+    inertia: tuple[float, ...]
+    """Reflected inertia of each acting joint: the diagonal of the mass matrix, kg m^2 or kg."""
+    holding: tuple[float, ...]
+    """Force of each acting joint that holds the arm, N m or N."""
+    reach: float
+    """Largest horizontal distance of the paddle from the first joint, m."""
+    score: float
+
+
+class Mount(NamedTuple):
+    """A way to hold the paddle, in the frame of the site."""
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
+def mounts(length: float = 0.19) -> tuple[Mount, ...]:
+    """Paddles held by a handle along the site's z, in four turns about it, and one that lies flat
+    on the site."""
+    half = math.sqrt(0.5)
+    held = []
+    for turn in range(4):
+        angle = turn * math.pi / 4.0
+        quaternion = np.zeros(4)
+        about_z = np.array([math.cos(angle), 0.0, 0.0, math.sin(angle)])
+        mujoco.mju_mulQuat(quaternion, about_z, np.array([half, 0.0, -half, 0.0]))
+        held.append(Mount((0.0, 0.0, length), tuple(quaternion.tolist())))
+    return (*held, Mount((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)))
+
+
+def find_pose(
+    model: mujoco.MjModel,
+    force_limits: Sequence[float | None],
+    choices: Sequence[Mount],
+    seed: int = 0,
+) -> Pose:
+    """The best start pose of an arm in the task's scene.
+
+    Args:
+      model: the compiled scene, with the paddle mounted as in the first choice.
+      force_limits: largest force of each acting joint, N m or N; None for no limit.
+      choices: mounts of the paddle to try.
+      seed: seed of the random first guesses.
+
+    Raises:
+      UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
+    """
+    limits = np.array([np.inf if limit is None else limit for limit in force_limits])
+    search = _Search(model, limits, np.random.default_rng(seed))
+    return search.best(choices)
+
+
+class _Search:
+    def __init__(self, model: mujoco.MjModel, limits: np.ndarray, rng: np.random.Generator):
+        self._model, self._limits, self._rng = model, limits, rng
+        self._data = mujoco.MjData(model)
+        self._at: Addresses = find_addresses(model)
+        self._qpos, self._dofs = np.array(self._at.arm_qpos), np.array(self._at.arm_qvel)
+        self._joints = np.array(self._at.arm_joints)
+        self._body = int(model.geom_bodyid[self._at.paddle_geom])
+        low, high = model.jnt_range[self._joints].T
+        free = low >= high
+        hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
+        wide = np.where(hinge, np.pi, 0.5)
+        centre = model.qpos0[self._qpos]
+        # A joint without limits, or with more than a turn, is searched within half a turn.
+        self._low = np.where(free, centre - wide, np.maximum(low, centre - wide))
+        self._high = np.where(free, centre + wide, np.minimum(high, centre + wide))
+        outside = self._low >= self._high
+        self._low, self._high = (
+            np.where(outside, low, self._low),
+            np.where(outside, high, self._high),
+        )
+        self._limited = ~free
+        self._range = np.where(free, -np.inf, low), np.where(free, np.inf, high)
+        # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
+        model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        self._mounted = (
+            model.geom_pos[self._at.paddle_geom].copy(),
+            model.geom_quat[self._at.paddle_geom].copy(),
+        )
+        self._base = self._anchor()
+
+    def best(self, choices: Sequence[Mount]) -> Pose:
+        reach = self._reach()
+        poses, level = [], 0
+        for choice in choices:
+            self._mount(choices[0], choice)
+            for angles in self._level_poses(reach):
+                level += 1
+                pose = self._judged(angles, choice, reach)
+                if pose is not None:
+                    poses.append(pose)
+        if not level:
+            raise UserError(
+                f"no reachable pose with a level paddle in front of the robot ({self._names()} "
+                "within their ranges); check the site, or the paddle's position and quaternion"
+            )
+        able = [p for p in poses if p.manipulability >= _LEAST_MANIPULABILITY]
+        if not able:
+            raise UserError(
+                f"no pose in which the joints {self._names()} can lift the paddle and tilt it "
+                "about two axes; give an arm with joints about more axes"
+            )
+        strong = [p for p in able if p.acceleration >= _LEAST_ACCELERATION]
+        if not strong:
+            most = max(0.0, *(p.acceleration for p in able))
+            raise UserError(
+                "no servo strong enough: beside holding the arm, the actuators accelerate the "
+                f"paddle upward by {most:.1f} m/s^2 at most, and the task needs "
+                f"{_LEAST_ACCELERATION:g}; raise the force limits of {self._names()}"
+            )
+        return max(strong, key=lambda pose: pose.score)
+
+    def _names(self) -> str:
+        return ", ".join(joint_name(self._model, j) for j in self._at.arm_joints)
+
+    def _mount(self, first: Mount, choice: Mount) -> None:
+        """Moves the paddle from its mount in the model to another one."""
+        turn, back = np.zeros(4), np.zeros(4)
+        mujoco.mju_negQuat(back, np.array(first.quaternion))
+        position, quaternion = self._mounted
+        site = np.zeros(4)
+        mujoco.mju_mulQuat(site, quaternion, back)
+        mujoco.mju_mulQuat(turn, site, np.array(choice.quaternion))
+        moved = np.zeros(3)
+        mujoco.mju_rotVecQuat(moved, np.array(choice.position) - np.array(first.position), site)
+        self._model.geom_quat[self._at.paddle_geom] = turn
+        self._model.geom_pos[self._at.paddle_geom] = position + moved
+
+    def _anchor(self) -> np.ndarray:
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._data.xanchor[self._joints[0]].copy()
+
+    def _random(self) -> np.ndarray:
+        return self._rng.uniform(self._low, self._high)
+
+    def _reach(self) -> float:
+        distances = []
+        for _ in range(500):
+            paddle, _ = self._forward(self._random())
+            distances.append(np.hypot(*(paddle - self._base)[:2]))
+        return float(max(distances))
+
+    def _forward(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position [3] and normal [3] of the paddle."""
+        self._data.qpos[self._qpos] = angles
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        rotation = self._data.geom_xmat[self._at.paddle_geom].reshape(3, 3)
+        return self._data.geom_xpos[self._at.paddle_geom].copy(), rotation[:, 2].copy()
+
+    def _jacobian(self, paddle: np.ndarray) -> np.ndarray:
+        """Jacobian [5, n] of the paddle's displacement, m, and of its tilt about x and y, m."""
+        linear, angular = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
+        mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
+        return np.vstack([linear, _LENGTH * angular[:2]])[:, self._dofs]
+
+    def _level_poses(self, reach: float):
+        """Poses [n] with a level paddle in front of the robot, at many distances and heights."""
+        distances = reach * np.array([0.45, 0.6, 0.75])
+        heights = (0.1, 0.25, 0.4)
+        for distance in distances:
+            for height in heights:
+                goal = np.array([self._base[0] + distance, self._base[1], height])
+                for _ in range(4):
+                    angles = self._solved(self._random(), goal)
+                    if angles is not None:
+                        yield angles
+
+    def _solved(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+        """The pose near the goal with a level paddle; None if the search finds none."""
+        for iteration in range(_ITERATIONS):
+            paddle, normal = self._forward(angles)
+            # The rotation vector that turns the normal to vertical.
+            tilt = np.array([normal[1], -normal[0]])
+            if normal[2] < 0.0:
+                size = np.linalg.norm(tilt)
+                tilt = tilt / size if size > 1e-6 else np.array([1.0, 0.0])
+            if normal[2] > 0.0 and np.linalg.norm(tilt) < _LEVEL_TOLERANCE and iteration >= 30:
+                break
+            jacobian = self._jacobian(paddle)
+            if iteration < 30:
+                error = np.concatenate([goal - paddle, _LENGTH * tilt])
+            else:
+                # The paddle stays where the joints can hold it level.
+                jacobian, error = jacobian[3:], _LENGTH * tilt
+            damping = _DAMPING if iteration < 30 else 1e-9
+            gram = jacobian @ jacobian.T + damping * np.eye(len(error))
+            step = jacobian.T @ np.linalg.solve(gram, error)
+            largest = np.max(np.abs(step))
+            step *= min(1.0, _MAX_STEP / max(largest, 1e-12))
+            angles = np.clip(angles + step, *self._range)
+        else:
+            return None
+        wrapped = self._wrapped(angles)
+        paddle, _ = self._forward(wrapped)
+        in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
+        return wrapped if in_front and paddle[2] > 0.03 else None
+
+    def _wrapped(self, angles: np.ndarray) -> np.ndarray:
+        """The same pose with each free hinge within half a turn of its middle."""
+        hinge = self._model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
+        low, high = self._range
+        middle = np.where(self._limited, 0.5 * (self._low + self._high), 0.0)
+        turned = angles - 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
+        inside = hinge & (turned >= low) & (turned <= high)
+        return np.where(inside, turned, angles)
+
+    def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> Pose | None:
+        """The pose with its score; None if the arm is in the way of the ball or in the floor."""
+        paddle, _ = self._forward(angles)
+        if not self._is_clear(paddle):
+            return None
+        jacobian = self._jacobian(paddle)
+        task = jacobian if len(angles) >= 5 else jacobian[2:]
+        lifting = jacobian[2:]
+        smallest = float(np.linalg.svd(task, compute_uv=False)[-1])
+        if len(angles) < 3 or np.linalg.matrix_rank(lifting, tol=1e-3) < 3:
+            smallest = 0.0
+        acceleration, inertia, holding = self._strength(task, smallest)
+        margin = self._margin(angles)
+        strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
+        score = smallest * margin * strong
+        return Pose(
+            tuple(angles.tolist()),
+            tuple(paddle.tolist()),
+            choice.quaternion,
+            choice.position,
+            smallest,
+            acceleration,
+            inertia,
+            holding,
+            reach,
+            score,
+        )
+
+    def _margin(self, angles: np.ndarray) -> float:
+        """Distance to the nearest joint limit as a share of half a radian, at most 1."""
+        low, high = self._range
+        return float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
+
+    def _is_clear(self, paddle: np.ndarray) -> bool:
+        """Whether the links, as straight lines between the joints, stay above the floor and out of
+        the ball's way."""
+        data = self._data
+        points = [data.xanchor[j] for j in self._joints] + [data.xpos[self._body]]
+        for joint, (start, end) in enumerate(zip(points, points[1:], strict=False)):
+            samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
+            if joint and np.any(samples[:, 2] < _FLOOR_CLEARANCE):
+                return False
+            near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
+            beside = (samples[:, 2] > paddle[2] - 0.03) & (samples[:, 2] < paddle[2] + _HEADROOM)
+            if np.any(near & beside):
+                return False
+        return True
+
+    def _strength(self, task: np.ndarray, smallest: float) -> tuple[float, tuple, tuple]:
+        """Largest upward acceleration of the paddle, the reflected inertias, and the forces that
+        hold the arm."""
+        model, data = self._model, self._data
+        data.qvel[:] = 0.0
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        mass = full[np.ix_(self._dofs, self._dofs)]
+        inertia = tuple(np.diag(mass).tolist())
+        hold = (data.qfrc_bias - data.qfrc_passive)[self._dofs]
+        if smallest < _LEAST_MANIPULABILITY:
+            return -np.inf, inertia, tuple(hold.tolist())
+        up = np.zeros(len(task))
+        up[-3] = 1.0
+        force = mass @ (np.linalg.pinv(task) @ up)
+        spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
+        if np.any(np.abs(hold) > self._limits):
+            return -np.inf, inertia, tuple(hold.tolist())
+        needed = np.abs(force)
+        ratios = spare[needed > 1e-9] / needed[needed > 1e-9]
+        return float(np.min(ratios, initial=np.inf)), inertia, tuple(hold.tolist())

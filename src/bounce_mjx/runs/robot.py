@@ -1,0 +1,67 @@
+"""The copy of a robot's MJCF in the run that trains it.
+
+    runs/bounce_ball/<time stamp>/robot/
+        my_robot.xml        the MJCF, and every file that it names, in their own subfolders
+        manifest.json       size and SHA-256 of every file
+
+A run of the project's own robot has no copy.
+"""
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.lazy import mujoco
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal
+
+ROBOT = "robot"
+
+
+def copy_robot(mjcf: Path, run: Path) -> Path:
+    """Copies an MJCF file with its meshes, textures and included files into a run's folder, sealed
+    by a manifest. An absolute path inside the MJCF still leads to the original file.
+
+    Args:
+      mjcf: a file that MuJoCo compiles.
+
+    Returns:
+      The copy of the MJCF file.
+
+    Raises:
+      OSError: a file cannot be read or written.
+    """
+    files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(mjcf))]
+    root = Path(os.path.commonpath([path.parent for path in files]))
+    for path in files:
+        copy = run / ROBOT / path.relative_to(root)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    seal(run / ROBOT)
+    return run / ROBOT / mjcf.resolve().relative_to(root)
+
+
+def check_robot(mjcf: Path, run: Path) -> None:
+    """Checks that a run's MJCF file is its own copy, as it was written.
+
+    Raises:
+      UserError: it is another file, or one of the copied files is missing or was edited.
+    """
+    folder = run / ROBOT
+    try:
+        if not Path(os.path.abspath(mjcf)).is_relative_to(os.path.abspath(folder)):
+            raise ValueError(f"{mjcf} is outside of it")
+        check_integrity(folder)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{folder} is not the robot that {run} was trained with ({reason}); restore that "
+            "folder, or train a new run with --mjcf"
+        ) from error
+
+
+def identify_robot(mjcf: Path, run: Path) -> str:
+    """Name of a run's MJCF file, and eight digits of the hash of all copied files."""
+    digest = hashlib.sha256((run / ROBOT / MANIFEST_FILE).read_bytes()).hexdigest()
+    return f"{mjcf.name} {digest[:8]}"

@@ -1,0 +1,207 @@
+"""The page of a running training: its newest policy, its curves and the five results."""
+
+import collections
+import contextlib
+import html
+import queue
+import threading
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+import viser
+from rich.console import Console
+
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.viewers.browser import AXIS, LivePage, address, free_port
+from bounce_mjx.viewers.controllers import make_exchangeable_controller
+from bounce_mjx.viewers.page import open_server
+from bounce_mjx.viewers.simulation import Simulation
+
+_ROBOTS = 4
+_CURVES = {
+    "episode/return": "return of an episode",
+    "episode/bounces": "bounces in a row at its end",
+}
+_MAX_POINTS = 2000
+
+
+class TrainingPage:
+    """A `training.trainer.Watcher` that serves a page from a thread of its own. The simulation runs
+    on the CPU, so that a training on a GPU keeps its speed."""
+
+    def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
+        """Starts the thread, which first compiles the simulation.
+
+        Raises:
+          UserError: the page cannot be served there.
+        """
+        self._config, self._host, self._port = config, host, free_port(host, port)
+        self._console = console
+        self._news: queue.SimpleQueue = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def block(self, steps: int, means: dict[str, float]) -> None:
+        """See `Watcher`."""
+        self._news.put(lambda _, panel: panel.add_block(steps, means))
+
+    def evaluation(self, steps: int, report: Report, policy: Policy) -> None:
+        """See `Watcher`."""
+
+        def show(simulation: Simulation, panel: _Panel) -> None:
+            simulation.policy = policy
+            panel.add_evaluation(steps, report)
+
+        self._news.put(show)
+
+    def wait(self) -> None:
+        """Waits until Ctrl-C ends the page."""
+        self._news.put(lambda _, panel: panel.end())
+        if self._thread.is_alive():
+            self._say(f"the page stays at {address(self._host, self._port)} until Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            while self._thread.is_alive():
+                self._thread.join(0.2)
+
+    def _serve(self) -> None:
+        try:
+            with _on_cpu():
+                simulation = self._simulate()
+                with open_server(self._host, self._port) as server:
+                    side = server.gui.add_panel()
+                    panel = _Panel(server.gui, side, self._config.total_steps)
+                    page = LivePage(
+                        server, simulation, num_shown=1, speed=1.0, title="training", side=side
+                    )
+                    self._say(f"watch: {address(self._host, self._port)}")
+                    page.run(None, lambda: self._tell(simulation, panel))
+        # The training goes on without its page.
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            self._say(f"the page is not served ({reason}); the training goes on without it")
+
+    def _simulate(self) -> Simulation:
+        config = self._config
+        env = BounceBall(config.env)
+        networks = make_networks(config.ppo, env.observation_size, env.action_size)
+        untrained = Policy(
+            init_normalizer(env.observation_size),
+            networks.policy_network.init(jax.random.PRNGKey(config.seed)),
+        )
+        robots = _ROBOTS if env.engine.name == "fused" else 1
+        controller = make_exchangeable_controller(networks)
+        untrained = jax.device_get(untrained)
+        return Simulation(env, controller, robots, config.seed, policy=untrained)
+
+    def _tell(self, simulation: Simulation, panel: "_Panel") -> None:
+        """Shows the news since the last call."""
+        while not self._news.empty():
+            self._news.get()(simulation, panel)
+        panel.refresh()
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+class _Panel:
+    """The tab of the training: its progress, the five results and the curves."""
+
+    def __init__(self, gui: viser.GuiApi, side: viser.PanelHandle, total_steps: int):
+        self._total_steps = total_steps
+        self._points: collections.deque[tuple[float, ...]] = collections.deque(maxlen=_MAX_POINTS)
+        self._met_at: dict[str, int] = {}
+        self._changed = False
+        with side.add_tab("training", viser.Icon.SCHOOL):
+            self._progress = gui.add_html(_text("compiling"))
+            self._results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
+            self._plots = []
+            for title in _CURVES.values():
+                gui.add_markdown(title)
+                self._plots.append(
+                    gui.add_uplot(
+                        (np.zeros(1), np.zeros(1)),
+                        ({"label": "M steps"}, {"label": title, "stroke": "#e8590c", "width": 2}),
+                        axes=({**AXIS, "size": 30}, {**AXIS, "size": 50}),
+                        scales={"x": {"time": False}},
+                        legend={"show": False},
+                        height=130,
+                    )
+                )
+
+    def add_block(self, steps: int, means: dict[str, float]) -> None:
+        """Adds a point to the curves."""
+        self._points.append((steps / 1e6, *(means.get(name, np.nan) for name in _CURVES)))
+        rate = means["speed/steps_per_second"]
+        done = f"{steps:,} of {self._total_steps:,} steps"
+        self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
+        self._changed = True
+
+    def end(self) -> None:
+        """Says that the training has ended."""
+        self._progress.content = _text("<b>the training has ended</b>")
+
+    def add_evaluation(self, steps: int, report: Report) -> None:
+        """Shows the results of an evaluation."""
+        self._results.content = results_list(report, steps, self._met_at)
+
+    def refresh(self) -> None:
+        """Draws new points."""
+        if not self._changed:
+            return
+        self._changed = False
+        steps, *curves = np.array(self._points).T
+        for plot, values in zip(self._plots, curves, strict=True):
+            known = np.isfinite(values)
+            if known.any():
+                plot.data = (steps[known], values[known])
+
+
+def results_list(report: Report, steps: int, met_at: dict[str, int]) -> str:
+    """The five results as HTML, each with the step from which it has been met without a break.
+
+    Args:
+      steps: environment steps at the evaluation.
+      met_at: these steps by name, which this updates.
+    """
+    rows = []
+    for result in report.results:
+        if not result.passed:
+            met_at.pop(result.name, None)
+        since = met_at.setdefault(result.name, steps) if result.passed else None
+        mark, colour = {
+            True: ("&#10003;", "#2b8a3e"),
+            False: ("&#10007;", "#c92a2a"),
+            None: ("-", "#444"),
+        }[result.passed]
+        rows.append(
+            f'<tr><td style="color:{colour}">{mark}</td><td>{html.escape(result.name)}</td>'
+            f'<td style="text-align:right">{figure_text(result.value)}</td>'
+            f"<td>{html.escape(result.bound.partition(' (')[0])}</td>"
+            f"<td>{'' if since is None else f'since {since:,}'}</td></tr>"
+        )
+    kind = "screening" if report.screening else "evaluation"
+    head = f"{kind} at {steps:,} steps:<br><b>{html.escape(report.summary)}</b>"
+    style = "font:10px sans-serif;white-space:nowrap;width:100%"
+    return _text(f'{head}<table style="{style}">{"".join(rows)}</table>')
+
+
+def _text(content: str) -> str:
+    return f'<div style="font:11px sans-serif;padding:2px 12px">{content}</div>'
+
+
+@contextlib.contextmanager
+def _on_cpu() -> Iterator[None]:
+    """Runs JAX's programs of this thread on the CPU, where JAX has one."""
+    try:
+        cpu = jax.devices("cpu")[0]
+    except RuntimeError:
+        yield
+        return
+    with jax.default_device(cpu):
+        yield

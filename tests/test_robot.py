@@ -1,0 +1,298 @@
+"""Adoption of arms: unsuitable models are refused in one sentence, suitable ones become the task's
+scene with a level paddle and stable servos."""
+
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
+from bounce_mjx import BounceBall
+from bounce_mjx.commands import adopt as adopt_command
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.adopt import adopt
+from bounce_mjx.robot.arm import locate
+from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
+from bounce_mjx.runs.config import load_config, read_preset
+
+LEG = '<body pos="{0} {1} 0"><joint name="{2}1" axis="1 0 0"/><geom size=".03" mass=".3"/>'
+LEG += '<body pos="0 0 -.2"><joint name="{2}2" axis="0 1 0"/><geom size=".03" mass=".3"/>'
+LEG += '<body pos="0 0 -.2"><joint name="{2}3" axis="0 1 0"/><geom size=".03" mass=".3"/>'
+LEG += '<site name="{2}foot"/></body></body></body>'
+LEGS = [("0.2", "0.1", "a"), ("0.2", "-0.1", "b"), ("-0.2", "0.1", "c"), ("-0.2", "-0.1", "d")]
+QUADRUPED = mjcf(
+    '<body pos="0 0 .5"><freejoint/><geom size=".1"/>'
+    + "".join(LEG.format(*p) for p in LEGS)
+    + "</body>",
+    motors(" ".join(f"{p[2]}{i}" for p in LEGS for i in (1, 2, 3))),
+)
+FINGERS = "".join(
+    f'<body pos="0 {y} 0.05"><joint name="{n}" type="slide" axis="0 1 0" range="0 0.04"/>'
+    f'<geom size=".01" mass=".05"/></body>'
+    for n, y in (("left", 0.02), ("right", -0.02))
+)
+GRIPPER = mjcf(f'<body><geom size=".05"/><site name="tool"/>{FINGERS}</body>', motors("left right"))
+SLIDE = '<joint name="{}" type="slide" axis="{}" range="0 0.3"/>'
+SCARA = mjcf(
+    link(
+        hinge("s1", "0 0 1"),
+        "0 0 .4",
+        link(
+            hinge("s2", "0 0 1"),
+            ".3 0 0",
+            link(
+                SLIDE.format("s3", "0 0 1"),
+                ".3 0 0",
+                link(hinge("s4", "0 0 1"), "0 0 0", '<site name="tool"/>'),
+            ),
+        ),
+    ),
+    motors("s1 s2 s3 s4"),
+)
+PLANAR = mjcf(
+    link(
+        hinge("p1", "0 1 0"),
+        "0 0 .1",
+        link(
+            hinge("p2", "0 1 0"),
+            "0 0 .3",
+            link(hinge("p3", "0 1 0"), "0 0 .3", '<site name="tool"/>'),
+        ),
+    ),
+    motors("p1 p2 p3"),
+)
+TWO_JOINTS = mjcf(
+    link(hinge("a", "0 0 1"), "0 0 .1", link(hinge("b", "0 1 0"), "0 0 .3", '<site name="tool"/>')),
+    motors("a b"),
+)
+WHEELS = "".join(
+    f'<body pos="0 {y} 0.1"><joint name="{n}" axis="0 1 0"/><geom size=".1" mass="1"/></body>'
+    for n, y in (("wheel_l", 0.3), ("wheel_r", -0.3))
+)
+MOBILE = mjcf(
+    f'<body><freejoint/><geom size=".2"/>{WHEELS}{arm()}</body>',
+    motors(f"wheel_l wheel_r {ARM_JOINTS}"),
+)
+TENDON = mjcf(
+    arm(),
+    motors("j1 j2 j3 j4 j5") + '<motor tendon="t"/>',
+    '<tendon><fixed name="t"><joint joint="j6" coef="1"/></fixed></tendon>',
+)
+BROKEN = {
+    "quadruped": (QUADRUPED, "afoot", "9 driven joints (b1, b2", "one arm"),
+    "gripper": (GRIPPER, "tool", "too few joints", "0 (none)"),
+    "SCARA": (SCARA, "tool", "s1, s2, s3, s4", "tilt"),
+    "planar arm": (PLANAR, "tool", "p1, p2, p3", "axes"),
+    "two joints": (TWO_JOINTS, "tool", "too few joints", "2 (a, b)"),
+    "two arms": (
+        mjcf(arm() + arm("r_", base="0 1 .2"), motors(f"{ARM_JOINTS} r_j1 r_j2")),
+        "tool",
+        "2 driven joints (r_j1, r_j2) beside the arm",
+    ),
+    "mobile base": (MOBILE, "tool", "wheel_l, wheel_r", "on a fixed base"),
+    "no actuators": (mjcf(arm(), ""), "tool", "no actuators", "<position>"),
+    "idle joint": (mjcf(arm(), motors("j1 j2 j3 j5 j6")), "tool", "on j4", "--joints"),
+    "tendon": (TENDON, "tool", "no actuator of its own on j6"),
+    "weak motors": (mjcf(arm(), motors(ARM_JOINTS, 2.0)), "tool", "no servo strong enough"),
+    "missing mesh": (
+        mjcf(
+            arm(tip='<geom type="mesh" mesh="m"/>'),
+            motors(ARM_JOINTS),
+            assets='<asset><mesh name="m" file="gone.stl"/></asset>',
+        ),
+        "tool",
+        "does not compile",
+        "gone.stl",
+    ),
+    "no such site": (ARM, "flange", "no site or body named flange", "tool"),
+    "ball joint": (
+        ARM.replace('<joint name="j4" axis="0 0 1" range="-3 3" ', '<joint name="j4" type="ball" '),
+        "tool",
+        "ball joint j4",
+    ),
+    "loop": (
+        mjcf(
+            arm(),
+            motors(ARM_JOINTS),
+            '<equality><joint joint1="j2" joint2="j3"/></equality>',
+        ),
+        "tool",
+        "equality constraint",
+        "serial",
+    ),
+    "narrow limits": (
+        mjcf(arm(limits="-0.1 0.1", tip='<body name="hand"/>'), motors(ARM_JOINTS)),
+        "tool",
+        "no reachable pose",
+        "j1, j2",
+    ),
+    "URDF without joints": (
+        '<robot name="arm"><link name="base"/></robot>',
+        "tool",
+        "no site or body named tool",
+    ),
+    "text": ("hello", "tool", "does not compile", "correct it"),
+    "massless link": (ARM.replace('mass="0.5"', 'mass="0"'), "tool", "does not compile", "mass"),
+    "nan": (ARM.replace('pos="0 0 0.2"', 'pos="0 0 nan"'), "tool", "nan in body_pos"),
+    "empty": (mjcf("", ""), "tool", "no site or body named tool", "none"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_an_unsuitable_model_is_refused(name, tmp_path, monkeypatch, capfd) -> None:
+    text, site, *words = BROKEN[name]
+    assert text != ARM or name == "no such site"
+    monkeypatch.chdir(tmp_path)
+    Path("robot.xml").write_text(text)
+    with pytest.raises(SystemExit) as exited:
+        adopt_command.main(["robot.xml", "--site", site, "--no-view"])
+    out, err = capfd.readouterr()
+    assert (exited.value.code, out) == (2, "")
+    assert re.fullmatch(r"error: .+\n", err) and "robot.xml" in err
+    assert not [word for word in words if word not in err], err
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.xml"]
+
+
+def test_a_file_of_a_package_is_found_by_name() -> None:
+    import bounce_mjx
+
+    folder = Path(bounce_mjx.__file__).parent
+    assert locate(Path("package:bounce_mjx/errors.py")) == folder / "errors.py"
+    with pytest.raises(UserError, match="no_such_arm.* is not installed"):
+        locate(Path("package:no_such_arm/arm.xml"))
+    with pytest.raises(UserError, match="gone.xml does not exist"):
+        locate(Path("package:bounce_mjx/gone.xml"))
+
+
+# Adopted arms
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> dict[str, Path]:
+    """Configs of a small arm with motors and a gripper, and of the UR5e."""
+    folder = tmp_path_factory.mktemp("adopted")
+    small = folder / "small.xml"
+    hand = f'<body pos="0 0 0.05"><geom size=".02" mass=".1"/>{FINGERS}</body>'
+    table = '<geom type="plane" size="1 1 1"/><body><freejoint/><geom size=".1"/></body>'
+    more = '<keyframe><key qpos="1 0 0 1 0 0 0 0 0 0 0 0 0 0 0"/></keyframe>'
+    small.write_text(
+        mjcf(table + arm(tip=hand), motors(f"{ARM_JOINTS} left"), more).replace(
+            "<worldbody>", '<option timestep="0.005" gravity="0 0 -1.6"/><worldbody>'
+        )
+    )
+    configs = {}
+    for name, path, site in (("small", small, "tool"), ("ur5e", ur5e(), "attachment_site")):
+        configs[name] = folder / f"{name}.yaml"
+        adopt_command.main([str(path), "--site", site, "--out", str(configs[name]), "--no-view"])
+    return configs
+
+
+@pytest.fixture(params=["small", "ur5e"])
+def env(request, written) -> BounceBall:
+    return BounceBall(load_config(written[request.param]).env)
+
+
+def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
+    config, data = env.config, mujoco.MjData(env.mj_model)
+    data.qpos[list(find_addresses(env.mj_model).arm_qpos)] = config.default_joint_angles
+    mujoco.mj_forward(env.mj_model, data)
+    paddle = data.geom("blocker")
+    np.testing.assert_allclose(paddle.xmat.reshape(3, 3)[:, 2], [0.0, 0.0, 1.0], atol=1e-4)
+    reward = config.reward
+    point = reward.target_x, reward.target_y, reward.paddle_home_height
+    np.testing.assert_allclose(paddle.xpos, point, atol=1e-3)
+    assert config.ball_init_pos[:2] == point[:2] and paddle.xpos[0] > 0.15
+    # The task keeps its heights above the paddle.
+    assert np.isclose(config.ball_init_pos[2] - paddle.xpos[2], 0.4, atol=1e-3)
+    assert np.allclose(
+        np.array(config.target_height_range) - paddle.xpos[2], [0.35, 0.55], atol=1e-3
+    )
+    low, high = env.mj_model.jnt_range[list(find_addresses(env.mj_model).arm_joints)].T
+    assert np.all(low < config.default_joint_angles) and np.all(config.default_joint_angles < high)
+
+
+def test_only_the_arm_is_left(env) -> None:
+    """The arm's own links, the ball; and all the mass of the arm with the paddle's."""
+    model = env.mj_model
+    assert (env.observation_size, env.action_size) == (29, 6)
+    assert env.backend == "fused" and len(joint_names(model)) == 6
+    assert (model.njnt, model.nkey, model.neq, model.ntendon) == (7, 0, 0, 0)
+    assert not np.any(model.geom_contype) and not np.any(model.jnt_limited)
+    assert model.opt.gravity[2] == -9.81 and model.npair == 1
+
+
+def test_the_links_keep_their_masses(written) -> None:
+    config = load_config(written["ur5e"]).env
+    model = BounceBall(config).mj_model
+    plain = mujoco.MjModel.from_xml_path(str(locate(config.mjcf)))
+    for name in joint_names(model)[:-1]:
+        body, own = model.joint(name).bodyid, plain.joint(name).bodyid
+        np.testing.assert_allclose(model.body_mass[body], plain.body_mass[own])
+        np.testing.assert_allclose(model.body_inertia[body], plain.body_inertia[own])
+    wrist = [m.body_mass[m.joint("wrist_3_joint").bodyid].item() for m in (model, plain)]
+    assert np.isclose(wrist[0] - wrist[1], config.robot.paddle.mass)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.002])
+def test_servos_step_without_overshoot_and_hold_the_arm(env, dt) -> None:
+    """A step of every target overshoots little, and ends at rest, at physics steps up to 2 ms; the
+    UR5e's own servos sag a little under gravity."""
+    config, model = env.config, env.mj_model
+    model.opt.timestep = dt
+    addresses = find_addresses(model)
+    data, arm_qpos = mujoco.MjData(model), list(addresses.arm_qpos)
+    start = np.array(config.default_joint_angles)
+    data.qpos[arm_qpos] = start
+    data.ctrl[list(addresses.actuators)] = start + 0.02
+    travelled = []
+    for _ in range(round(1.0 / dt)):
+        mujoco.mj_step(model, data)
+        travelled.append(data.qpos[arm_qpos] - start)
+    model.opt.timestep = config.physics_dt
+    end = travelled[-1]
+    assert np.all(np.abs(data.qvel[list(addresses.arm_qvel)]) < 0.02)
+    assert np.all(np.max(travelled, axis=0) < np.maximum(end, 0.02) + 0.004)
+    assert np.all(np.abs(end - 0.02) < 0.025) and np.median(end) > 0.018
+
+
+def test_the_small_arm_has_servos_instead_of_motors(written) -> None:
+    values = yaml.safe_load(written["small"].read_text())["env"]
+    assert values["robot"]["servo_force_limit"] == [100.0] * 6
+    model = BounceBall(load_config(written["small"]).env).mj_model
+    servos = list(find_addresses(model).actuators)
+    np.testing.assert_allclose(
+        model.actuator_gainprm[servos, 0], values["robot"]["servo_stiffness"]
+    )
+    np.testing.assert_allclose(model.actuator_forcerange[servos, 1], 100.0)
+    # Critical damping at 1 / control_dt: kp = kv^2 / (4 M), with kv = 2 M / control_dt.
+    kp, kv = (np.array(values["robot"][f"servo_{key}"]) for key in ("stiffness", "damping"))
+    np.testing.assert_allclose(kp / kv, 50.0, rtol=1e-3)
+
+
+def test_changes_are_listed(tmp_path) -> None:
+    text = mjcf(arm(), motors(ARM_JOINTS)).replace('damping="0.1"', 'frictionloss="0.2"', 1)
+    (tmp_path / "arm.xml").write_text(text)
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=False)
+    changes = "\n".join(found.arm.changes)
+    for words in ("own contacts", "joint limits", "dry friction of j1 (0.2)", "added a paddle"):
+        assert words in changes
+    assert len(re.findall("by a position servo: kp", changes)) == 6
+
+
+def test_an_adopted_config_gives_the_same_model_again(written) -> None:
+    config = load_config(written["small"]).env
+    again = [load_model(config.mjcf, 0.001, robot=config.robot) for _ in range(2)]
+    assert fingerprint(again[0]) == fingerprint(again[1])
+
+
+def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
+    preset = tmp_path / "preset.yaml"
+    preset.write_text("env: {action_scale: 0.5, episode_seconds: 3.0}\nseed: 4\n")
+    config = read_preset(preset, written["small"])
+    own = load_config(written["small"]).env
+    assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
+    assert own.action_scale != 0.5
