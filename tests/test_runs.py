@@ -23,7 +23,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import load_model
+from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config, read_preset
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
@@ -172,6 +172,21 @@ def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypa
     assert load_config(moved / "config.yaml").env.mjcf == env.mjcf
 
 
+def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "some_robots").mkdir()
+    (tmp_path / "some_robots/__init__.py").touch()
+    shutil.copy(resource_path("mjcf/bounce_ball.xml"), tmp_path / "some_robots")
+    monkeypatch.syspath_prepend(tmp_path)
+    packaged = Path("package:some_robots/bounce_ball.xml")
+    (tmp_path / "my.yaml").write_text(f"env: {{mjcf: '{packaged}'}}")
+    config = load_config(tmp_path / "my.yaml")
+    assert config.env.mjcf == packaged
+    run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
+    assert load_run_config(run).env.mjcf == run / "robot/bounce_ball.xml"
+    copy = load_model(run / "robot/bounce_ball.xml", 0.001)
+    assert fingerprint(copy) == fingerprint(load_model(packaged, 0.001))
+
+
 @pytest.mark.parametrize("name", ["mjcf/my robot.xml", "mjcf/more.xml", "meshes/m.obj"])
 def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, name: str, capsys) -> None:
     with (robot_run / "robot" / name).open("a") as file:
@@ -197,6 +212,11 @@ def test_a_preset_has_a_name(tmp_path: Path, monkeypatch) -> None:
     assert read_preset(Path("seed")) == load_config(resource_path("configs/seed.yaml"))
     with pytest.raises(UserError, match="the config file sead cannot be read"):
         read_preset(Path("sead"))
+    robots = (
+        read_preset(Path("seed"), Path("ur5e")),
+        read_preset(Path("seed"), resource_path("configs/robots/ur5e.yaml")),
+    )
+    assert robots[0] == robots[1] != read_preset(Path("seed"))
     (tmp_path / "seed").write_text("seed: 7")
     assert read_preset(Path("seed")).seed == 7
 

@@ -194,16 +194,21 @@ def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
     both.target_height = None
 
 
-def test_an_exchanged_policy_acts(env: BounceBall) -> None:
-    def control(policy, states, key):
-        return policy["action"][:, None] + jnp.zeros_like(states.obs[: env.action_size])
+@pytest.fixture(scope="module")
+def exchangeable(env: BounceBall) -> Simulation:
+    """One robot under a policy that is one constant action for all joints."""
 
-    still = {"action": np.zeros(env.action_size, np.float32)}
-    simulation = Simulation(env, control, 1, seed=0, policy=still)
-    before = simulation.frame.qpos[0, :6]
-    np.testing.assert_allclose(simulation.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
-    simulation.policy = {"action": np.ones(env.action_size, np.float32)}
-    moved = simulation.record(0.1).qpos[-1, 0, :6] - before
+    def control(policy, states, key):
+        return policy + jnp.zeros_like(states.obs[: env.action_size])
+
+    return Simulation(env, control, 1, seed=0, policy=np.float32(0.0))
+
+
+def test_an_exchanged_policy_acts(env: BounceBall, exchangeable: Simulation) -> None:
+    before = exchangeable.frame.qpos[0, :6]
+    np.testing.assert_allclose(exchangeable.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
+    exchangeable.policy = np.float32(1.0)
+    moved = exchangeable.record(0.1).qpos[-1, 0, :6] - before
     # The target of a servo is ahead of its joint by the scale of an action.
     assert np.all(moved > 0.5 * env.config.action_scale)
 
@@ -550,9 +555,11 @@ def test_results_are_shown_as_they_are_met() -> None:
     assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
 
 
-def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, monkeypatch) -> None:
+def test_the_page_of_a_training_shows_its_newest_policy(
+    exchangeable: Simulation, monkeypatch
+) -> None:
     """The training only puts the news into a queue."""
-    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: scripted)
+    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: exchangeable)
     stop = threading.Event()
 
     def step(simulation) -> None:
@@ -566,8 +573,8 @@ def test_the_page_of_a_training_shows_its_newest_policy(scripted: Simulation, mo
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
     means = {"episode/return": 1.0, "episode/bounces": NAN, "speed/steps_per_second": 2e6}
     training.block(500_000, means)
-    training.evaluation(500_000, evaluated(True, False), policy := ("newest",))
-    wait_until(lambda: scripted.policy == policy)
+    training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
+    wait_until(lambda: exchangeable.policy == 0.5)
     while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
         client._receive()
     assert any("1 of 2 results met" in text for text in client.texts)

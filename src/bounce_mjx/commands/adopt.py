@@ -144,7 +144,7 @@ def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adopt
     from bounce_mjx.runs.files import write_atomically
 
     site = adoption.config.site
-    head = f"# The arm of {mjcf} with a paddle at {site}: bounce-mjx adopt {mjcf} --site {site}\n"
+    head = f"# An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}\n"
     text = head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     try:
         write_atomically(out, text)

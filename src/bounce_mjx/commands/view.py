@@ -12,7 +12,7 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import ROBOTS, load_config, named_file
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.command import path_flag
 from bounce_mjx.viewers.options import ViewerOptions
@@ -24,7 +24,8 @@ class ViewCommand(StrictModel):
     actions: Literal["random", "zero", "scripted"] = "random"
     """random: uniform; zero: the servos hold their angles; scripted: a hand-written juggler."""
     robot: Path | None = None
-    """Config of a robot, such as the file that bounce-mjx adopt wrote."""
+    """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
+    configs/robots/ (ur5e, panda or iiwa)."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
 
@@ -34,6 +35,7 @@ def main(args: Sequence[str] | None = None) -> None:
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
         robot = path_flag(args, "--robot")
+        robot = robot and named_file(robot, ROBOTS)
         command = parse(
             ViewCommand,
             args,

@@ -18,6 +18,8 @@ from bounce_mjx.runs.robot import check_robot
 from bounce_mjx.task.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
+ROBOTS = "configs/robots"
+"""Folder of the package with configs of robots."""
 
 
 class TrainConfig(StrictModel):
@@ -99,16 +101,23 @@ def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
     this machine.
 
     Args:
-      robot: config of a robot, whose keys win over the preset's.
+      robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
+        in configs/robots/.
 
     Raises:
       UserError: the file is missing or invalid.
     """
     if path is None:
         path = Path("default" if has_accelerator() else "cpu")
-    named = resource_path(f"configs/{path.name}.yaml")
+    return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS))
+
+
+def named_file(path: Path, folder: str) -> Path:
+    """The YAML file in a folder of the package that a path names; the path itself if there is none
+    or if the path exists."""
+    named = resource_path(f"{folder}/{path.name}.yaml")
     is_name = str(path) == path.name and not os.path.exists(path)
-    return load_config(named if is_name and os.path.isfile(named) else path, robot)
+    return named if is_name and os.path.isfile(named) else path
 
 
 def has_accelerator() -> bool:

@@ -24,14 +24,18 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
     by a manifest. An absolute path inside the MJCF still leads to the original file.
 
     Args:
-      mjcf: a file that MuJoCo compiles.
+      mjcf: a file that MuJoCo compiles, as for `locate`.
 
     Returns:
       The copy of the MJCF file.
 
     Raises:
       OSError: a file cannot be read or written.
+      UserError: the file is missing.
     """
+    from bounce_mjx.robot.arm import locate
+
+    mjcf = locate(mjcf)
     files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(mjcf))]
     root = Path(os.path.commonpath([path.parent for path in files]))
     for path in files:

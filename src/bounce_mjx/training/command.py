@@ -33,8 +33,8 @@ class TrainingCommand(TrainConfig):
     """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
     The default is default on an accelerator, and cpu on a CPU."""
     robot: Path | None = None
-    """Config of a robot, such as configs/robots/ur5e.yaml or the file that bounce-mjx adopt wrote,
-    on top of the preset."""
+    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
+    one in configs/robots/ (ur5e, panda or iiwa)."""
     resume: Path | None = None
     """Folder of a run, or latest for the newest run, to continue in place from its latest
     checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,

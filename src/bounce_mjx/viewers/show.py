@@ -9,6 +9,7 @@ from rich.console import Console
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
@@ -55,8 +56,6 @@ def show(
     viewer, several = options.viewer, len(shown) > 1
     if several and (viewer == "native" or options.video is not None):
         raise UserError("a window or a video shows one policy; show several with --viewer browser")
-    if several and len({one.config.mjcf for one in shown}) > 1:
-        raise UserError("the policies have different robots; show one at a time")
     if viewer == "auto":
         viewer = "native" if not several and has_display() else "browser"
     film = None
@@ -102,6 +101,8 @@ def show(
 
     with console.status("compiling"):
         simulations = [simulate(one) for one in shown]
+    if len({fingerprint(one.env.mj_model) for one in simulations}) > 1:
+        raise UserError("the policies have different robots or time steps; show one at a time")
     simulation = SideBySide(simulations) if several else simulations[0]
 
     if recorded:
