@@ -4,20 +4,28 @@ scene with a level paddle and stable servos."""
 import re
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 import yaml
 
 from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
-from bounce_mjx import BounceBall
+from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.results import HOME_HEIGHT, _speed_result
+from bounce_mjx.learning import ppo
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt
 from bounce_mjx.robot.arm import locate
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
+from random_worlds import random_parameters
+from test_parameters import assert_same_step, c_steps, uncompiled_steps
+from test_physics import States
 
 LEG = '<body pos="{0} {1} 0"><joint name="{2}1" axis="1 0 0"/><geom size=".03" mass=".3"/>'
 LEG += '<body pos="0 0 -.2"><joint name="{2}2" axis="0 1 0"/><geom size=".03" mass=".3"/>'
@@ -225,6 +233,29 @@ def test_only_the_arm_is_left(env) -> None:
     assert model.opt.gravity[2] == -9.81 and model.npair == 1
 
 
+@pytest.mark.usefixtures("float64")
+def test_one_step_in_random_worlds_is_mujocos(env) -> None:
+    model, at = env.mj_model, find_addresses(env.mj_model)
+    count, rng = 32, np.random.default_rng(1)
+    qpos = np.tile(model.qpos0, (count, 1))
+    angles = env.config.default_joint_angles + rng.uniform(-0.5, 0.5, (count, 6))
+    qpos[:, at.arm_qpos] = angles
+    qvel = rng.uniform(-2.0, 2.0, (count, model.nv))
+    data = mujoco.MjData(model)
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        paddle = data.geom("blocker")
+        local = rng.uniform(-1.0, 1.0, 3) * (0.04, 0.05, 0.012)
+        row[at.ball_qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+    ctrl = np.zeros((count, model.nu))
+    ctrl[:, at.actuators] = angles + rng.uniform(-0.1, 0.1, (count, 6))
+    states, parameters = States(qpos, qvel, ctrl), random_parameters(model, count, seed=2)
+    expected, contacts = c_steps(model, parameters, states)
+    assert contacts >= count // 2
+    assert_same_step(uncompiled_steps(model, parameters, states), expected)
+
+
 def test_the_links_keep_their_masses(written) -> None:
     config = load_config(written["ur5e"]).env
     model = BounceBall(config).mj_model
@@ -289,6 +320,21 @@ def test_an_adopted_config_gives_the_same_model_again(written) -> None:
     assert fingerprint(again[0]) == fingerprint(again[1])
 
 
+def test_speed_is_judged_at_targets_above_the_arms_own_home(written) -> None:
+    """As for the package's own arm, whose config judges it too; higher targets are not judged."""
+    config = load_config(written["small"]).env
+    low, high = config.target_height_range
+    home = config.reward.paddle_home_height
+    assert home != HOME_HEIGHT
+    assert _speed_result(1.0, (low, high), home).passed
+    assert _speed_result(1.0, (low, high + 0.1), home).passed is None
+    assert _speed_result(1.0, (0.4, 0.6), HOME_HEIGHT).passed
+
+
+def test_the_config_of_the_packages_arm_has_the_defaults() -> None:
+    assert load_config(resource_path("configs/robots/peitian.yaml")).env == EnvConfig()
+
+
 def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     preset = tmp_path / "preset.yaml"
     preset.write_text("env: {action_scale: 0.5, episode_seconds: 3.0}\nseed: 4\n")
@@ -296,3 +342,24 @@ def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     own = load_config(written["small"]).env
     assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
     assert own.action_scale != 0.5
+
+
+def test_a_short_training_of_the_ur5e_rises(written) -> None:
+    env = BounceBall(
+        load_config(written["ur5e"]).env.model_copy(
+            update={"episode_seconds": 4.0, "physics_dt": 0.002}
+        )
+    )
+    config = PPOConfig(
+        num_envs=128,
+        rollout_length=32,
+        num_minibatches=4,
+        hidden_layers=(64, 64),
+        learning_rate=1e-3,
+    )
+    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    state = jax.jit(trainer.init)(jax.random.key(0))
+    _, metrics = jax.jit(trainer.run, static_argnums=1)(state, 140)
+    rewards = np.asarray(metrics["reward"])
+    print(f"reward of a step: {rewards[10:30].mean():.2f}, then {rewards[-20:].mean():.2f}")
+    assert rewards[-20:].mean() > 1.2 * rewards[10:30].mean()

@@ -22,7 +22,11 @@ UPWARD_SPEED_RANGE = (0.1, 1.5)
 """Bounds of the mean upward speed, m/s."""
 
 UPWARD_SPEED_TARGETS = (0.4, 0.6)
-"""Target heights at which the upward speed is judged, m."""
+"""Target heights at which the upward speed is judged, m, for a paddle with the home height
+`HOME_HEIGHT`; another home height shifts them."""
+
+HOME_HEIGHT = 0.05
+"""Home height of the original specification, m."""
 
 
 Figure = Annotated[float, Field(allow_inf_nan=False)] | None
@@ -134,6 +138,7 @@ def judge(
         _speed_result(
             _ratio(s.rising_speed.sum(), s.rising_steps.sum()),
             target_heights or env.config.target_heights,
+            env.config.reward.paddle_home_height,
         ),
         _share_result(
             "stable",
@@ -163,11 +168,15 @@ def _share_result(name: str, measured: str, share: float | None, minimum: float)
     )
 
 
-def _speed_result(speed: float | None, target_heights: tuple[float, float]) -> Result:
-    """The upward speed, which is judged only if all targets are within `UPWARD_SPEED_TARGETS`."""
+def _speed_result(
+    speed: float | None, target_heights: tuple[float, float], home_height: float
+) -> Result:
+    """The upward speed, which is judged only if all targets are as high above the paddle's home as
+    `UPWARD_SPEED_TARGETS`."""
     low, high = UPWARD_SPEED_RANGE
     bound = f"{low} to {high}"
-    lowest, highest = UPWARD_SPEED_TARGETS
+    # Rounded, as a config has the heights of another arm with four digits.
+    lowest, highest = (round(h + home_height - HOME_HEIGHT, 4) for h in UPWARD_SPEED_TARGETS)
     judged = lowest <= target_heights[0] and target_heights[1] <= highest
     passed = speed is not None and low <= speed <= high
     return Result(

@@ -543,7 +543,7 @@ class BounceBall:
         )
 
     def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
-        """qpos [nq] with measured joint angles [6]."""
+        """qpos [nq] with measured joint angles [n]."""
         qpos = [physics.qpos[i] for i in range(self.mj_model.nq)]
         for i, address in enumerate(self._addresses.arm_qpos):
             qpos[address] = joint_angles[i]

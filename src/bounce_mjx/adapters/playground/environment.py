@@ -19,6 +19,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.arm import locate
 from bounce_mjx.task import state as core
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
@@ -161,7 +162,8 @@ class PlaygroundBounceBall(MjxEnv):
     @property
     def xml_path(self) -> str:
         """The MJCF file."""
-        return str(self.task.config.mjcf or resource_path("mjcf/bounce_ball.xml"))
+        mjcf = self.task.config.mjcf
+        return str(resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf))
 
     @property
     def action_size(self) -> int:
