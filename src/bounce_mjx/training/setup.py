@@ -1,6 +1,8 @@
 """JAX's settings in a command."""
 
+import contextlib
 import os
+import threading
 from pathlib import Path
 
 import jax
@@ -24,6 +26,17 @@ def cache_compilations() -> None:
     if jax.config.jax_compilation_cache_dir is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
+
+
+def find_devices() -> None:
+    """Starts JAX's devices in the background; JAX waits for them where it needs them, and reports
+    an error there."""
+
+    def start() -> None:
+        with contextlib.suppress(Exception):
+            jax.devices()
+
+    threading.Thread(target=start, daemon=True).start()
 
 
 def set_up_cpu() -> None:
