@@ -88,6 +88,7 @@ class Scene:
             )
             for body, shapes in body_scenes(model)
         }
+        self._display.pose(model.qpos0, 0.0)
         self._markers = {}
         for name in MARKERS:
             mesh, rgba = site_mesh(model, name)
@@ -96,7 +97,7 @@ class Scene:
                 mesh.vertices,
                 mesh.faces,
                 batched_wxyzs=upright,
-                batched_positions=home,
+                batched_positions=self._display.data.site(name).xpos + self._offsets,
                 batched_colors=np.round(rgba[:3] * 255.0).astype(np.uint8),
                 opacity=0.55 if name == TARGET_SITE else 0.9,
                 side="double",
@@ -135,19 +136,17 @@ class Scene:
         frame = frames[-1]
         positions = np.zeros((number, model.nbody, 3))
         rotations = np.zeros((number, model.nbody, 4))
-        sites = {name: np.zeros((number, 3)) for name in self._markers}
+        targets = np.zeros((number, 3))
         for i in range(number):
             display.pose(frame.qpos[i], frame.target_height[i])
             positions[i], rotations[i] = display.data.xpos, display.data.xquat
-            for name, site_positions in sites.items():
-                site_positions[i] = display.data.site(name).xpos
+            targets[i] = display.data.site(TARGET_SITE).xpos
         with self._server.atomic():
             for body, handle in self._bodies.items():
                 if model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
-            for name, handle in self._markers.items():
-                handle.batched_positions = sites[name] + self._offsets
+            self._markers[TARGET_SITE].batched_positions = targets + self._offsets
             self._line.points, self._line.colors = self._trails(frames)
             for seen in frames:
                 over = seen.over[:number]
