@@ -1,4 +1,4 @@
-"""Finds the start pose and the servos of an arm: `python -m bounce_mjx.adopt [CHECKPOINT]`."""
+"""Finds the start pose and the servos of an arm: `python -m bounce_mjx.adopt MJCF`."""
 
 import sys
 
