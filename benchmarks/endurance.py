@@ -23,7 +23,8 @@ from bounce_mjx import BounceBall
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
+from bounce_mjx.evaluation.config import DEFAULT_SEED
+from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.reports.tables import figure_text

@@ -1,6 +1,7 @@
 """The console script: its commands, its help, and Ctrl-C while it starts."""
 
 import importlib
+import os
 import re
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import bounce_mjx
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.training import setup
 
 PYTHON = [sys.executable, "-X", "importtime"]
 SCRIPT = ["-c", "from bounce_mjx.commands.main import main; main()"]
@@ -118,6 +120,36 @@ def test_only_the_chosen_command_is_imported() -> None:
     assert done.stdout.endswith("['bounce_mjx.commands.main', 'bounce_mjx.commands.train']")
 
 
+# Libraries that read a command line and print its help; the last line has their dependencies.
+HELP_NEEDS = set("bounce_mjx pydantic rich tyro yaml".split()) | set(
+    "annotated_types docstring_parser pydantic_core typeguard typing_extensions "
+    "typing_inspection".split()
+)
+
+
+@pytest.mark.parametrize("needs", [{"bounce_mjx"}, HELP_NEEDS], ids=["import", "help"])
+def test_an_import_and_each_help_are_light(needs: set[str]) -> None:
+    """Neither imports a library that computes, draws or simulates."""
+    helps = """
+for name in COMMANDS:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main([name, "--help"])
+"""
+    code = f"""
+import contextlib, io, sys
+before = set(sys.modules)
+import bounce_mjx
+from bounce_mjx.commands.main import COMMANDS, main
+{helps if needs is HELP_NEEDS else ""}
+imported = {{name.split(".")[0] for name in set(sys.modules) - before}}
+print(*sorted(imported - sys.stdlib_module_names))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = set(done.stdout.split())
+    libraries = {name for name in imported if not name.startswith(("_", "cython"))}
+    assert "bounce_mjx" in libraries and libraries <= needs
+
+
 @pytest.mark.parametrize(
     "command",
     [[*SCRIPT, "eval"], ["-m", "bounce_mjx.play"], [str(CHECKOUT / "train_jax.py")]],
@@ -166,3 +198,13 @@ def test_usual_spellings_of_flags(flags: str) -> None:
     for name in path:
         value = getattr(value, name)
     assert value == expected
+
+
+@pytest.mark.parametrize(
+    "given", ["", "--xla_force_host_platform_device_count=2", "--xla_backend_extra_options=a"]
+)
+def test_the_users_flags_of_xla_have_priority(monkeypatch, given: str) -> None:
+    monkeypatch.setenv("XLA_FLAGS", given)
+    setup.set_up_cpu()
+    added = [] if "extra_options" in given else [setup.MULTI_OUTPUT_FUSION]
+    assert os.environ["XLA_FLAGS"].split() == given.split() + added

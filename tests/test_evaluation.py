@@ -602,7 +602,7 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
             progress(share)
         return evaluation
 
-    monkeypatch.setattr(eval_command, "evaluate_policy", evaluate)
+    monkeypatch.setattr(policy_evaluation, "evaluate_policy", evaluate)
     results = tmp_path / "results.json"
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([str(resource_path("pretrained")), "--json", str(results)])

@@ -59,7 +59,10 @@ import sys
 import bounce_mjx
 print("jax" in sys.modules)
 env = bounce_mjx.BounceBall(bounce_mjx.EnvConfig())
-heavy = "brax mujoco.mjx trimesh scipy networkx numba flax optax orbax matplotlib gymnasium torch"
+heavy = (
+    "brax mujoco.mjx trimesh scipy networkx numba flax optax orbax matplotlib gymnasium torch "
+    "array_api_compat stable_baselines3 sbx torchrl skrl"
+)
 print(env.backend, *(name for name in heavy.split() if name in sys.modules))
 print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
 """

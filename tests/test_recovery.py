@@ -489,6 +489,35 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
     assert fresh != pytest.approx(mean_return(config.eval_seed))
 
 
+# Starts
+
+
+COUNTED = """
+import sys
+import jax
+from bounce_mjx.commands.train import main
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+main(sys.argv[1:])
+names = "compile_requests_use_cache", "cache_hits"
+print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
+"""
+
+
+def test_a_second_start_compiles_nothing(tmp_path: Path) -> None:
+    """Every program of the second start is read from the cache."""
+    counts = []
+    for start in ("first", "second"):
+        flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir", tmp_path / start]
+        with job(tmp_path / f"{start}.log", *flags, code=COUNTED) as process:
+            assert process.wait() == 0, process.said
+        (line,) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
+        counts.append(tuple(map(int, line)))
+    requests, hits = counts[1]
+    assert requests == hits >= 3
+    assert counts[0][0] == requests
+
+
 def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     """The program of a screening of three episodes also runs a full evaluation of four, on the
     resets that one program of four episodes uses."""
@@ -558,7 +587,7 @@ def test_the_time_left(monkeypatch, steps: int, solved: bool, expected: str) -> 
     config = TrainConfig(total_steps=100, stop_when_solved=solved)
     names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
     metrics = {name: np.ones((1, 1)) for name in names} | {"task/non_finite": np.zeros((1, 1))}
-    reporter = Reporter([], Console(file=shown, width=200), config, 50)
+    reporter = Reporter(lambda: [], Console(file=shown, width=200), config, 50)
     now = 120.0
     reporter.block(steps, 1.0, metrics)
     assert expected in shown.getvalue()
@@ -697,7 +726,8 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
         said.append(line)
         os.kill(os.getpid(), signal.SIGINT)
 
-    reporter = Reporter([SummaryWriter(tmp_path)], Console(file=io.StringIO()), TrainConfig(), 0)
+    log = SummaryWriter(tmp_path)
+    reporter = Reporter(lambda: [log], Console(file=io.StringIO()), TrainConfig(), 0)
     monkeypatch.setattr(reporter, "say", say)
     writer = CheckpointWriter(blocked, TrainConfig())
     writer.save(["latest"], 64, {"array": np.zeros(3)})

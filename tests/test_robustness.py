@@ -396,7 +396,7 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
 @pytest.fixture
 def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
     """Makes the command return this report's outcomes without a simulation."""
-    monkeypatch.setattr(robustness_command, "measure_conditions", lambda *_, **__: report.outcomes)
+    monkeypatch.setattr(robustness, "measure_conditions", lambda *_, **__: report.outcomes)
     return report
 
 

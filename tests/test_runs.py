@@ -20,6 +20,7 @@ from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
@@ -225,7 +226,9 @@ def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> Non
     run.parent.mkdir(parents=True)
     run.symlink_to(PRETRAINED)
     report = report_of([1.0, 2.0, None, 4.0, 5.0])
-    monkeypatch.setattr(eval_command, "evaluate_policy", lambda *_, **__: (report, "fused", ()))
+    monkeypatch.setattr(
+        policy_evaluation, "evaluate_policy", lambda *_, **__: (report, "fused", ())
+    )
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([str(run)])
     assert exit_info.value.code == 1

@@ -16,7 +16,9 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
+from skrl.envs.wrappers.torch import wrap_env
 from skrl.trainers.torch import SequentialTrainer
 from tensordict import TensorDict
 
@@ -430,6 +432,27 @@ def test_gymnasium_vector_env_stays_on_the_device(env):
     assert after[0, 28] != first[0, 28]
     assert after.numpy() in made.observation_space
     assert reward.shape == terminated.shape == (made.num_envs,)
+
+
+def test_skrl_and_gymnasium_wrap_the_vector_env(env):
+    """skrl's wrapper gives arrays as actions, and Gymnasium's counts the episodes."""
+    made = RecordEpisodeStatistics(TorchGymnasiumVectorEnv(env))
+    wrapped = wrap_env(made, verbose=False)
+    assert wrapped.num_envs == NUM_ENVS and wrapped.action_space == made.single_action_space
+    first, _ = wrapped.reset()
+    env.reset(seed=7)
+    state = env.state
+    expected = env.step(torch.full((NUM_ENVS, 6), 0.5))
+    expected = expected.observation.clone(), expected.reward[:, None].clone()
+    env.state = state
+    observation, reward, terminated, truncated, _ = wrapped.step(torch.full((NUM_ENVS, 6), 0.5))
+    torch.testing.assert_close((observation, reward), expected)
+    assert first.shape == observation.shape and terminated.shape == truncated.shape == (NUM_ENVS, 1)
+    wrapped.render()
+    for _ in range(EPISODE_STEPS - 1):
+        *_, truncated, info = wrapped.step(torch.zeros(NUM_ENVS, 6))
+    assert truncated.all()
+    np.testing.assert_array_equal(info["episode"]["l"], EPISODE_STEPS)
 
 
 # Networks

@@ -1,10 +1,12 @@
 """Ctrl-C during work that Python cannot interrupt, such as a compilation by XLA."""
 
 import concurrent.futures
+import contextlib
 import os
+import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn, TypeVar
 
 Result = TypeVar("Result")
@@ -45,6 +47,20 @@ def run_interruptible(function: Callable[..., Result], *arguments: Any, **keywor
     except KeyboardInterrupt as interrupt:
         raise Interrupted from interrupt
     return future.result()
+
+
+@contextlib.contextmanager
+def interruptible_imports() -> Iterator[None]:
+    """Lets Ctrl-C end the process at once, without a KeyboardInterrupt: a library that is being
+    imported may turn it into another exception."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def leave(status: int = INTERRUPTED) -> NoReturn:

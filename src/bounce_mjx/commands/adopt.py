@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 import yaml
@@ -13,14 +13,13 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.robot.adopt import Adoption, adopt
-from bounce_mjx.robot.arm import limit_words
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training.setup import set_up_jax
+
+if TYPE_CHECKING:
+    from bounce_mjx.robot.adopt import Adoption
 
 DEFAULT_SITE = "attachment_site"
 
@@ -52,6 +51,11 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx adopt",
             description="Finds the start pose and the servos of an arm, and writes its config.",
         )
+        with interruptible_imports():
+            from bounce_mjx.robot.adopt import adopt
+            from bounce_mjx.task.env import BounceBall
+            from bounce_mjx.training.setup import set_up_jax
+
         set_up_jax()
         console = Console(soft_wrap=True, highlight=False)
         default = EnvConfig()
@@ -78,7 +82,7 @@ def main(args: Sequence[str] | None = None) -> None:
             view.main(["--robot", str(out), "--actions", "zero"])
 
 
-def env_values(mjcf: Path, adoption: Adoption) -> dict[str, Any]:
+def env_values(mjcf: Path, adoption: "Adoption") -> dict[str, Any]:
     """The settings of `EnvConfig` that belong to an adopted arm.
 
     The task keeps its heights relative to the paddle's home; those of the default config are for a
@@ -108,8 +112,10 @@ def env_values(mjcf: Path, adoption: Adoption) -> dict[str, Any]:
     }
 
 
-def described(adoption: Adoption) -> list[str]:
+def described(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
+    from bounce_mjx.robot.arm import limit_words
+
     pose, arm = adoption.pose, adoption.arm
     x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
     kind = "kept" if adoption.are_kept else "made from the reflected inertia"
@@ -129,12 +135,14 @@ def described(adoption: Adoption) -> list[str]:
     return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]
 
 
-def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: Adoption) -> None:
+def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adoption") -> None:
     """Writes the YAML file of an adopted arm.
 
     Raises:
       UserError: the file cannot be written.
     """
+    from bounce_mjx.runs.files import write_atomically
+
     site = adoption.config.site
     head = f"# An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}\n"
     text = head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)

@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -21,15 +21,8 @@ from rich.progress import (
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
-from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED
-from bounce_mjx.interrupt import run_interruptible
-from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.files import to_json
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
+from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 
 # An evaluation that is not slower needs no lines about its progress.
 _SILENT_SECONDS = 10.0
@@ -50,7 +43,7 @@ class EvalCommand(StrictModel):
     """One target height for all episodes, m. The default is the range of the run's config."""
     nominal: bool = False
     """Whether the worlds are the model's own; else each episode draws one, as in the training."""
-    physics: Literal["config", "fused", "mjx", "mujoco"] = "config"
+    physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
@@ -70,6 +63,15 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
+        with interruptible_imports():
+            from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+            from bounce_mjx.reports.tables import details_line, results_table
+            from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.files import to_json
+            from bounce_mjx.runs.folders import choose_checkpoint
+            from bounce_mjx.runs.reading import load_policy
+            from bounce_mjx.training.setup import set_up_jax
+
         set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)

@@ -11,11 +11,8 @@ from rich.console import Console
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.deploy.export import export_jax, export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import run_interruptible
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 
 
 class ExportCommand(StrictModel):
@@ -44,6 +41,11 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.onnx is None and command.jax is None:
             raise UserError("there is no file to write; give --onnx FILE or --jax FILE")
+        with interruptible_imports():
+            from bounce_mjx.deploy.export import export_jax, export_onnx
+            from bounce_mjx.runs.folders import choose_checkpoint
+            from bounce_mjx.training.setup import set_up_jax
+
         files = {"--onnx": (command.onnx, export_onnx), "--jax": (command.jax, export_jax)}
         for flag, (path, _) in files.items():
             if path is not None and not os.path.isdir(path.absolute().parent):

@@ -3,18 +3,15 @@
 `bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|train-torch`
 """
 
-import contextlib
 import difflib
 import importlib
-import os
-import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 
 import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import INTERRUPTED
+from bounce_mjx.interrupt import interruptible_imports
 
 COMMANDS = {
     "train": "train a policy that keeps the ball bouncing",
@@ -56,7 +53,7 @@ def main(args: Sequence[str] | None = None) -> None:
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
-        with _interruptible():
+        with interruptible_imports():
             module = _import(f"bounce_mjx.commands.{name.replace('-', '_')}")
         module.main(rest)
 
@@ -76,17 +73,3 @@ def _import(name: str) -> ModuleType:
             f"the package {error.name} is not installed for {sys.executable}; in the folder of "
             "bounce_mjx run: pip install -e . (or start the command with uv run)"
         ) from error
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Lets Ctrl-C end the process at once, without a KeyboardInterrupt: a library that is being
-    imported may turn it into another exception."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -12,16 +12,14 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.viewers.controllers import Controller, make_policy_controller
-from bounce_mjx.viewers.scene import MAX_ENVS
-from bounce_mjx.viewers.show import Shown, ViewerOptions, show
+from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
+
+if TYPE_CHECKING:
+    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.viewers.controllers import Controller
+    from bounce_mjx.viewers.show import Shown
 
 
 class PlayCommand(StrictModel):
@@ -53,6 +51,10 @@ def main(args: Sequence[str] | None = None) -> None:
             raise UserError(
                 f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
             )
+        with interruptible_imports():
+            from bounce_mjx.training.setup import set_up_jax
+            from bounce_mjx.viewers.show import show
+
         console = Console()
         set_up_jax()
         paths = command.checkpoints or (None,)
@@ -64,15 +66,22 @@ def main(args: Sequence[str] | None = None) -> None:
         )
 
 
-def _load(path: Path | None, command: PlayCommand, console: Console) -> Shown:
+def _load(path: Path | None, command: PlayCommand, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
+    from bounce_mjx.learning.policy import make_networks
+    from bounce_mjx.runs.config import load_run_config
+    from bounce_mjx.runs.folders import choose_checkpoint
+    from bounce_mjx.runs.reading import load_policy
+    from bounce_mjx.viewers.controllers import make_policy_controller
+    from bounce_mjx.viewers.show import Shown
+
     checkpoint = choose_checkpoint(path, command.log_dir, console)
     config = load_run_config(checkpoint.run)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
     changes = {} if command.physics == "config" else {"physics": command.physics}
     policy = load_policy(checkpoint, config)
 
-    def make_controller(env: BounceBall) -> Controller:
+    def make_controller(env: "BounceBall") -> "Controller":
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         return make_policy_controller(networks, policy)
 

@@ -11,13 +11,7 @@ from pydantic import Field
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import run_interruptible
-from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
-from bounce_mjx.reports.page import record_checkpoint
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 
 
 class PlotCommand(StrictModel):
@@ -44,6 +38,19 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx plot",
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
+        with interruptible_imports():
+            from bounce_mjx.reports.curves import group_runs
+            from bounce_mjx.reports.figures import (
+                curves_figure,
+                evaluation_figure,
+                image,
+                rewards_figure,
+            )
+            from bounce_mjx.reports.page import record_checkpoint
+            from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
+            from bounce_mjx.task.env import BounceBall
+
         runs = [named_run(run, command.log_dir) for run in command.runs or (None,)]
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
         checkpoints = [find_checkpoint(seed) for seed in seeds]

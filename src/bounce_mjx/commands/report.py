@@ -10,9 +10,7 @@ import tyro
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import run_interruptible
-from bounce_mjx.reports.page import record_checkpoint, write_report
-from bounce_mjx.runs.folders import find_checkpoint, named_run
+from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 
 
 class ReportCommand(StrictModel):
@@ -33,6 +31,10 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx report",
             description="Writes the report of a run, report.html in its folder.",
         )
+        with interruptible_imports():
+            from bounce_mjx.reports.page import record_checkpoint, write_report
+            from bounce_mjx.runs.folders import find_checkpoint, named_run
+
         checkpoint = find_checkpoint(named_run(command.run, command.log_dir))
         recording = run_interruptible(record_checkpoint, checkpoint)
         path, _ = write_report(checkpoint.run, recording)

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -12,25 +12,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.results import DEFAULT_SEED
-from bounce_mjx.evaluation.robustness import (
-    DEFAULT_EPISODES,
-    Outcome,
-    Physics,
-    RobustnessReport,
-    measure_conditions,
-)
-from bounce_mjx.evaluation.suite import load_suite
-from bounce_mjx.interrupt import run_interruptible
-from bounce_mjx.learning.policy import Policy
-from bounce_mjx.reports.figures import image
-from bounce_mjx.reports.robustness import ROBUSTNESS_FILE, robustness_figure, robustness_table
+from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
+from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.files import to_json, write_atomically
-from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.training.setup import set_up_jax
+
+if TYPE_CHECKING:
+    from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
+    from bounce_mjx.learning.policy import Policy
+    from bounce_mjx.runs.config import TrainConfig
 
 
 class RobustnessCommand(StrictModel):
@@ -42,7 +31,7 @@ class RobustnessCommand(StrictModel):
     pretrained if there is no run."""
     suite: Path | None = None
     """YAML file of the perturbations; the default is configs/robustness.yaml."""
-    episodes: Count = DEFAULT_EPISODES
+    episodes: Count = DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
@@ -67,6 +56,14 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx robustness",
             description="Measures the five results of a trained policy in perturbed worlds.",
         )
+        with interruptible_imports():
+            from bounce_mjx.evaluation.robustness import RobustnessReport
+            from bounce_mjx.reports.robustness import robustness_table
+            from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
+            from bounce_mjx.runs.reading import load_policy
+            from bounce_mjx.training.setup import set_up_jax
+
         set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
@@ -90,9 +87,16 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _measure(
-    command: RobustnessCommand, config: TrainConfig, policy: Policy, suite: Path, console: Console
-) -> list[Outcome]:
+    command: RobustnessCommand,
+    config: "TrainConfig",
+    policy: "Policy",
+    suite: Path,
+    console: Console,
+) -> "list[Outcome]":
     """Measures all conditions and shows a progress bar."""
+    from bounce_mjx.evaluation.robustness import measure_conditions
+    from bounce_mjx.evaluation.suite import load_suite
+
     conditions = load_suite(suite, config.env)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
@@ -116,8 +120,12 @@ def _make_folder(out: Path) -> None:
         raise _not_writable(out, error) from error
 
 
-def _write(out: Path, report: RobustnessReport) -> None:
+def _write(out: Path, report: "RobustnessReport") -> None:
     """Writes the results and the pictures, and prints their paths."""
+    from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.robustness import ROBUSTNESS_FILE, robustness_figure
+    from bounce_mjx.runs.files import to_json, write_atomically
+
     figure = robustness_figure(report)
     try:
         write_atomically(out / ROBUSTNESS_FILE, to_json(report.model_dump()))

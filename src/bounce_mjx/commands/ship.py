@@ -16,8 +16,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
-from bounce_mjx.evaluation.results import DEFAULT_SEED
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config

@@ -9,12 +9,16 @@ from rich.console import Console
 
 from bounce_mjx.config.settings import whole_number
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import leave
-from bounce_mjx.training import hosts
-from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, run_command
+from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.training.command import (
+    TrainingCommand,
+    asks_for_help,
+    config_of,
+    early_flag,
+    run_command,
+)
 from bounce_mjx.training.command import read_command as read
-from bounce_mjx.training.ppo_trainer import PPOTrainer
-from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
 PROG = "bounce-mjx train"
 
@@ -38,17 +42,32 @@ class TrainCommand(TrainingCommand):
     """Address of that page's server; 0.0.0.0 also admits other machines."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""
-    host_timeout: Annotated[int, Field(ge=1, le=10**6)] = hosts.DEFAULT_TIMEOUT
+    host_timeout: Annotated[int, Field(ge=1, le=10**6)] = DEFAULT_TIMEOUT
     """Seconds that the processes wait for each other at the start, and after which a silent one
     counts as dead."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
-    with hosts.leave_at_once(), exit_on_user_error():
-        args = sys.argv[1:] if args is None else args
+    args = sys.argv[1:] if args is None else args
+    with exit_on_user_error():
+        if asks_for_help(args):
+            read_command(args)
+    several_hosts = _hosts(args)
+    with interruptible_imports():
+        from bounce_mjx.training.setup import find_devices, set_up_jax
+
         set_up_jax()
-        _join_hosts(args)
+        if several_hosts is None:
+            # CUDA starts beside the imports.
+            find_devices()
+        from bounce_mjx.training import hosts, job  # noqa: F401
+        from bounce_mjx.training.ppo_trainer import PPOTrainer
+
+    with hosts.leave_at_once(), exit_on_user_error():
+        if several_hosts is not None:
+            # JAX must not be asked for its devices before.
+            hosts.join(*several_hosts)
         command = read_command(args)
         if not command.watch or not hosts.is_leader():
             run_command(command, PPOTrainer, PROG)
@@ -69,17 +88,19 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     return read(TrainCommand, args, prog=PROG, description=description)
 
 
-def _join_hosts(args: Sequence[str]) -> None:
-    """Joins the other hosts; this must happen before JAX is asked for its devices."""
+def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:
+    """The address, number of processes, number of this process, and time limit of a training on
+    several hosts; None for a training on one."""
     address = early_flag(args, "--coordinator-address")
     words = [early_flag(args, f) for f in ("--num-processes", "--process-id", "--host-timeout")]
     try:
         numbers = [None if word is None else int(whole_number(word)) for word in words]
     except ValueError:
         # The parser refuses the flag by name.
-        return
-    *numbers, timeout = numbers
+        return None
+    processes, process, timeout = numbers
     distributed = early_flag(args, "--distributed")
     wanted = distributed is not None and distributed.lower() != "false"
-    if wanted or any(value is not None for value in (address, *numbers)):
-        hosts.join(address, *numbers, timeout or hosts.DEFAULT_TIMEOUT)
+    if not wanted and all(value is None for value in (address, processes, process)):
+        return None
+    return address, processes, process, timeout or DEFAULT_TIMEOUT

@@ -7,16 +7,22 @@ At its end it writes the networks and the optimizer as `model.pt`, in the format
 import importlib
 import sys
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folders import find_run, latest_checkpoint
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training.command import TrainingCommand, path_flag, read_command, run_command
-from bounce_mjx.training.job import library_of
-from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.training.trainer import Trainer
+from bounce_mjx.training.command import (
+    TrainingCommand,
+    asks_for_help,
+    path_flag,
+    read_command,
+    run_command,
+)
+
+if TYPE_CHECKING:
+    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.training.trainer import Trainer
 
 PROG = "bounce-mjx train-torch"
 
@@ -35,9 +41,17 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        set_up_jax()
+        if not asks_for_help(args):
+            with interruptible_imports():
+                from bounce_mjx.training import job  # noqa: F401
+                from bounce_mjx.training.setup import set_up_jax
+
+            set_up_jax()
         resume, defaults = path_flag(args, "--resume"), {}
         if resume:
+            from bounce_mjx.runs.folders import find_run, latest_checkpoint
+            from bounce_mjx.training.job import library_of
+
             library = library_of(latest_checkpoint(find_run(resume)))
             if library in get_args(Library):
                 defaults = {"library": library}
@@ -52,7 +66,7 @@ def main(args: Sequence[str] | None = None) -> None:
             raise UserError(str(error)) from error
         made = []
 
-        def make_trainer(config: TrainConfig, env: BounceBall) -> Trainer:
+        def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":
             made.append(trainer.TorchTrainer(command.library, config, env))
             return made[0]
 

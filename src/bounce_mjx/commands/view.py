@@ -11,22 +11,11 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import ROBOTS, load_config, named_file
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.command import path_flag
-from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.viewers.controllers import (
-    make_random_controller,
-    make_scripted_controller,
-    make_zero_controller,
-)
-from bounce_mjx.viewers.show import Shown, ViewerOptions, show
-
-_CONTROLLERS = {
-    "random": make_random_controller,
-    "zero": make_zero_controller,
-    "scripted": make_scripted_controller,
-}
+from bounce_mjx.viewers.options import ViewerOptions
 
 
 class ViewCommand(StrictModel):
@@ -54,10 +43,23 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
+        with interruptible_imports():
+            from bounce_mjx.training.setup import set_up_jax
+            from bounce_mjx.viewers.controllers import (
+                make_random_controller,
+                make_scripted_controller,
+                make_zero_controller,
+            )
+            from bounce_mjx.viewers.show import Shown, show
+
+        controllers = {
+            "random": make_random_controller,
+            "zero": make_zero_controller,
+            "scripted": make_scripted_controller,
+        }
         set_up_jax()
-        controller = _CONTROLLERS[command.actions]
         show(
-            [Shown(command.env, controller, f"{command.actions} actions")],
+            [Shown(command.env, controllers[command.actions], f"{command.actions} actions")],
             command.viewing,
             target_height=None,
             console=Console(),

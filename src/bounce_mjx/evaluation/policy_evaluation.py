@@ -2,14 +2,15 @@
 
 import functools
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 
 from bounce_mjx.config.validation import validate
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
-from bounce_mjx.evaluation.results import DEFAULT_EPISODES, DEFAULT_SEED, Report, judge
+from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.task.config import EnvConfig
@@ -36,7 +37,7 @@ def evaluate_policy(
     seed: int = DEFAULT_SEED,
     target_height: float | None = None,
     nominal: bool = False,
-    physics: Literal["config", "fused", "mjx", "mujoco"] = "config",
+    physics: Physics = "config",
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
     """Measures the five results of a policy without action noise.

@@ -11,10 +11,6 @@ from bounce_mjx.evaluation.recording import Recording
 from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, MAX_X_ERROR, Statistics
 from bounce_mjx.task.env import BounceBall
 
-DEFAULT_EPISODES = 1024
-DEFAULT_SEED = 20_000
-"""Seed of the resets; a training evaluates with a different one."""
-
 MIN_CONSECUTIVE_BOUNCES = 3
 MIN_EPISODE_SHARE = 0.99
 """Minimum share of episodes with enough consecutive bounces, and of stable episodes."""

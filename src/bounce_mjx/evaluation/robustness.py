@@ -4,7 +4,6 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +11,15 @@ import numpy as np
 import pydantic
 
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.results import DEFAULT_SEED, judge
+from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.suite import Condition, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import RandomizationConfig, Ranges
-
-DEFAULT_EPISODES = 64
-
-Physics = Literal["config", "fused", "mjx", "mujoco"]
 
 # Terms without a neutral value, or with a high cost in the physics: only the conditions that need
 # such a term are simulated with it.
@@ -94,7 +90,7 @@ def measure_conditions(
     ppo_config: PPOConfig,
     conditions: Sequence[Condition],
     *,
-    episodes: int = DEFAULT_EPISODES,
+    episodes: int = DEFAULT_CONDITION_EPISODES,
     seed: int = DEFAULT_SEED,
     physics: Physics = "config",
     progress: Callable[[int], None] = lambda done: None,

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES, Recording
-from bounce_mjx.evaluation.results import DEFAULT_SEED, Report
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (

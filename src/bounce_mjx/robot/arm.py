@@ -79,11 +79,6 @@ def locate(mjcf: Path) -> Path:
     return path
 
 
-def is_packaged(mjcf: Path) -> bool:
-    """Whether `locate` finds the file by the name of a package."""
-    return str(mjcf).startswith(("package:", "menagerie:"))
-
-
 def _in_package(name: str) -> Path:
     package, _, file = name.partition("/")
     found = importlib.util.find_spec(package) if package.isidentifier() else None

@@ -1,5 +1,7 @@
 """Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
 
+from pathlib import Path
+
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
@@ -60,3 +62,8 @@ class RobotConfig(StrictModel):
                 "number of each for each acting joint, or none of the three"
             )
         return self
+
+
+def is_packaged(mjcf: Path) -> bool:
+    """Whether `locate` finds the file by the name of a package."""
+    return str(mjcf).startswith(("package:", "menagerie:"))

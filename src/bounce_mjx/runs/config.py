@@ -1,17 +1,19 @@
 """The settings of a training run, and their YAML file."""
 
+import importlib.metadata
+import importlib.util
 import os
+import sys
 from pathlib import Path
 from typing import Any
-
-import jax
 
 from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
+from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.arm import is_packaged
+from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.robot import check_robot
 from bounce_mjx.task.config import EnvConfig
 
@@ -106,7 +108,7 @@ def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
       UserError: the file is missing or invalid.
     """
     if path is None:
-        path = Path("cpu" if jax.default_backend() == "cpu" else "default")
+        path = Path("default" if has_accelerator() else "cpu")
     return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS))
 
 
@@ -116,6 +118,15 @@ def named_file(path: Path, folder: str) -> Path:
     named = resource_path(f"{folder}/{path.name}.yaml")
     is_name = str(path) == path.name and not os.path.exists(path)
     return named if is_name and os.path.isfile(named) else path
+
+
+def has_accelerator() -> bool:
+    """Whether JAX computes on an accelerator by default. JAX is imported only if a plugin for one
+    is installed."""
+    plugins = importlib.metadata.entry_points(group="jax_plugins") or any(
+        importlib.util.find_spec(name) for name in ("jax_plugins", "libtpu")
+    )
+    return bool(plugins or "jax" in sys.modules) and jax.default_backend() != "cpu"
 
 
 def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:

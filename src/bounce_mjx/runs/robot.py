@@ -12,10 +12,8 @@ import os
 import shutil
 from pathlib import Path
 
-import mujoco
-
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import locate
+from bounce_mjx.lazy import mujoco
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal
 
 ROBOT = "robot"
@@ -35,6 +33,8 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
       OSError: a file cannot be read or written.
       UserError: the file is missing.
     """
+    from bounce_mjx.robot.arm import locate
+
     mjcf = locate(mjcf)
     files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(mjcf))]
     root = Path(os.path.commonpath([path.parent for path in files]))

@@ -8,8 +8,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
-from bounce_mjx.robot.arm import is_packaged
-from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.task.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import RewardConfig

@@ -1,14 +1,15 @@
 """The observation: its quantities, how many past values of each it holds, and their order."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 from typing import Annotated, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 from pydantic import Field
 
 from bounce_mjx.config.settings import NonNegative, Positive, StrictModel
+from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
 
@@ -104,7 +105,7 @@ class ObservationConfig(StrictModel):
     """Source of ball_velocity: a sensor, the differences between pictures, or the estimate of the
     Kalman filter (env.estimator)."""
 
-    def layout(self, num_joints: int) -> "ObservationLayout":
+    def layout(self, num_joints: int) -> ObservationLayout:
         """The order of the entries for an arm with this number of acting joints."""
         values = ((part, getattr(self, part.name)) for part in parts(num_joints))
         return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in values if n))

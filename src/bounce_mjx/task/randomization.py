@@ -4,27 +4,27 @@ A term is a key of the config with a range (low, high), from which a reset draws
 term uniformly. A term that is null is inactive and costs nothing.
 """
 
-import math
-from typing import Annotated, NamedTuple
+from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-import mujoco
-import numpy as np
+import math
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
-from bounce_mjx.physics.fused.scalars import Quaternion, quaternion_product
-from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.lazy import jax, jnp, mujoco, np
+
+if TYPE_CHECKING:
+    from bounce_mjx.physics import PhysicsParameters
+    from bounce_mjx.physics.fused.scalars import Quaternion
 
 Range = tuple[Finite, Finite]
 
-World = dict[str, jax.Array]
+World = dict[str, "jax.Array"]
 """Values drawn for one episode, by the names of the active terms."""
 
-Ranges = dict[str, tuple[jax.Array, jax.Array]]
+Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 """Lower and upper ends of the active terms' ranges, each a number [] or an array of the term's
 shape."""
 
@@ -45,9 +45,9 @@ class Term(NamedTuple):
         return (num_joints,) if self.size is None else self.size
 
 
-_ANY = (-np.inf, np.inf)
+_ANY = (-math.inf, math.inf)
 _FACTOR = (1e-3, 1e3)
-_NOT_NEGATIVE = (0.0, np.inf)
+_NOT_NEGATIVE = (0.0, math.inf)
 
 TERMS: dict[str, Term] = {
     "restitution": Term((), 0.85, (0.6, 0.98)),
@@ -58,7 +58,7 @@ TERMS: dict[str, Term] = {
     "servo_gain": Term(None, 1.0, _FACTOR),
     "servo_damping": Term(None, 1.0, _FACTOR),
     "servo_lag": Term((), 0.0, _NOT_NEGATIVE),
-    "torque_limit": Term(None, None, (1e-3, np.inf)),
+    "torque_limit": Term(None, None, (1e-3, math.inf)),
     "joint_damping": Term(None, 0.0, _NOT_NEGATIVE),
     "joint_frictionloss": Term(None, 0.0, _NOT_NEGATIVE),
     "armature": Term(None, 1.0, _FACTOR),
@@ -79,9 +79,9 @@ TERMS: dict[str, Term] = {
     "joint_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
     "joint_velocity_bias": Term(None, 0.0, _ANY),
     "push_speed": Term((), 0.0, _NOT_NEGATIVE),
-    "push_interval": Term((), None, (0.01, np.inf)),
-    "target_height": Term((), None, (1e-3, np.inf)),
-    "target_interval": Term((), None, (0.01, np.inf)),
+    "push_interval": Term((), None, (0.01, math.inf)),
+    "target_height": Term((), None, (1e-3, math.inf)),
+    "target_interval": Term((), None, (0.01, math.inf)),
     "ball_start": Term((3,), 0.0, _ANY),
     "joint_start": Term(None, 0.0, _ANY),
 }
@@ -232,6 +232,11 @@ def draw_world(
 
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
+    # The engines are not needed to read a config.
+    from bounce_mjx.physics.fused.scalars import quaternion_product
+    from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
+    from bounce_mjx.robot.model import find_addresses
+
     m, addresses = mj_model, find_addresses(mj_model)
     servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
     paddle = addresses.paddle_geom
@@ -302,6 +307,8 @@ def _array(values: np.ndarray, like: jax.Array) -> jax.Array:
 def _rotation_xy(angles: jax.Array) -> Quaternion:
     """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
     a, b = 0.5 * angles[0], 0.5 * angles[1]
+    from bounce_mjx.physics.fused.scalars import quaternion_product
+
     about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
     about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
     return quaternion_product(about_x, about_y)

@@ -5,15 +5,16 @@ A term is a config class with the weight and the constants, and below it the for
 `reward/<name>`, the log and the report's figure follow the registry `TERMS`.
 """
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
+from bounce_mjx.lazy import jax, jnp
 
 
 class RewardInputs(NamedTuple):

@@ -1,12 +1,11 @@
 """Shared by the commands that train: their flags, the start of the job, and the printed results."""
 
-import importlib
 import importlib.util
 import shlex
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 from rich.console import Console
@@ -16,17 +15,13 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import leave
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.reports.tables import details_line, results_table, seeds_table
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
-from bounce_mjx.runs.folders import find_run, named_run, runs_of_seeds
-from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import RESUMABLE_KEYS
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.training import hosts
-from bounce_mjx.training.console import say
-from bounce_mjx.training.job import REPORT_MODULE, Outcome, TrainingStopped, train
-from bounce_mjx.training.trainer import Trainer, Watcher
+
+if TYPE_CHECKING:
+    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.training.job import Outcome
+    from bounce_mjx.training.trainer import Trainer, Watcher
 
 
 class TrainingCommand(TrainConfig):
@@ -72,6 +67,9 @@ def read_command(
         if given and resume:
             raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
     if resume:
+        from bounce_mjx.runs.folders import find_run, named_run
+        from bounce_mjx.runs.reading import RESUMABLE_KEYS
+
         log_dir = path_flag(args, "--log-dir") or TrainConfig().log_dir
         resume = find_run(named_run(resume, log_dir))
     base = load_run_config(resume) if resume else read_preset(config_path, robot)
@@ -100,21 +98,28 @@ def read_command(
 
 def _is_solved(run: Path) -> bool:
     """Whether every seed of a run has met all five results."""
+    from bounce_mjx.runs.folders import runs_of_seeds
+    from bounce_mjx.runs.progress import load_results
+
     results = [load_results(seed) for seed in runs_of_seeds(run)]
     return all(found is not None and found.solved_steps is not None for found in results)
 
 
 def run_command(
     command: TrainingCommand,
-    make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+    make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
-    watcher: Watcher | None = None,
-) -> Sequence[Outcome]:
+    watcher: "Watcher | None" = None,
+) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
     """
+    from bounce_mjx.training import hosts
+    from bounce_mjx.training.console import say
+    from bounce_mjx.training.job import TrainingStopped, train
+
     if command.wandb is not None and importlib.util.find_spec("wandb") is None:
         raise UserError(
             "--wandb needs the package wandb; install it with: pip install 'bounce_mjx[wandb]'"
@@ -144,8 +149,11 @@ def run_command(
     return outcomes
 
 
-def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
+def show(outcomes: "Sequence[Outcome]", console: Console) -> "Outcome":
     """Prints the results of a training; returns the best seed's outcome."""
+    from bounce_mjx.reports.tables import details_line, results_table, seeds_table
+    from bounce_mjx.training.console import say
+
     best = max((o for o in outcomes if o.report is not None), key=lambda o: o.report.score)
     if len(outcomes) > 1:
         console.print(seeds_table({o.seed: o.report for o in outcomes}))
@@ -159,12 +167,15 @@ def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:
     return best
 
 
-def leave_report(outcome: Outcome, console: Console) -> None:
+def leave_report(outcome: "Outcome", console: Console) -> None:
     """Draws the report. The training is already saved, so a failure only prints one line."""
+    from bounce_mjx.training.console import say
+
     started = time.perf_counter()
     try:
-        report_module = importlib.import_module(REPORT_MODULE)
-        page = report_module.report_training(outcome.run, outcome.report, outcome.best_steps)
+        from bounce_mjx.training.report import report_training
+
+        page = report_training(outcome.run, outcome.report, outcome.best_steps)
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         again = f"bounce-mjx report {shlex.quote(str(outcome.run))}"
@@ -176,6 +187,11 @@ def leave_report(outcome: Outcome, console: Console) -> None:
 def config_of(command: TrainingCommand) -> TrainConfig:
     """The run's config within a command line."""
     return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+
+
+def asks_for_help(args: Sequence[str]) -> bool:
+    """Whether the command line only prints the help."""
+    return not {"-h", "--help"}.isdisjoint(args)
 
 
 def path_flag(args: Sequence[str], flag: str) -> Path | None:

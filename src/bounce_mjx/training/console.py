@@ -3,7 +3,7 @@
 import math
 import time
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from rich.console import Console
@@ -25,7 +25,7 @@ class Reporter:
 
     def __init__(
         self,
-        logs: Sequence["SummaryWriter | Logs"],
+        logs: Callable[[], Sequence["SummaryWriter | Logs"]],
         console: Console,
         config: TrainConfig,
         first_step: int,
@@ -33,10 +33,11 @@ class Reporter:
     ):
         """
         Args:
-          logs: one log per seed; none in a process that writes nothing.
+          logs: returns one log per seed, none in a process that writes nothing; it is first called
+            after the first block, as TensorBoard's library takes seconds to import.
         """
         self._console, self._watcher = console, watcher
-        self._logs = logs
+        self._open_logs = logs
         self._progress = Progress(
             TextColumn("[bold]training"),
             BarColumn(),
@@ -54,6 +55,10 @@ class Reporter:
         unknown = np.full(config.num_seeds, math.nan)
         self._last = {"episode/return": unknown, "episode/bounces": unknown}
         self._saving_problem: str | None = None
+
+    @property
+    def _logs(self) -> Sequence["SummaryWriter | Logs"]:
+        return self._open_logs()
 
     def __enter__(self) -> "Reporter":
         self._progress.start()

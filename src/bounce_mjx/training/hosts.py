@@ -26,11 +26,9 @@ from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.training.peers import Address, Peers
+from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Address, Peers
 
 Tree = TypeVar("Tree")
-
-DEFAULT_TIMEOUT = 300
 
 _peers: Peers | None = None
 _host, _timeout = "", float(DEFAULT_TIMEOUT)

@@ -260,7 +260,9 @@ class _Job:
             say(self.console, f"{met}; {how if self.config.stop_when_solved else goes_on}")
 
     def compile(self, report: bool) -> None:
-        """Compiles the programs; during the compilation it opens logs and imports modules."""
+        """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
+        opened, and the libraries that save and draw are imported in the background, also while the
+        training already runs."""
         with self.console.status("compiling"):
             compiling = self.pool.submit(self._compile, report)
             if not self.stop.wait_for(compiling):
@@ -288,7 +290,7 @@ class _Job:
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.reporter = self.stack.enter_context(
-            Reporter(opening.result(), self.console, self.config, self.steps, self.watcher)
+            Reporter(opening.result, self.console, self.config, self.steps, self.watcher)
         )
         self.clock.lap("compile")
 
@@ -296,11 +298,11 @@ class _Job:
         """Returns once the training can start, with the future of its logs. The longest program is
         traced first: Python traces one program at a time while XLA compiles others."""
         compiling = self.trainer.compile(self.pool)
+        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
         self.pool.submit(importlib.import_module, "orbax.checkpoint")
         if report:
             opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
-        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
         compiling.result()
         return opening
 

@@ -16,6 +16,9 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn, TextIO
 
+DEFAULT_TIMEOUT = 300
+"""Time after which a silent process counts as dead, s."""
+
 # Within this time, a process that fails on its own prints its own reason.
 _GRACE_SECONDS = 1.0
 _CONNECT_SECONDS = 30.0

@@ -13,7 +13,6 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.display import MARKERS, TARGET_SITE, Display, body_scenes, site_mesh
 from bounce_mjx.viewers.simulation import Frame
 
-MAX_ENVS = 16
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
 # Distance of a label above its target, which the ball may exceed.

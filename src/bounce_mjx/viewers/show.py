@@ -1,15 +1,12 @@
-"""The viewing options that `view` and `play` share, and the viewers that they start."""
+"""The viewers and recordings that `view` and `play` start."""
 
 import contextlib
 import string
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import NamedTuple
 
-from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.robot.model import fingerprint
@@ -18,44 +15,11 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
-from bounce_mjx.viewers.pace import SPEED_RANGE
-from bounce_mjx.viewers.scene import MAX_ENVS
+from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
 
 _RECORDED_SECONDS = 10.0
-
-
-class ViewerOptions(StrictModel):
-    """Choice of a viewer or a recording."""
-
-    viewer: Literal["auto", "browser", "native"] = "auto"
-    """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
-    display and browser elsewhere."""
-    video: Path | None = None
-    """File for a video, .mp4 or .gif, instead of a viewer."""
-    html: Path | None = None
-    """File for a page that replays the episode offline, instead of a viewer."""
-    seconds: Positive | None = None
-    """Simulated time, s. The default is 10 for a recording; a viewer runs until it is closed."""
-    num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
-    """Robots side by side, on the live page and in the replay."""
-    speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
-    """Speed of a viewer, as a factor of real time."""
-    fps: Annotated[int, Field(ge=1, le=240)] | None = None
-    """Frames per second of a recording. The default is 60 for an MP4, 25 for a GIF and 30 for a
-    page."""
-    size: tuple[Annotated[int, Field(ge=64, le=4096)], Annotated[int, Field(ge=64, le=4096)]] = (
-        640,
-        480,
-    )
-    """Width and height of a video in pixels."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    """Seed of the resets."""
-    host: str = "127.0.0.1"
-    """Address of the page's server; 0.0.0.0 also admits other machines."""
-    port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
-    """Port of the page's server, or the next free port."""
 
 
 class Shown(NamedTuple):

@@ -1,0 +1,44 @@
+"""The viewing options that `view` and `play` share."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from bounce_mjx.config.settings import Positive, StrictModel
+from bounce_mjx.viewers.pace import SPEED_RANGE
+
+MAX_ENVS = 16
+"""Largest number of robots side by side."""
+
+
+class ViewerOptions(StrictModel):
+    """Choice of a viewer or a recording."""
+
+    viewer: Literal["auto", "browser", "native"] = "auto"
+    """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
+    display and browser elsewhere."""
+    video: Path | None = None
+    """File for a video, .mp4 or .gif, instead of a viewer."""
+    html: Path | None = None
+    """File for a page that replays the episode offline, instead of a viewer."""
+    seconds: Positive | None = None
+    """Simulated time, s. The default is 10 for a recording; a viewer runs until it is closed."""
+    num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
+    """Robots side by side, on the live page and in the replay."""
+    speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
+    """Speed of a viewer, as a factor of real time."""
+    fps: Annotated[int, Field(ge=1, le=240)] | None = None
+    """Frames per second of a recording. The default is 60 for an MP4, 25 for a GIF and 30 for a
+    page."""
+    size: tuple[Annotated[int, Field(ge=64, le=4096)], Annotated[int, Field(ge=64, le=4096)]] = (
+        640,
+        480,
+    )
+    """Width and height of a video in pixels."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Seed of the resets."""
+    host: str = "127.0.0.1"
+    """Address of the page's server; 0.0.0.0 also admits other machines."""
+    port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
+    """Port of the page's server, or the next free port."""
