@@ -172,6 +172,14 @@ def test_damping_of_the_ball_is_refused(mj_model, base):
     np.testing.assert_array_equal(read(mj_model, base, dof_damping=damping).damping[1], 1.0)
 
 
+def test_friction_of_the_floor_is_refused(mj_model, base):
+    """Only the paddle touches the ball, so another geom's friction would change nothing."""
+    friction = np.stack([base.geom_friction] * 2)
+    friction[1, mj_model.geom("floor").id, 0] = 1.0
+    with pytest.raises(UserError, match="geom_friction, .* no effect"):
+        read(mj_model, base, geom_friction=friction)
+
+
 def test_friction_of_geoms_and_of_the_pair_exclude_each_other(mj_model, base):
     with pytest.raises(UserError, match="geom_friction and pair_friction"):
         read(

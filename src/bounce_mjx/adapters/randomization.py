@@ -112,8 +112,33 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
             f"randomization_fn changes {name}, which this physics cannot vary between "
             f"environments; leave it out, or change {', '.join(sorted(_FIELDS))}"
         )
+    _check_acting(mj_model, varied)
     _check_effect(mj_model, base_fields, batches, varied)
     return _read(mj_model, changed, varied)
+
+
+def _check_acting(mj_model: mujoco.MjModel, varied: Fields) -> None:
+    """Checks that each field changes an entry with an effect.
+
+    Raises:
+      UserError: only the torsion, or only objects that touch nothing, change in a field.
+    """
+    addresses = find_addresses(mj_model)
+    geoms = [addresses.ball_geom, addresses.paddle_geom]
+    acting = {
+        "geom_friction": (geoms, 0),
+        "geom_solref": (geoms,),
+        "body_mass": (slice(1, None),),
+    }
+    if "pair_friction" in varied or "pair_solref" in varied:
+        pair = contact_pair(mj_model)
+        acting |= {"pair_friction": (pair, slice(0, 2)), "pair_solref": (pair,)}
+    for name, index in acting.items():
+        if name in varied and not varied[name][index].any():
+            raise UserError(
+                f"randomization_fn changes {name}, but not the entries of the ball, the paddle or "
+                "the links, so it would have no effect; change those, or leave it out"
+            )
 
 
 class _Source(NamedTuple):
