@@ -3,11 +3,13 @@
 All tests and their processes share one cache of compiled programs, which is deleted at the end.
 """
 
+import importlib
 import importlib.util
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
 
 import jax
 import mujoco
@@ -25,6 +27,8 @@ OPTIONAL = "CI" not in os.environ
 HAS_TORCH = all(importlib.util.find_spec(name) for name in ("torch", "rsl_rl", "skrl"))
 
 collect_ignore = ["test_torch.py", "test_torch_train.py"] if OPTIONAL and not HAS_TORCH else []
+if OPTIONAL and not importlib.util.find_spec("stable_baselines3"):
+    collect_ignore.append("test_sb3.py")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -42,7 +46,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_report_header() -> list[str]:
-    return [f"skipped, as PyTorch is missing: {name}" for name in collect_ignore]
+    return [f"skipped, as a library is missing: {name}" for name in collect_ignore]
 
 
 @pytest.fixture
@@ -56,6 +60,12 @@ def float64() -> Iterator[None]:
 def mj_model() -> mujoco.MjModel:
     """The shipped model at the default time step."""
     return load_model(None, EnvConfig().physics_dt)
+
+
+@pytest.fixture(scope="session")
+def need() -> Callable[[str], types.ModuleType]:
+    """Imports an optional package."""
+    return pytest.importorskip if OPTIONAL else importlib.import_module
 
 
 @pytest.fixture(scope="session")

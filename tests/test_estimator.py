@@ -167,6 +167,25 @@ def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
     assert np.abs(np.array(estimates({"ball_age": np.array([0.0])})) - expected).max() > 0.02
 
 
+def test_measurements_of_missed_steps_are_no_pictures() -> None:
+    """A late call fills the missed control steps with interpolated measurements; to the filter, the
+    last picture is still the newest."""
+    metadata = describe(TrainConfig(env=ENV), 0)
+    angles = np.array(metadata.default_joint_angles)
+
+    def measured(height: float, age: float) -> dict[str, np.ndarray]:
+        position = np.array([0.59, 0.0, height])
+        return {"ball_position": position, "ball_age": np.array([age]), "joint_angles": angles}
+
+    seen = []
+    for between, is_real in ((measured(0.45, 0.02), False), (measured(0.5, 0.03), True)):
+        histories = Histories(metadata, measured(0.5, 0.02))
+        histories.add(between, np.zeros(6), is_real)
+        histories.add(measured(0.4, 0.02), np.zeros(6))
+        seen.append([histories.values[name][0] for name in SEEN])
+    np.testing.assert_array_equal(*seen)
+
+
 @pytest.mark.usefixtures("float64")
 def test_a_stated_latency_replaces_the_true_one(mj_model) -> None:
     """The age of an unstamped picture is the time since its arrival plus the stated latency."""

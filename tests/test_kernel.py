@@ -182,6 +182,37 @@ def test_devices_keep_their_shard(monkeypatch):
     assert done.stdout.split() == ["0", "0"]
 
 
+@pytest.mark.parametrize("order", ["of the batch", "in the batch"])
+def test_the_kernel_has_the_derivative_of_the_function(order):
+    """A kernel itself has no derivative, so the derivative is the plain function's."""
+
+    def function(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.lax.fori_loop(0, 3, lambda i, z: z * y, x), jnp.sin(x)
+
+    in_kernel = kernel.elementwise(function, 2, interpret=True)
+    x, y = jnp.linspace(0.5, 2.0, BATCH), jnp.linspace(-1.0, 1.0, BATCH)
+    if order == "of the batch":
+        given = jax.grad(lambda x, y: sum(jax.vmap(in_kernel)(x, y)).sum(), argnums=(0, 1))(x, y)
+    else:
+        given = jax.vmap(jax.grad(lambda x, y: sum(in_kernel(x, y)), argnums=(0, 1)))(x, y)
+    np.testing.assert_allclose(given[0], y**3 + np.cos(x), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(given[1], 3.0 * x * y**2, rtol=1e-5, atol=1e-6)
+
+
+def test_a_step_in_the_kernel_has_a_gradient(env, in_kernel, monkeypatch):
+    """Of a control step of several environments: equal to the gradient without the kernel."""
+    physics, ctrl = moving(env, 3)
+
+    def gradient() -> jax.Array:
+        total = lambda ctrl: jnp.sum(batched(env)(physics, ctrl).qvel ** 2)  # noqa: E731
+        return jax.jit(jax.grad(total))(ctrl)
+
+    given = gradient()
+    monkeypatch.setattr(dynamics, "elementwise", kernel.elementwise)
+    np.testing.assert_allclose(given, gradient(), rtol=1e-4, atol=1e-4)
+    assert np.all(np.abs(given).max(axis=0) > 0.0)
+
+
 def test_one_environment_and_float64_are_compiled_by_xla(env, in_kernel):
     physics, ctrl = moving(env, 2)
     one = jax.tree.map(lambda x: x[:, 0], physics)

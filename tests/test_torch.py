@@ -1,18 +1,26 @@
 """The environment for PyTorch: shared memory, the same steps, and the interfaces of PyTorch
 libraries."""
 
+import copy
 import itertools
+import runpy
 import subprocess
 import sys
+import types
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 import torch
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
+from skrl.envs.wrappers.torch import wrap_env
 from skrl.trainers.torch import SequentialTrainer
+from tensordict import TensorDict
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.adapters.torch import TorchVectorEnv
@@ -40,6 +48,7 @@ EPISODE_STEPS = 20
 PPO = PPOConfig(
     num_envs=8, rollout_length=8, num_epochs=2, num_minibatches=2, hidden_layers=(16, 12)
 )
+SMALL = {"num_envs", "rollout_length", "num_epochs", "num_minibatches", "hidden_layers"}
 LIBRARIES = ("rsl_rl", "skrl")
 
 
@@ -302,6 +311,51 @@ def test_rsl_rl_log_has_the_mean_reward_terms(env):
     torch.testing.assert_close(log["task/reward"], rewards.mean())
 
 
+def test_rsl_rl_scripts_find_what_they_touch(env):
+    """The attributes and methods that the scripts of mjlab and Isaac Lab use."""
+    vec_env = RslRlVecEnv(env)
+    assert vec_env.unwrapped is vec_env and vec_env.step_dt == 0.01 and vec_env.physics_dt == 0.001
+    assert vec_env.render_mode is None
+    assert vec_env.seed(7) == 7
+    first, extras = vec_env.reset()
+    assert extras == {} and vec_env.get_observations() is first
+    for name, group in first.items():
+        assert group.numpy() in vec_env.observation_space[name]
+    assert vec_env.action_space.shape == (NUM_ENVS, 6)
+    later, _ = vec_env.reset()
+    assert not torch.equal(later["policy"], first["policy"])
+    vec_env.seed(7)
+    torch.testing.assert_close(vec_env.reset()[0]["policy"], first["policy"])
+    vec_env.close()
+
+
+def test_rsl_rl_exports_the_policy(learners, tmp_path):
+    """TorchScript and ONNX give the actions of the trained network, beyond the normaliser's limit
+    too, and with a quantity that never varied."""
+    learner, _ = learners["rsl_rl"]
+    actor = copy.deepcopy(learner.algorithm.get_policy())
+    actor.obs_normalizer.std[3] = 0.0
+    runner = types.SimpleNamespace(alg=types.SimpleNamespace(get_policy=lambda: actor))
+    OnPolicyRunner.export_policy_to_jit(runner, str(tmp_path))
+    OnPolicyRunner.export_policy_to_onnx(runner, str(tmp_path))
+    observation = 3.0 * torch.randn(8, 29) * torch.tensor([1.0] * 28 + [1e6])
+    with torch.no_grad():
+        expected = actor(TensorDict({"policy": observation}, batch_size=[8]))
+        scripted = torch.jit.load(tmp_path / "policy.pt")(observation)
+    torch.testing.assert_close(scripted, expected)
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    for row, action in zip(observation, expected, strict=True):
+        (given,) = session.run(None, {"obs": row[None].numpy()})
+        np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
+
+
+def test_example_trains_and_acts_with_its_export(tmp_path):
+    main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "rsl_rl_ppo.py"))["main"]
+    rewards = main(tmp_path, iterations=1, **PPO.model_dump(include=SMALL))
+    assert (tmp_path / "policy.onnx").stat().st_size > 1000 and list(tmp_path.glob("model_*.pt"))
+    assert rewards.shape == (100,) and rewards.isfinite().all() and rewards.std() > 0.0
+
+
 def test_rsl_rl_runner_trains(task, tmp_path):
     """rsl_rl's own runner trains, with its log and its check for non-finite numbers."""
     env = RslRlVecEnv(TorchVectorEnv(task, PPO.num_envs))
@@ -378,6 +432,27 @@ def test_gymnasium_vector_env_stays_on_the_device(env):
     assert after[0, 28] != first[0, 28]
     assert after.numpy() in made.observation_space
     assert reward.shape == terminated.shape == (made.num_envs,)
+
+
+def test_skrl_and_gymnasium_wrap_the_vector_env(env):
+    """skrl's wrapper gives arrays as actions, and Gymnasium's counts the episodes."""
+    made = RecordEpisodeStatistics(TorchGymnasiumVectorEnv(env))
+    wrapped = wrap_env(made, verbose=False)
+    assert wrapped.num_envs == NUM_ENVS and wrapped.action_space == made.single_action_space
+    first, _ = wrapped.reset()
+    env.reset(seed=7)
+    state = env.state
+    expected = env.step(torch.full((NUM_ENVS, 6), 0.5))
+    expected = expected.observation.clone(), expected.reward[:, None].clone()
+    env.state = state
+    observation, reward, terminated, truncated, _ = wrapped.step(torch.full((NUM_ENVS, 6), 0.5))
+    torch.testing.assert_close((observation, reward), expected)
+    assert first.shape == observation.shape and terminated.shape == truncated.shape == (NUM_ENVS, 1)
+    wrapped.render()
+    for _ in range(EPISODE_STEPS - 1):
+        *_, truncated, info = wrapped.step(torch.zeros(NUM_ENVS, 6))
+    assert truncated.all()
+    np.testing.assert_array_equal(info["episode"]["l"], EPISODE_STEPS)
 
 
 # Networks

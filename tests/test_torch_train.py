@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 from jax.experimental.compilation_cache import compilation_cache
+from rsl_rl.runners import OnPolicyRunner
 
-from bounce_mjx.adapters.torch.trainer import TorchTrainer
+from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
+from bounce_mjx.adapters.torch.trainer import TorchTrainer, make_vector_env
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands import train_torch as torch_train
@@ -91,7 +93,28 @@ def test_run_folder_has_the_same_files_as_in_jax(run):
     assert load_config(run / "config.yaml").env.target_height_range == (0.3, 0.8)
     assert find_checkpoint(run / "checkpoints" / "latest").steps == 256
     assert list(run.glob("events.out.tfevents.*"))
-    assert not [p for p in run.rglob("*") if p.suffix in (".pt", ".pth", ".pkl", ".pickle")]
+    assert [p.name for p in run.rglob("*.p*") if p.suffix in (".pt", ".pth", ".pkl")] == [
+        "model.pt"
+    ]
+
+
+def test_rsl_rls_runner_opens_the_model(run, library):
+    """Its runner goes on from the last networks, optimizer and iteration."""
+    if library != "rsl_rl":
+        pytest.skip("the format of rsl_rl's runner")
+    config = load_config(run / "config.yaml")
+    vector = make_vector_env(config.ppo, BounceBall(config.env), seed=0)
+    runner = OnPolicyRunner(RslRlVecEnv(vector), algorithm_config(config.ppo))
+    fresh = runner.get_inference_policy().mlp[0].weight.clone()
+    runner.load(str(run / "model.pt"))
+    assert runner.current_learning_iteration == 256 // config.ppo.batch_steps
+    actor = runner.get_inference_policy()
+    assert not torch.equal(actor.mlp[0].weight, fresh)
+    assert runner.alg.optimizer.state_dict()["state"][0]["step"] > 0
+    # The latest checkpoint holds the same policy.
+    policy = load_policy(find_checkpoint(run / "checkpoints" / "latest"), config)
+    kernel = policy.params["params"]["MLP_0"]["hidden_0"]["kernel"]
+    np.testing.assert_array_equal(actor.mlp[0].weight.detach().numpy().T, kernel)
 
 
 def test_run_is_evaluated_without_torch(run, tmp_path):

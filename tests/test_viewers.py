@@ -56,7 +56,8 @@ from bounce_mjx.viewers.display import (
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
-from bounce_mjx.viewers.scene import Scene
+from bounce_mjx.viewers.scene import Scene, camera_pose
+from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
@@ -334,6 +335,32 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     display.pose(env.mj_model.qpos0, 0.5)
     assert display.data.site(TARGET_SITE).xpos[2] == 0.5
     assert display.data.site(HOME_SITE).xpos[2] == env.config.reward.paddle_home_height
+
+
+# The camera of the page
+
+
+def projected(points: np.ndarray, aspect: float, on_phone: bool, offsets) -> np.ndarray:
+    """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
+    position, gaze = camera_pose(offsets, aspect, on_phone)
+    forward = (gaze - position) / np.linalg.norm(gaze - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen = (points - position) @ np.stack([right, np.cross(right, forward), forward]).T
+    return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
+
+
+@pytest.mark.parametrize("number", [1, 2, 4, 16])
+@pytest.mark.parametrize(
+    ("aspect", "on_phone", "lowest"), [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
+)
+def test_the_camera_sees_every_robot(number: int, aspect, on_phone, lowest) -> None:
+    """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
+    parts = np.array([(-0.1, 0.0, 0.0), (0.64, 0.0, 0.05), (0.59, 0.0, 0.85)])
+    offsets = scene_grid(number)
+    points = (offsets[:, None] + parts).reshape(-1, 3)
+    across, up = projected(points, aspect, on_phone, offsets).T
+    assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
 
 
 # The clock

@@ -15,11 +15,12 @@ become `PhysicsParameters`, and a field that no parameter expresses is refused b
 | `dof_armature`, `dof_damping`, `dof_frictionloss` | the same, of the arm's joints                |
 | `opt.gravity`                          | gravity                                                 |
 
-The fields of the two geoms act on the contact pair as if the pair had been made of these geoms.
+The friction and the solref of the two geoms act as in a contact without a pair.
 """
 
 import dataclasses
 from collections.abc import Iterator
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +29,12 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.parameters import PhysicsParameters, contact_pair, edited_fields
+from bounce_mjx.physics.parameters import (
+    PhysicsParameters,
+    contact_pair,
+    edited_fields,
+    link_bodies,
+)
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.randomization import RandomizationConfig, draw_world, physics_parameters
 
@@ -152,8 +158,7 @@ _DERIVED = frozenset(
 
 
 def _sources(mj_model: mujoco.MjModel) -> dict[str, _Source]:
-    m, addresses = mj_model, find_addresses(mj_model)
-    links = m.jnt_bodyid[list(addresses.arm_joints)]
+    addresses = find_addresses(mj_model)
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
     paddle = addresses.paddle_geom
     return {
@@ -165,71 +170,78 @@ def _sources(mj_model: mujoco.MjModel) -> dict[str, _Source]:
         "armature": _Source("dof_armature", dofs),
         "damping": _Source("dof_damping", dofs),
         "frictionloss": _Source("dof_frictionloss", dofs),
-        "link_mass": _Source("body_mass", links),
         "paddle_position": _Source("geom_pos", paddle),
         "paddle_rotation": _Source("geom_quat", paddle),
         "gravity": _Source("opt.gravity", slice(None)),
     }
 
 
-def _read(mj_model: mujoco.MjModel, changed: Fields, varied: Fields) -> PhysicsParameters:
+def _read(
+    mj_model: mujoco.MjModel, changed: Fields, varied: Fields, xp: ModuleType = jnp
+) -> PhysicsParameters:
     """The parameters of one environment.
 
     Args:
       changed: fields of its model.
+      xp: numpy or jax.numpy, for the arrays in `changed`.
       varied: mask of the entries of each field that differ between environments.
     """
     given = {
-        parameter: source.sign * jnp.asarray(changed[source.field])[source.index]
+        parameter: source.sign * xp.asarray(changed[source.field])[source.index]
         for parameter, source in _sources(mj_model).items()
         if source.field in varied and varied[source.field][source.index].any()
     }
-    addresses = find_addresses(mj_model)
+    addresses, links = find_addresses(mj_model), link_bodies(mj_model)
     geoms = addresses.ball_geom, addresses.paddle_geom
+    if "body_mass" in varied and varied["body_mass"][np.concatenate(links)].any():
+        mass = xp.asarray(changed["body_mass"])
+        given["link_mass"] = xp.stack([mass[np.asarray(bodies)].sum() for bodies in links])
     if "pair_friction" in varied:
         given["contact_friction"] = changed["pair_friction"][contact_pair(mj_model), 0]
     if "geom_friction" in varied and varied["geom_friction"][geoms, 0].any():
-        friction = changed["geom_friction"]
-        given["contact_friction"] = _combined(mj_model, *(friction[geom, 0] for geom in geoms))
+        values = xp.asarray(changed["geom_friction"])[geoms, 0]
+        given["contact_friction"] = _combined(mj_model, geoms, values)
     solref = None
     if "pair_solref" in varied:
         solref = changed["pair_solref"][contact_pair(mj_model)]
     if "geom_solref" in varied and varied["geom_solref"][geoms, :].any():
-        solref = _mixed(mj_model, *(changed["geom_solref"][geom] for geom in geoms))
+        solref = mixed_solref(mj_model, geoms, *xp.asarray(changed["geom_solref"])[geoms, :], xp)
     if solref is not None:
         first, second = solref
-        time_constant = jnp.maximum(first, 2.0 * mj_model.opt.timestep)
-        given["contact_stiffness"] = jnp.where(
+        time_constant = xp.maximum(first, 2.0 * mj_model.opt.timestep)
+        given["contact_stiffness"] = xp.where(
             first > 0.0, 1.0 / (time_constant * second) ** 2, -first
         )
-        given["contact_damping"] = jnp.where(first > 0.0, 2.0 / time_constant, -second)
+        given["contact_damping"] = xp.where(first > 0.0, 2.0 / time_constant, -second)
     return PhysicsParameters(**given)
 
 
-def _combined(mj_model: mujoco.MjModel, ball: jax.Array, paddle: jax.Array) -> jax.Array:
-    """Friction of a contact: the larger value, or that of the geom with the higher priority."""
-    geoms = find_addresses(mj_model)
-    of_ball, of_paddle = (
-        mj_model.geom_priority[geom] for geom in (geoms.ball_geom, geoms.paddle_geom)
-    )
-    if of_ball == of_paddle:
-        return jnp.maximum(ball, paddle)
-    return ball if of_ball > of_paddle else paddle
+def _combined(mj_model: mujoco.MjModel, geoms: tuple[int, int], values: jax.Array) -> jax.Array:
+    """Friction [] of a contact of two geoms with the frictions [2]: the larger value, or the value
+    of the geom with the higher priority."""
+    first, second = mj_model.geom_priority[list(geoms)]
+    if first == second:
+        return values.max()
+    return values[0] if first > second else values[1]
 
 
-def _mixed(mj_model: mujoco.MjModel, ball: jax.Array, paddle: jax.Array) -> jax.Array:
-    """`solref` [2] of a contact of two geoms: the mean by `solmix` of two standard formats, and the
-    smaller values if one has the direct format (MuJoCo's documentation, "Contact parameters").
-    """
-    geoms = find_addresses(mj_model)
-    pair = [geoms.ball_geom, geoms.paddle_geom]
-    of_ball, of_paddle = mj_model.geom_priority[pair]
-    if of_ball != of_paddle:
-        return ball if of_ball > of_paddle else paddle
-    mix = mj_model.geom_solmix[pair]
+def mixed_solref(
+    mj_model: mujoco.MjModel,
+    geoms: tuple[int, int],
+    first: jax.Array,
+    second: jax.Array,
+    xp: ModuleType = jnp,
+) -> jax.Array:
+    """`solref` [2] of a contact of two geoms with their own ones [2]: the mean by `solmix` of two
+    standard formats, and the smaller values if one has the direct format; a higher priority decides
+    alone (MuJoCo's documentation, "Contact parameters")."""
+    priority = mj_model.geom_priority[list(geoms)]
+    if priority[0] != priority[1]:
+        return first if priority[0] > priority[1] else second
+    mix = mj_model.geom_solmix[list(geoms)]
     share = mix[0] / mix.sum() if mix.sum() > 0.0 else 0.5
-    mean = share * ball + (1.0 - share) * paddle
-    return jnp.where((ball[0] > 0.0) & (paddle[0] > 0.0), mean, jnp.minimum(ball, paddle))
+    mean = share * first + (1.0 - share) * second
+    return xp.where((first[0] > 0.0) & (second[0] > 0.0), mean, xp.minimum(first, second))
 
 
 def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varied: Fields) -> None:
@@ -244,15 +256,16 @@ def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varie
         # A position servo needs kp in both.
         names.append("actuator_biasprm")
 
-    def effect(fields: Fields) -> Fields:
-        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied))
+    def effect(index: int) -> Fields:
+        fields = {name: batches[name][min(index, len(batches[name]) - 1)] for name in varied}
+        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied, np))
         edited |= {f"opt.{name}": value for name, value in options.items()}
-        return {name: jnp.asarray(edited.get(name, base[name])) for name in names}
+        return {name: edited.get(name, np.asarray(base[name])) for name in names}
 
-    with jax.ensure_compile_time_eval():
-        effects = jax.jit(jax.vmap(effect))({name: batches[name] for name in varied})
+    each = [effect(i) for i in range(max(len(batches[name]) for name in varied))]
+    effects = {name: np.stack([one[name] for one in each]) for name in names}
     for name in names:
-        wanted, given = batches.get(name, np.asarray(base[name])), np.asarray(effects[name])
+        wanted, given = batches.get(name, np.asarray(base[name])), effects[name]
         wrong = np.any(np.abs(wanted - given) > 1e-4 * np.abs(wanted) + 1e-9, axis=0)
         wrong &= ~_without_effect(mj_model, name)
         if wrong.any():

@@ -1,17 +1,22 @@
 """Trains a policy with the PPO of a PyTorch library and writes a run's folder
-(`bounce-mjx train-torch`)."""
+(`bounce-mjx train-torch`).
 
-import functools
+At its end it writes the networks and the optimizer as `model.pt`, in the format of rsl_rl's runner.
+"""
+
 import importlib
 import sys
 from collections.abc import Sequence
 from typing import Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import find_run, latest_checkpoint
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.command import TrainingCommand, path_flag, read_command, run_command
 from bounce_mjx.training.job import library_of
 from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.training.trainer import Trainer
 
 PROG = "bounce-mjx train-torch"
 
@@ -45,7 +50,14 @@ def main(args: Sequence[str] | None = None) -> None:
             trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         except ImportError as error:
             raise UserError(str(error)) from error
-        run_command(command, functools.partial(trainer.TorchTrainer, command.library), PROG)
+        made = []
+
+        def make_trainer(config: TrainConfig, env: BounceBall) -> Trainer:
+            made.append(trainer.TorchTrainer(command.library, config, env))
+            return made[0]
+
+        outcomes = run_command(command, make_trainer, PROG)
+        made[0].save_models([outcome.run for outcome in outcomes])
 
 
 if __name__ == "__main__":

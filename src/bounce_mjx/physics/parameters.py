@@ -138,11 +138,11 @@ def edited_fields(
         put("dof_M0", np.array(addresses.ball_qvel[3:]), current("body_inertia")[ball])
     if p.contact_stiffness is not None or p.contact_damping is not None:
         stiffness, damping = direct_solref(m)
-        pair = _contact_pair(m)
+        pair = contact_pair(m)
         put("pair_solref", (pair, 0), -_given(p.contact_stiffness, stiffness))
         put("pair_solref", (pair, 1), -_given(p.contact_damping, damping))
     if p.contact_friction is not None:
-        pair = _contact_pair(m)
+        pair = contact_pair(m)
         put("pair_dim", pair, max(3, int(m.pair_dim[pair])))
         numpy = jnp if isinstance(p.contact_friction, jax.Array) else np
         friction = numpy.maximum(p.contact_friction, MIN_FRICTION)
@@ -218,7 +218,7 @@ def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
     documentation, "Modeling", solver parameters).
     """
-    first, second = (float(x) for x in mj_model.pair_solref[_contact_pair(mj_model)])
+    first, second = (float(x) for x in mj_model.pair_solref[contact_pair(mj_model)])
     if first <= 0.0:
         return -first, -second
     # MuJoCo's lower limit for the time constant is two steps.
@@ -226,7 +226,7 @@ def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
 
 
-def _contact_pair(mj_model: mujoco.MjModel) -> int:
+def contact_pair(mj_model: mujoco.MjModel) -> int:
     """Index of the contact pair of ball and paddle."""
     addresses = find_addresses(mj_model)
     for pair in range(mj_model.npair):

@@ -109,8 +109,8 @@ def run_command(
     make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
     prog: str,
     watcher: Watcher | None = None,
-) -> None:
-    """Trains according to the command, and prints the results.
+) -> Sequence[Outcome]:
+    """Trains according to the command, and prints the results; returns each seed's outcome.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -141,6 +141,7 @@ def run_command(
     run = shlex.quote(str(best.run))
     say(console, f"measure it: bounce-mjx eval {run}")
     say(console, f"watch it: bounce-mjx play {run}")
+    return outcomes
 
 
 def show(outcomes: Sequence[Outcome], console: Console) -> Outcome:

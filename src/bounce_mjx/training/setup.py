@@ -9,17 +9,19 @@ MULTI_OUTPUT_FUSION = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusi
 
 
 def set_up_jax() -> None:
-    """Sets JAX up for a command; the user's environment variables have priority.
-
-    Compiled programs are cached in the user's cache folder, so that a second start is quick
-    (`JAX_COMPILATION_CACHE_DIR` names another folder). JAX's default is to cache only programs that
-    take a second to compile.
-    """
+    """Sets JAX up for a command; the user's environment variables have priority."""
     set_up_cpu()
     set_up_gpu()
+    cache_compilations()
+
+
+def cache_compilations() -> None:
+    """Caches compiled programs in the user's cache folder, so that a second start is quick; a
+    folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority. JAX's default is to cache
+    only programs that take a second to compile."""
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    if jax.config.jax_compilation_cache_dir is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
 

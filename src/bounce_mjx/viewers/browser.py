@@ -188,7 +188,7 @@ class LivePage:
         shown = self._settings.num_shown
         recording = Frame(*(np.stack(values)[:, :shown] for values in zip(*frames, strict=True)))
         text = replay(self._simulation.env, recording, names=self._names)
-        client.send_file_download("bounce.html", text.encode())
+        client.send_file_download("bounce.html", text.encode(), save_immediately=True)
 
     def _add_plots(self, side: viser.PanelHandle) -> None:
         gui = self._server.gui

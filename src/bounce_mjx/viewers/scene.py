@@ -3,6 +3,7 @@
 import collections
 import contextlib
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -34,6 +35,8 @@ _PHONE_SHIFT = 0.27
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
 _FOLLOWING = 0.1
+# A page lays out its panels within this time, s.
+_LAYOUT_SECONDS = 5.0
 
 
 class Scene:
@@ -54,7 +57,8 @@ class Scene:
         self._env = env
         self._names = names
         self._display = Display(env)
-        server.on_client_connect(self._frame)
+        self._phones: set[int] = set()
+        server.on_client_connect(self._welcome)
         self.show(num_envs)
 
     def show(self, num_envs: int) -> None:
@@ -201,29 +205,44 @@ class Scene:
         )
         return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a new page, and once more when its panels have taken their room."""
+        # Later the width is of the picture between the panels.
+        if client.camera.image_width < _PHONE_WIDTH:
+            self._phones.add(client.client_id)
+        self._frame(client)
+        aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if time.monotonic() < until and camera.aspect != aspect:
+                aspect = camera.aspect
+                self._frame(client)
+
     def _frame(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a page towards the environments."""
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
-            aspect, width = client.camera.aspect, client.camera.image_width
-            position, gaze = camera_pose(self._offsets, aspect, width)
+            on_phone = client.client_id in self._phones
+            position, gaze = camera_pose(self._offsets, client.camera.aspect, on_phone)
             if np.all(np.isfinite(position)):
                 client.camera.position, client.camera.look_at = position, gaze
 
 
 def camera_pose(
-    offsets: np.ndarray, aspect: float = 1.0, width: float = np.inf
+    offsets: np.ndarray, aspect: float = 1.0, on_phone: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
 
     Args:
       offsets: positions of the environments [N, 3], m.
       aspect: width / height of the picture.
-      width: width of the picture in pixels.
+      on_phone: whether the controls cover the lower part of the picture.
     """
     extent = 1.0 + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
-    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if width < _PHONE_WIDTH else 0.0
+    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if on_phone else 0.0
     return _LOOK_AT + view, _LOOK_AT - (0.0, 0.0, down * np.linalg.norm(view))
 
 

@@ -4,94 +4,122 @@ The arrays are NumPy arrays; `adapters/torch/gymnasium_env.py` has a vectorised 
 tensors that stay on JAX's device. Keyword arguments are the settings of `EnvConfig`.
 """
 
-import weakref
+import math
+import multiprocessing
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
-import jax
+import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.registration import ENV_ID
-from bounce_mjx.config.validation import validate
+from bounce_mjx.adapters.gymnasium.batch import (
+    Batch,
+    StepArrays,
+    UnexpectedArgument,
+    action_space,
+    checked_actions,
+    observation_space,
+)
+from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
 from bounce_mjx.errors import UserError
-from bounce_mjx.task import vector
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall, BounceState
-from bounce_mjx.task.state import State
-from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+from bounce_mjx.task.env import BounceBall
 
-_FRAMES_PER_SECOND = 50
-_HEIGHT, _WIDTH = 480, 640
-
-
-def action_space(task: BounceBall) -> gymnasium.spaces.Box:
-    """The space of the actions of one environment."""
-    return gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
-
-
-def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
-    """The space of the observations of one environment."""
-    return gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+_FRAMES_PER_SECOND = 100
 
 
 class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment with the time limit of its config."""
+    """One environment.
+
+    `gymnasium.make` ends its episodes after `max_episode_steps` steps. Without it, only a given
+    `episode_seconds` limits them.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": _FRAMES_PER_SECOND}
 
-    def __init__(self, render_mode: str | None = None, **settings: Any):
-        """Makes the environment.
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        camera: str | None = None,
+        **settings: Any,
+    ):
+        """Makes the environment. The first reset compiles it, unless an equal one exists.
 
         Args:
+          width: of the pictures, in pixels, as is `height`.
+          camera: name of a camera of the model; None for the overview.
           settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
 
         Raises:
-          UserError: a setting or the render mode is wrong, or there is no OpenGL library for
-            rendering.
+          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
+            argument is a TypeError too.
         """
-        _check_render_mode(render_mode)
-        self.task = BounceBall(validate(EnvConfig, settings, ENV_ID))
-        self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
+        check_render_mode(render_mode)
+        _prefer_forkserver()
+        self._batch = Batch(settings, 1, None)
+        self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
         self.render_mode = render_mode
         self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
-        self._reset = jax.jit(self.task.reset)
-        self._step = jax.jit(self.task.step)
-        self._state: State | None = None
-        self._length = 0
-        self._pictures = Pictures(self.task) if render_mode else None
+        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+
+    @property
+    def task(self) -> BounceBall:
+        """The environment on JAX; equal environments share it."""
+        return self._batch.task
+
+    @property
+    def dt(self) -> float:
+        """Time of one step, s."""
+        return self._batch.config.control_dt
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """MuJoCo's model, to read; edits have no effect."""
+        return self.task.mj_model
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode: its first observation [N] and an empty info."""
-        super().reset(seed=seed)
-        self._state = self._reset(_key(self.np_random))
-        self._length = 0
-        return np.array(self._state.obs), {}
+        """Starts an episode.
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        Args:
+          options: {"target_height": h} sets the target height of this episode, m.
+
+        Returns:
+          The first observation [N] and an empty info.
+        """
+        super().reset(seed=seed)
+        options = checked_options(options, "target_height")
+        target = checked_height(options.get("target_height"))
+        return self._batch.restart([seed], self.np_random, target_heights=target)[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances one control step under the action [n].
 
         Returns:
           Observation [N], reward, terminated, truncated, and the environment's metrics.
         """
-        self._state = self._step(self._state, np.asarray(action, np.float32))
-        self._length += 1
-        state = jax.device_get(self._state)
-        terminated = bool(state.done)
-        truncated = not terminated and self._length >= self.task.config.episode_steps
-        metrics = {name: float(value) for name, value in state.metrics.items()}
-        return np.array(state.obs), float(state.reward), terminated, truncated, metrics
+        action = checked_actions(action, self.action_space.shape)
+        result = self._batch.step(action[None])
+        metrics = {name: float(value[0]) for name, value in result.metrics.items()}
+        return (
+            result.observation[0],
+            float(result.reward[0]),
+            bool(result.terminated[0]),
+            bool(result.truncated[0]),
+            metrics,
+        )
 
     def render(self) -> np.ndarray | None:
-        """A picture [480, 640, 3], uint8; None without render_mode="rgb_array"."""
+        """A picture [height, width, 3], uint8; None without render_mode="rgb_array"."""
         if self._pictures is None:
             return None
-        return self._pictures.draw(jax.device_get(self._state.pipeline_state))
+        return self._pictures.draw(self.task, *self._batch.pose(0))
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -100,24 +128,45 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """B environments; an ended episode is reset within the step that ends it.
+    """B environments in one compiled step.
 
-    `info["final_obs"]` [B, N] is every environment's observation after the step, before any reset;
-    `info["_final_obs"]` [B] is true where the episode ended.
+    Given the same seeds and actions, they return the same as a `gymnasium.vector.SyncVectorEnv` of
+    B single environments, in every autoreset mode. In the same-step mode, `info["final_info"]` also
+    has the entry `episode` of Gymnasium's `RecordEpisodeStatistics`.
     """
 
     metadata = {
         "render_modes": ["rgb_array"],
         "render_fps": _FRAMES_PER_SECOND,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **settings: Any):
-        """Makes `num_envs` environments; see `BounceBallEnv`."""
-        _check_render_mode(render_mode)
-        self.task = BounceBall(validate(EnvConfig, settings, ENV_ID))
-        self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.dt)}
-        self.num_envs = num_envs
+    def __init__(
+        self,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        camera: str | None = None,
+        **settings: Any,
+    ):
+        """Makes `num_envs` environments; the other arguments are as in `BounceBallEnv`.
+
+        Args:
+          max_episode_steps: time limit of an episode in steps; `gymnasium.make_vec` gives 2000.
+          autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
+            disabled, which leaves it to reset(options={"reset_mask": ...}).
+        """
+        check_render_mode(render_mode)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self._batch = Batch(settings, num_envs, max_episode_steps)
+        self.metadata = self.metadata | {
+            "render_fps": round(1.0 / self.dt),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.num_envs = self._batch.num_envs
         self.render_mode = render_mode
         self.single_action_space = action_space(self.task)
         self.single_observation_space = observation_space(self.task)
@@ -125,83 +174,208 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
-        self._reset = jax.jit(lambda key: vector.reset(self.task, key, num_envs))
-        self._step = jax.jit(self._step_and_split_key, donate_argnums=0)
-        self._state: vector.VectorState | None = None
-        self._key: jax.Array | None = None
-        self._pictures = Pictures(self.task) if render_mode else None
+        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._ended = np.zeros(num_envs, bool)
+        self._statistics = EpisodeStatistics(num_envs)
+
+    task, dt, mj_model = BounceBallEnv.task, BounceBallEnv.dt, BounceBallEnv.mj_model
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a new episode in every environment: observations [B, N] and an empty info."""
-        super().reset(seed=seed)
-        self._key, key = jax.random.split(_key(self.np_random))
-        self._state = self._reset(key)
-        return np.array(vector.observe(self._state)), {}
+        """Starts a new episode in every environment, or in some.
+
+        Args:
+          seed: s seeds the environments with s, s + 1, ...; a list gives each one's seed.
+          options: "target_height" sets the target height of these episodes, m; "reset_mask" [B],
+            bool, chooses the environments.
+
+        Returns:
+          The observations of all environments [B, N] and an empty info.
+        """
+        options = checked_options(options, "target_height", "reset_mask")
+        target = checked_height(options.get("target_height"))
+        mask = _checked_mask(options.get("reset_mask"), self.num_envs)
+        seeds = _seeds(seed, self.num_envs)
+        super().reset(seed=seeds[0])
+        observation = self._batch.restart(seeds, self.np_random, mask, target)
+        chosen = slice(None) if mask is None else mask
+        self._ended[chosen] = False
+        self._statistics.restart(chosen)
+        return observation, {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances every environment under the actions [B, 6].
+        """Advances every environment under the actions [B, n].
 
         Returns:
           Observations [B, N], rewards [B], terminated [B], truncated [B], and an info of the
-          environments' metrics and the final observations.
+          environments' metrics.
         """
-        self._state, self._key, result = self._step(
-            self._state, np.asarray(actions, np.float32), self._key
-        )
-        # Copies, because the caller may write into them.
-        result = jax.tree.map(np.array, result)
-        info = dict(result.metrics) | {
-            "final_obs": result.final_observation,
-            "_final_obs": result.terminated | result.truncated,
-        }
+        mode, before = self.autoreset_mode, self._ended
+        if mode is AutoresetMode.DISABLED and before.any():
+            raise UserError(
+                f"the episodes of the environments {np.flatnonzero(before).tolist()} have ended; "
+                'reset them with reset(options={"reset_mask": terminated | truncated})'
+            )
+        same_step = mode is AutoresetMode.SAME_STEP
+        # In the same-step mode, the ended ones have already been reset.
+        skipped = np.zeros_like(before) if same_step else before
+        result = self._batch.step(actions, skipped, same_step)
+        self._ended = result.terminated | result.truncated
+        info = self._info(result, skipped)
         return result.observation, result.reward, result.terminated, result.truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture [480, 640, 3], uint8, of each environment; None without a render mode."""
+        """A picture [height, width, 3], uint8, of each environment; None without a render mode."""
         if self._pictures is None:
             return None
-        states = jax.device_get(self._state.env.pipeline_state)
         return tuple(
-            self._pictures.draw(jax.tree.map(lambda x, i=i: x[..., i], states))
-            for i in range(self.num_envs)
+            self._pictures.draw(self.task, *self._batch.pose(i)) for i in range(self.num_envs)
         )
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """A common attribute of the environments, or the result of a method such as render, once
+        for each environment [B]."""
+        if name == "render":
+            return self.render() or (None,) * self.num_envs
+        value = getattr(self, name)
+        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """A common attribute of the environments, once for each environment [B]."""
+        return self.call(name)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
         if self._pictures is not None:
             self._pictures.close()
 
-    def _step_and_split_key(
-        self, state: vector.VectorState, action: jax.Array, key: jax.Array
-    ) -> tuple[vector.VectorState, jax.Array, vector.StepResult]:
-        key, reset_key = jax.random.split(key)
-        steps = self.task.config.episode_steps
-        state, result = vector.step(self.task, state, action, reset_key, steps)
-        return state, key, result
+    def _info(self, result: StepArrays, skipped: np.ndarray) -> dict[str, Any]:
+        """The info in the form of `VectorEnv._add_info`: each key has a mask [B], `_key`."""
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            return _masked(result.metrics, ~skipped)
+        statistics = self._statistics.step(result.reward, self._ended)
+        info = _masked(result.metrics, ~self._ended)
+        if self._ended.any():
+            final_obs = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(self._ended):
+                final_obs[i] = result.final_observation[i]
+            final_info = _masked(result.metrics, self._ended)
+            final_info |= {
+                "episode": _masked(statistics, self._ended),
+                "_episode": self._ended.copy(),
+            }
+            for name, value in (("final_obs", final_obs), ("final_info", final_info)):
+                info |= {name: value, f"_{name}": self._ended.copy()}
+        return info
 
 
-class Pictures:
-    """Draws states of the environment."""
+class EpisodeStatistics:
+    """Return, length and duration of the episodes of B environments that restart as they end."""
 
-    def __init__(self, task: BounceBall):
-        renderer = Renderer(task, _WIDTH, _HEIGHT, choose_backend())
-        self._render = renderer.render
-        # Also closed at exit, where OpenGL would be unloaded before the renderer.
-        self.close = weakref.finalize(self, renderer.close)
+    def __init__(self, num_envs: int):
+        self._returns = np.zeros(num_envs)
+        self._lengths = np.zeros(num_envs, int)
+        self._starts = np.full(num_envs, time.perf_counter())
 
-    def draw(self, state: BounceState) -> np.ndarray:
-        """The picture [480, 640, 3], uint8, of one environment."""
-        return self._render(np.asarray(state.physics.qpos), float(state.task.target_height))
+    def restart(self, chosen: slice | np.ndarray) -> None:
+        """Begins new episodes; `chosen` is an index or a mask [B]."""
+        self._returns[chosen] = 0.0
+        self._lengths[chosen] = 0
+        self._starts[chosen] = time.perf_counter()
+
+    def step(self, reward: np.ndarray, ended: np.ndarray) -> dict[str, np.ndarray]:
+        """Counts a step with rewards [B]; the episodes of the mask `ended` [B] end with it.
+
+        Returns:
+          r, the returns; l, the lengths in steps; and t, the durations in s [B].
+        """
+        self._returns += reward
+        self._lengths += 1
+        durations = np.round(time.perf_counter() - self._starts, 6)
+        statistics = {"r": self._returns.copy(), "l": self._lengths.copy(), "t": durations}
+        self.restart(ended)
+        return statistics
 
 
-def _key(generator: np.random.Generator) -> jax.Array:
-    return jax.random.PRNGKey(int(generator.integers(2**31)))
+def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
+    """The options of a reset.
+
+    Raises:
+      UnexpectedArgument: an option is unknown.
+    """
+    unknown = [name for name in options or {} if name not in known]
+    if unknown:
+        raise UnexpectedArgument(
+            f"reset got an unexpected option {unknown[0]!r}; known options are: "
+            f"{', '.join(known) or 'none'}"
+        )
+    return options or {}
 
 
-def _check_render_mode(render_mode: str | None) -> None:
-    if render_mode not in (None, "rgb_array"):
-        raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
+def checked_height(height: Any) -> float:
+    """A target height, m; NaN for None.
+
+    Raises:
+      UserError: it is not a positive number.
+    """
+    if height is None:
+        return math.nan
+    try:
+        number = float(height)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise UserError(f"the option target_height is {height!r}, but must be a height above 0 m")
+    return number
+
+
+def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    if not mask.any():
+        return {}
+    masked = {}
+    for name, value in values.items():
+        masked[name] = np.where(mask, value, value.dtype.type(0))
+        masked[f"_{name}"] = mask.copy()
+    return masked
+
+
+def _seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    if seed is None or isinstance(seed, int | np.integer):
+        return [None if seed is None else int(seed) + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise UserError(f"there are {len(seed)} seeds for {num_envs} environments; give as many")
+    return list(seed)
+
+
+def _checked_mask(mask: Any, num_envs: int) -> np.ndarray | None:
+    if mask is None:
+        return None
+    array = np.asarray(mask)
+    if array.dtype != bool or array.shape != (num_envs,) or not array.any():
+        raise UserError(
+            f"the option reset_mask has the type {array.dtype} and the shape {array.shape}, but "
+            f"must be an array of bools of the shape {(num_envs,)} with at least one True"
+        )
+    return array
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        known = ", ".join(repr(m.value) for m in AutoresetMode)
+        raise UserError(f"autoreset_mode is {mode!r}; choose one of {known}") from error
+
+
+def _prefer_forkserver() -> None:
+    """Lets `gymnasium.vector.AsyncVectorEnv` start its processes from a server, as Python 3.14
+    does, unless the program has chosen a method: JAX hangs in a fork of a process that used it."""
+    available = "forkserver" in multiprocessing.get_all_start_methods()
+    if available and multiprocessing.get_start_method(allow_none=True) is None:
+        multiprocessing.set_start_method("forkserver")

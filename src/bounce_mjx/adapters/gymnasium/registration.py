@@ -8,6 +8,8 @@ import types
 from collections.abc import Sequence
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
+MAX_EPISODE_STEPS = 2000
+"""The task's episode of 20 s. A constant, because reading `EnvConfig` would import JAX."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
@@ -31,6 +33,7 @@ def register() -> None:
         ENV_ID,
         entry_point=f"{_MODULE}:BounceBallEnv",
         vector_entry_point=f"{_MODULE}:BounceBallVectorEnv",
+        max_episode_steps=MAX_EPISODE_STEPS,
     )
 
 

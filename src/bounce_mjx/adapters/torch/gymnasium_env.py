@@ -3,10 +3,12 @@
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.environments import action_space, observation_space
+from bounce_mjx.adapters.gymnasium.batch import action_space, observation_space
+from bounce_mjx.adapters.gymnasium.environments import checked_options
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
@@ -17,11 +19,13 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     `info["_final_obs"]` [B] is true where the episode ended.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "torch": True}
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": [], "torch": True}
+    autoreset_mode = AutoresetMode.SAME_STEP
 
     def __init__(self, env: TorchVectorEnv):
         self.env = env
         self.num_envs = env.num_envs
+        self.device = env.device
         self.single_action_space = action_space(env.env)
         self.single_observation_space = observation_space(env.env)
         self.action_space = gymnasium.vector.utils.batch_space(
@@ -34,15 +38,28 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Starts a new episode in every environment: observations [B, N] and an empty info."""
+        """Starts a new episode in every environment: observations [B, N] and an empty info. There
+        are no options."""
+        checked_options(options)
         super().reset(seed=seed)
         observation, _ = self.env.reset(seed)
         return observation, {}
 
     def step(
-        self, actions: torch.Tensor
+        self, actions: torch.Tensor | np.ndarray
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advances every environment under the actions [B, A], float32."""
-        result = self.env.step(actions)
+        """Advances every environment under the actions [B, A]: tensors of any type and device, or
+        an array, as skrl's wrapper gives it."""
+        tensor = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
+        result = self.env.step(tensor)
         info = {"final_obs": result.final_observation, "_final_obs": result.done}
         return result.observation, result.reward, result.terminated, result.truncated, info
+
+    def render(self) -> None:
+        """Does nothing, as there is no render mode; skrl's trainers call it at every step."""
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """A common attribute of the environments, or the result of a method such as render, once
+        for each environment [B]."""
+        value = getattr(self, name)
+        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs

@@ -2,6 +2,7 @@
 data."""
 
 import abc
+from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -114,6 +115,20 @@ class Learner(abc.ABC):
         observed = self._observed().items()
         self._observe(**{n: _to_tensor(state["observed"][n], tensor) for n, tensor in observed})
         self._random = {name: torch.from_numpy(np.array(x)) for name, x in state["random"].items()}
+
+    def save_model(self, path: Path) -> None:
+        """Writes networks, optimizer and iteration in the format of rsl_rl's runner, whose `load`
+        reads the file of an rsl_rl learner."""
+        names = {f"{name}_state_dict": m.state_dict() for name, m in self._modules().items()}
+        torch.save(
+            names
+            | {
+                "optimizer_state_dict": self.optimizer.state_dict(),
+                "iter": self.iteration,
+                "infos": None,
+            },
+            path,
+        )
 
     @abc.abstractmethod
     def policy(self) -> Policy:

@@ -52,9 +52,32 @@ class Normalizer(nn.Module):
             return None
         if train:
             self.update(observation)
-        standardized = (observation - self.mean) / self.std
-        clipped = standardized.clamp(-MAX_NORMALIZED, MAX_NORMALIZED)
-        return torch.where(self.std > MIN_STD, clipped, 0.0)
+        return _standardized(observation, self.mean, self.std, MAX_NORMALIZED, MIN_STD)
+
+
+class FixedNormalizer(nn.Module):
+    """The normalisation with the present statistics of a `Normalizer`, for TorchScript and ONNX."""
+
+    def __init__(self, normalizer: Normalizer):
+        super().__init__()
+        self.register_buffer("mean", normalizer.mean.clone())
+        self.register_buffer("std", normalizer.std.clone())
+        self.max_normalized, self.min_std = float(MAX_NORMALIZED), float(MIN_STD)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Normalises observations [..., N]."""
+        return _standardized(observation, self.mean, self.std, self.max_normalized, self.min_std)
+
+
+def _standardized(
+    observation: torch.Tensor,
+    mean: torch.Tensor,
+    std: torch.Tensor,
+    max_normalized: float,
+    min_std: float,
+) -> torch.Tensor:
+    clipped = ((observation - mean) / std).clamp(-max_normalized, max_normalized)
+    return torch.where(std > min_std, clipped, torch.zeros_like(clipped))
 
 
 def make_mlp(config: PPOConfig, num_inputs: int, num_outputs: int) -> nn.Sequential:

@@ -22,11 +22,19 @@ import contextlib
 import io
 from typing import Any
 
+import numpy as np
 import torch
+from gymnasium import spaces
 from torch import nn
 
 from bounce_mjx.adapters.torch.learner import Learner
-from bounce_mjx.adapters.torch.networks import Normalizer, init_weights, linears_of, to_policy
+from bounce_mjx.adapters.torch.networks import (
+    FixedNormalizer,
+    Normalizer,
+    init_weights,
+    linears_of,
+    to_policy,
+)
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
@@ -57,8 +65,59 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.episode_steps
         self.device = env.device
         self.cfg = env.env.config
+        self._seed: int | None = None
         self._observations = self._groups(*env.reset())
         self._result: StepResult | None = None
+
+    @property
+    def unwrapped(self) -> "RslRlVecEnv":
+        """The environments themselves, as there is no wrapper around them."""
+        return self
+
+    @property
+    def step_dt(self) -> float:
+        """Time of one control step, s."""
+        return self.env.env.dt
+
+    @property
+    def physics_dt(self) -> float:
+        """Time of one physics step, s."""
+        return self.cfg.physics_dt
+
+    @property
+    def render_mode(self) -> None:
+        """The environments draw no pictures; `bounce-mjx play` does."""
+        return None
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        """The observation groups of all environments."""
+        return spaces.Dict(
+            {
+                name: spaces.Box(-np.inf, np.inf, tuple(group.shape), np.float32)
+                for name, group in self._observations.items()
+            }
+        )
+
+    @property
+    def action_space(self) -> spaces.Box:
+        """The actions [B, A] of all environments."""
+        return spaces.Box(-1.0, 1.0, (self.num_envs, self.num_actions), np.float32)
+
+    def seed(self, seed: int = -1) -> int:
+        """Sets the seed of the next `reset`; with -1, the next reset goes on with the present
+        random numbers."""
+        self._seed = None if seed < 0 else seed
+        return seed
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Starts a new episode in every environment: observations and empty extras."""
+        self._observations = self._groups(*self.env.reset(self._seed))
+        self._seed, self._result = None, None
+        return self._observations, {}
+
+    def close(self) -> None:
+        """Does nothing, as the environments hold no window and no file."""
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -123,6 +182,18 @@ class Network(MLPModel):
         self.obs_normalization = True
         self.obs_normalizer = Normalizer(self.obs_dim)
         init_weights(self.mlp, output_gain=2**0.5 if self.distribution is None else 0.01)
+
+    def as_jit(self) -> nn.Module:
+        """The policy for TorchScript."""
+        return self._exportable(super().as_jit())
+
+    def as_onnx(self, verbose: bool) -> nn.Module:
+        """The policy for ONNX."""
+        return self._exportable(super().as_onnx(verbose))
+
+    def _exportable(self, model: nn.Module) -> nn.Module:
+        model.obs_normalizer = FixedNormalizer(self.obs_normalizer)
+        return model
 
 
 class RslRlLearner(Learner):

@@ -2,7 +2,8 @@
 
 import concurrent.futures
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.trainer import Metrics, Snapshot
 
+MODEL_FILE = "model.pt"
 _LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
 
 
@@ -80,6 +82,11 @@ class TorchTrainer:
         if len(snapshots) == 1:
             return snapshots[0]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
+
+    def save_models(self, runs: Sequence[Path]) -> None:
+        """Writes the last networks of each seed as `model.pt` into its run."""
+        for learner, run in zip(self.learners, runs, strict=True):
+            learner.save_model(run / MODEL_FILE)
 
 
 def make_learner(library: str, config: PPOConfig, env: BounceBall, seed: int) -> Learner:

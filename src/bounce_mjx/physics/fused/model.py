@@ -1,8 +1,6 @@
 """Model of the fused engine: constants of a compiled MJCF, and parameters of one environment."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -10,8 +8,8 @@ import numpy as np
 
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
+from bounce_mjx.physics.fused.frames import Frame, cheapest, exact, floats
 from bounce_mjx.physics.fused.scalars import (
-    IDENTITY3,
     ZERO3,
     Mat3,
     Scalar,
@@ -30,13 +28,6 @@ from bounce_mjx.robot.model import Addresses, find_addresses
 
 # MuJoCo's mjMINVAL.
 _MIN_VALUE = 1e-15
-
-
-class Frame(NamedTuple):
-    """Position (m) and orientation of a body in the frame of its link."""
-
-    origin: Vec3 = ZERO3
-    rotation: Mat3 = IDENTITY3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,20 +107,20 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
     compensated = _compensated_share(m, addresses)
     if compensated is not None:
         links = [dataclasses.replace(x, floating_mass=0.0, floating_moment=ZERO3) for x in links]
-    paddle_body = frames[int(m.geom_bodyid[addresses.paddle_geom])]
+    links, paddle_body = cheapest(links, frames[int(m.geom_bodyid[addresses.paddle_geom])])
     paddle = _geom_frame(m, addresses.paddle_geom)
     implicit = m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     explicit_damping = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     return FusedModel(
         dt=float(m.opt.timestep),
-        gravity=_floats(m.opt.gravity),
+        gravity=floats(m.opt.gravity),
         links=tuple(links),
         servos=tuple(
             _read_servo(m, actuator, joint)
             for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
         ),
         paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle.origin)),
-        paddle_rotation=_exact(matmul(paddle_body.rotation, paddle.rotation)),
+        paddle_rotation=exact(matmul(paddle_body.rotation, paddle.rotation)),
         paddle_body=paddle_body,
         ball_mass=float(m.body_mass[addresses.ball_body]),
         ball_inertia=float(m.body_inertia[addresses.ball_body, 0]),
@@ -238,23 +229,11 @@ def _given(value, default):
     return default if value is None else value
 
 
-def _floats(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
-
-
 def _rotation(quaternion: np.ndarray) -> Mat3:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
-    return _exact(matrix.reshape(3, 3))
-
-
-def _exact(rotation: Sequence[Sequence[float]]) -> Mat3:
-    """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
-    matrix = np.asarray(rotation)
-    nearest = np.round(matrix)
-    matrix = np.where(np.abs(matrix - nearest) < 1e-12, nearest, matrix)
-    return tuple(_floats(row) for row in matrix)
+    return exact(matrix.reshape(3, 3))
 
 
 def _read_links(
@@ -269,12 +248,12 @@ def _read_links(
         if m.body_weldid[body] == addresses.ball_body:
             continue
         parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
-        origin = vadd(parent.origin, matvec(parent.rotation, _floats(m.body_pos[body])))
-        rotation = _exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
+        origin = vadd(parent.origin, matvec(parent.rotation, floats(m.body_pos[body])))
+        rotation = exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
         frame = Frame(origin, rotation)
         for joint in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
             slides = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-            anchor = ZERO3 if slides else _floats(m.jnt_pos[joint])
+            anchor = ZERO3 if slides else floats(m.jnt_pos[joint])
             origin = vadd(frame.origin, matvec(frame.rotation, anchor))
             link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
@@ -293,7 +272,7 @@ def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Lin
     return chain.Link(
         offset=frame.origin,
         rotation=frame.rotation,
-        axis=_floats(m.jnt_axis[joint]),
+        axis=floats(m.jnt_axis[joint]),
         slides=bool(m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
         zero_position=float(m.qpos0[at]),
         mass=0.0,
@@ -319,10 +298,10 @@ def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Fra
     return dataclasses.replace(
         link,
         mass=link.mass + mass,
-        first_moment=_floats(link.first_moment + mass * centre),
-        inertia=tuple(_floats(row) for row in link.inertia + about_origin),
+        first_moment=floats(link.first_moment + mass * centre),
+        inertia=tuple(floats(row) for row in link.inertia + about_origin),
         floating_mass=link.floating_mass + floating * mass,
-        floating_moment=_floats(link.floating_moment + floating * mass * centre),
+        floating_moment=floats(link.floating_moment + floating * mass * centre),
     )
 
 
@@ -330,7 +309,7 @@ def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
     """Inertial frame of a body in the body's frame. Where the two are almost the same, MuJoCo flags
     the body and computes as if they were the same."""
     same = mj_model.body_sameframe[body]
-    frame = Frame(_floats(mj_model.body_ipos[body]), _rotation(mj_model.body_iquat[body]))
+    frame = Frame(floats(mj_model.body_ipos[body]), _rotation(mj_model.body_iquat[body]))
     if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
         return Frame()
     if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
@@ -341,7 +320,7 @@ def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
 def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
     """Frame of a geom in its body's frame, with the same flags as for inertial frames."""
     same = mj_model.geom_sameframe[geom]
-    origin, rotation = _floats(mj_model.geom_pos[geom]), _rotation(mj_model.geom_quat[geom])
+    origin, rotation = floats(mj_model.geom_pos[geom]), _rotation(mj_model.geom_quat[geom])
     if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
         return Frame()
     if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
@@ -382,11 +361,11 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int, joint: int) -> Servo:
         stiffness=gear**2 * stiffness,
         damping=gear**2 * damping,
         gear=gear,
-        ctrl_range=_floats(m.actuator_ctrlrange[actuator]) if limited else None,
-        force_range=_floats(forces) if force_limited else None,
+        ctrl_range=floats(m.actuator_ctrlrange[actuator]) if limited else None,
+        force_range=floats(forces) if force_limited else None,
         gain_stiffness=gear**2 * gain_stiffness,
         gain_damping=gear**2 * gain_damping,
-        joint_range=_floats(m.jnt_actfrcrange[joint]) if joint_limited else None,
+        joint_range=floats(m.jnt_actfrcrange[joint]) if joint_limited else None,
         carries_weight=bool(m.jnt_actgravcomp[joint]),
     )
 
@@ -410,7 +389,7 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
     weights = mj_model.body_invweight0
     return ContactModel(
         radius=float(mj_model.geom_size[addresses.ball_geom, 0]),
-        half_size=_floats(mj_model.geom_size[addresses.paddle_geom]),
+        half_size=floats(mj_model.geom_size[addresses.paddle_geom]),
         stiffness=float(stiffness),
         damping=float(damping),
         solimp=(
@@ -422,7 +401,7 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
         ),
         paddle_inverse_weight=float(weights[paddle_body, 0]),
         ball_inverse_weight=float(weights[addresses.ball_body, 0]),
-        friction=_floats(friction) if frictional else None,
+        friction=floats(friction) if frictional else None,
         elliptic=bool(elliptic),
         impratio=max(_MIN_VALUE, float(mj_model.opt.impratio)),
         tangent_damping=_tangent_damping(mj_model, float(dmax)) if elliptic else None,

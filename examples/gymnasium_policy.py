@@ -1,0 +1,28 @@
+"""Gymnasium: one environment, the shipped policy, and an own target height.
+
+python examples/gymnasium_policy.py
+"""
+
+import argparse
+
+import gymnasium
+
+import bounce_mjx
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--steps", type=int, default=2000)
+parser.add_argument("--target-height", type=float, default=0.5)
+arguments = parser.parse_args()
+
+env = gymnasium.make("bounce_mjx/BounceBall-v0")
+policy = bounce_mjx.load_policy("pretrained")
+layout = env.get_wrapper_attr("task").layout
+
+observation, _ = env.reset(seed=0, options={"target_height": arguments.target_height})
+policy.reset()
+bounces, steps, over = 0, 0, False
+while steps < arguments.steps and not over:
+    action = policy.step({name: observation[layout[name]] for name in policy.needs})
+    observation, reward, terminated, truncated, info = env.step(action)
+    bounces, steps, over = bounces + int(info["bounced"]), steps + 1, terminated or truncated
+print(f"{bounces} bounces in {steps * env.get_wrapper_attr('dt'):.2f} s")

@@ -1,0 +1,346 @@
+"""B environments on JAX that start and end their episodes separately, with NumPy arrays.
+
+Each environment has its own stream of random numbers, so that it draws the same episodes in a batch
+of any size. Batches of equal configs and sizes share their compiled programs.
+"""
+
+import functools
+import operator
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.gpu.elementwise import in_one_kernel
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.state import State
+from bounce_mjx.training.setup import cache_compilations, set_up_cpu
+
+_NO_LIMIT = 2**31 - 1
+# The process in which a program has run. JAX's threads are lost when this process forks.
+_jax_process: int | None = None
+
+
+class UnexpectedArgument(UserError, TypeError):
+    """An argument or an option with an unknown name; libraries that try several expect a
+    TypeError."""
+
+
+class ResetNeeded(UserError, gymnasium.error.ResetNeeded):
+    """A step or a picture before the first reset."""
+
+
+def action_space(task: BounceBall) -> gymnasium.spaces.Box:
+    """The space of the actions of one environment."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
+
+
+def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
+    """The space of the observations of one environment."""
+    return gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+
+
+class StepArrays(NamedTuple):
+    """Result of one step of B environments; the arrays belong to the caller."""
+
+    observation: np.ndarray
+    """Observation for the next action [B, N], float32."""
+    final_observation: np.ndarray
+    """Observation after the step, before any reset [B, N], float32."""
+    reward: np.ndarray
+    """Reward [B], float64; 0 where the step only reset the environment."""
+    terminated: np.ndarray
+    """Whether the task ended the episode [B], bool."""
+    truncated: np.ndarray
+    """Whether the time limit ended the episode [B], bool."""
+    metrics: dict[str, np.ndarray]
+    """The environment's metrics, each [B], float64."""
+
+
+class Batch:
+    """B environments. It can be pickled and copied, including the state of its episodes."""
+
+    def __init__(self, settings: dict[str, Any], num_envs: int, max_episode_steps: int | None):
+        """Compiles nothing and does not use JAX's device; the first `restart` does both.
+
+        Args:
+          settings: fields of `EnvConfig`.
+          max_episode_steps: time limit of an episode in steps; None or -1 for no limit other than
+            a given `episode_seconds`.
+
+        Raises:
+          UserError: a setting is wrong; if its name is unknown, the error is a TypeError too.
+        """
+        self.config = _task_config(settings)
+        self.num_envs = _whole("num_envs", num_envs, at_least=1)
+        limits = [_NO_LIMIT]
+        if max_episode_steps not in (None, -1):
+            limits.append(_whole("max_episode_steps", max_episode_steps, at_least=1))
+        if "episode_seconds" in settings:
+            limits.append(self.config.episode_steps)
+        self._limit = min(limits)
+        self._programs = _programs_for(self.config, self.num_envs)
+        self._episodes: _Episodes | None = None
+
+    @property
+    def task(self) -> BounceBall:
+        """The environment on JAX."""
+        return self._programs.task
+
+    def restart(
+        self,
+        seeds: Sequence[int | None],
+        generator: np.random.Generator,
+        mask: np.ndarray | None = None,
+        target_heights: float | np.ndarray = np.nan,
+    ) -> np.ndarray:
+        """Starts new episodes.
+
+        Args:
+          seeds: seed of each environment; None goes on with its random numbers.
+          generator: seeds the environments that have neither a seed nor random numbers yet.
+          mask: environments to reset [B], bool; None for all.
+          target_heights: m, [] or [B]; NaN draws it.
+
+        Returns:
+          The observations of all environments [B, N], float32.
+        """
+        self._check_process()
+        if self._episodes is None:
+            self._check_started(mask is None or bool(mask.all()))
+            drawn = generator.integers(2**32, size=self.num_envs)
+            seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
+        seeded = np.array([s is not None for s in seeds])
+        numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
+        targets = np.broadcast_to(np.asarray(target_heights, np.float32), self.num_envs)
+        keys = None if self._episodes is None else self._episodes.key
+        started = self._programs.start(keys, numbers, seeded, targets)
+        if mask is not None and self._episodes is not None:
+            started = self._programs.choose(mask, started, self._episodes)
+        self._episodes = started
+        return np.array(started.env.obs.T, np.float32)
+
+    def step(
+        self,
+        actions: np.ndarray,
+        reset_before: np.ndarray | None = None,
+        reset_after: bool = False,
+    ) -> StepArrays:
+        """Advances every environment.
+
+        Args:
+          actions: [B, n], clipped to [-1, 1].
+          reset_before: environments that start a new episode instead of a step [B], bool.
+          reset_after: whether an ended episode is followed by a new one in the same step.
+
+        Raises:
+          UserError: the actions have another shape, or `restart` was never called.
+        """
+        actions = checked_actions(actions, (self.num_envs, self.task.action_size))
+        self._check_started()
+        self._check_process()
+        if reset_before is None:
+            reset_before = np.zeros(self.num_envs, bool)
+        self._episodes, packed = self._programs.step(
+            self._episodes, actions, self._limit, reset_before, reset_after
+        )
+        packed, size = np.asarray(packed), self.task.observation_size
+        numbers = packed[:, 2 * size :].T.astype(np.float64)
+        reward, terminated, truncated, *metrics = numbers
+        return StepArrays(
+            observation=np.array(packed[:, :size], np.float32),
+            final_observation=np.array(packed[:, size : 2 * size], np.float32),
+            reward=reward,
+            terminated=terminated > 0.0,
+            truncated=truncated > 0.0,
+            metrics=dict(zip(sorted(self._episodes.env.metrics), metrics, strict=True)),
+        )
+
+    def pose(self, index: int) -> tuple[np.ndarray, float]:
+        """The generalised positions [nq] and the target height (m) of one environment."""
+        self._check_started()
+        state = self._episodes.env.pipeline_state
+        return np.array(state.physics.qpos[:, index]), float(state.task.target_height[index])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_programs": None, "_episodes": jax.device_get(self._episodes)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._programs = _programs_for(self.config, self.num_envs)
+
+    def _check_started(self, started: bool | None = None) -> None:
+        if not (self._episodes is not None if started is None else started):
+            raise ResetNeeded("an environment was used before its reset; call reset() first")
+
+    def _check_process(self) -> None:
+        global _jax_process
+        _jax_process = _jax_process or os.getpid()
+        if _jax_process != os.getpid():
+            raise UserError(
+                "this process was forked from one that had already used JAX, in which JAX hangs; "
+                'start it otherwise, with AsyncVectorEnv(..., context="forkserver") or '
+                'make_vec(..., vector_kwargs={"context": "forkserver"})'
+            )
+
+
+class _Episodes(NamedTuple):
+    """State of the B episodes."""
+
+    env: State
+    """Environment states, the batch last in every array."""
+    length: jax.Array
+    """Steps since the reset [B], int32."""
+    key: jax.Array
+    """Key of each environment's later resets [B, ...]."""
+
+
+class _Programs(NamedTuple):
+    """The functions of `_Episodes`, compiled for one config and number of environments."""
+
+    task: BounceBall
+    start: Any
+    choose: Any
+    step: Any
+
+
+def _programs_for(config: EnvConfig, num_envs: int) -> _Programs:
+    # An edited file is another model.
+    edited = None if config.mjcf is None or not config.mjcf.exists() else config.mjcf.stat()
+    return _programs(config, num_envs, edited and edited.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=32)
+def _programs(config: EnvConfig, num_envs: int, edited: int | None) -> _Programs:
+    del edited
+    set_up_cpu()
+    cache_compilations()
+    task = BounceBall(config)
+    return _Programs(
+        task=task,
+        start=jax.jit(functools.partial(_start, task)),
+        choose=jax.jit(_choose),
+        step=jax.jit(functools.partial(_step, task), donate_argnums=0),
+    )
+
+
+def _start(
+    task: BounceBall,
+    keys: jax.Array | None,
+    seeds: jax.Array,
+    seeded: jax.Array,
+    targets: jax.Array,
+) -> _Episodes:
+    """New episodes; `keys` [B, ...] is None before the first ones."""
+    new_keys = jax.vmap(jax.random.PRNGKey)(seeds)
+    if keys is not None:
+        new_keys = jnp.where(seeded[:, None], new_keys, keys)
+    keys, now = _split(new_keys)
+    env = jax.vmap(functools.partial(_first_state, task), out_axes=-1)(now, targets)
+    return _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+
+
+def _first_state(task: BounceBall, key: jax.Array, target: jax.Array) -> State:
+    """The start of an episode with a target height [], m; NaN keeps the drawn one."""
+    state = task.reset(key)
+    start = state.pipeline_state
+    drawn = start.task.target_height
+    height = jnp.where(jnp.isnan(target), drawn, target).astype(drawn.dtype)
+    start = start._replace(task=start.task._replace(target_height=height))
+    memory = start.memory
+    if memory is not None and memory.sensing is not None:
+        seen = dict(memory.sensing.seen)
+        if "target_height" in seen:
+            seen["target_height"] = jnp.full_like(seen["target_height"], height)
+        memory = memory._replace(sensing=memory.sensing._replace(seen=seen))
+        start = start._replace(memory=memory)
+    return state.replace(pipeline_state=start, obs=task.observe(start))
+
+
+def _step(
+    task: BounceBall,
+    episodes: _Episodes,
+    actions: jax.Array,
+    limit: jax.Array,
+    reset_before: jax.Array,
+    reset_after: jax.Array,
+) -> tuple[_Episodes, jax.Array]:
+    """`Batch.step`; its results come as one array, as every transfer from a GPU costs time."""
+    keys, now = _split(episodes.key)
+    fresh = jax.vmap(task.reset, out_axes=-1)(now)
+    step_one = in_one_kernel(task.step)
+    stepped = jax.vmap(step_one, in_axes=-1, out_axes=-1)(episodes.env, actions.T)
+    length = episodes.length + 1
+    terminated = (stepped.done > 0) & ~reset_before
+    # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
+    truncated = (length >= limit) & ~reset_before
+    replaced = reset_before | (reset_after & (terminated | truncated))
+    after = _choose(
+        replaced,
+        _Episodes(fresh, jnp.zeros_like(length), keys),
+        _Episodes(stepped, length, episodes.key),
+    )
+    numbers = (jnp.where(reset_before, 0.0, stepped.reward), terminated, truncated)
+    metrics = [stepped.metrics[name] for name in sorted(stepped.metrics)]
+    columns = jnp.stack([*numbers, *metrics], axis=1)
+    return after, jnp.concatenate([after.env.obs.T, stepped.obs.T, columns], axis=1)
+
+
+def _choose(mask: jax.Array, chosen: _Episodes, other: _Episodes) -> _Episodes:
+    """The episodes `chosen` where the mask [B] is true, and the others elsewhere."""
+    env = jax.tree.map(lambda a, b: jnp.where(mask, a, b), chosen.env, other.env)
+    return _Episodes(
+        env,
+        jnp.where(mask, chosen.length, other.length),
+        jnp.where(mask[:, None], chosen.key, other.key),
+    )
+
+
+def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _task_config(settings: dict[str, Any]) -> EnvConfig:
+    try:
+        return validate(EnvConfig, settings, ENV_ID)
+    except UserError as error:
+        unknown = [name for name in settings if name not in EnvConfig.model_fields]
+        if not unknown:
+            raise
+        # Libraries look for this part of Python's own message.
+        python = f"got an unexpected keyword argument {unknown[0]!r}"
+        raise UnexpectedArgument(f"{error} ({python})") from error
+
+
+def _whole(name: str, value: Any, at_least: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not at_least <= number < _NO_LIMIT:
+        raise UserError(f"{name} is {value!r}, but must be a whole number of at least {at_least}")
+    return number
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The actions as an array, float32.
+
+    Raises:
+      UserError: they are not numbers of that shape.
+    """
+    try:
+        array = np.asarray(actions, np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the action must be an array of numbers {shape}, but: {error}") from error
+    if array.shape != shape:
+        raise UserError(f"the action has the shape {array.shape}, but must have {shape}")
+    return array

@@ -1,0 +1,197 @@
+"""Stable-Baselines3's `VecEnv` over a whole batch; SBX uses it too. It needs the extra `sb3`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from bounce_mjx.adapters.gymnasium.batch import Batch, action_space, observation_space
+from bounce_mjx.adapters.gymnasium.environments import (
+    EpisodeStatistics,
+    checked_height,
+    checked_options,
+)
+from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
+from bounce_mjx.errors import UserError
+from bounce_mjx.task.env import BounceBall
+
+try:
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise ImportError(
+        "bounce_mjx.adapters.sb3 needs Stable-Baselines3, which cannot be imported "
+        f"({error}); install it with pip install 'bounce_mjx[sb3]'"
+    ) from error
+
+_SHOWN = 4
+
+
+class Sb3VecEnv(VecEnv):
+    """B environments in one compiled step; an ended episode is reset within the step that ends it.
+
+    The info of an ended episode has `terminal_observation`, `TimeLimit.truncated`, the metrics of
+    its last step, and its statistics as `episode`, as from SB3's `Monitor`. Other infos are empty,
+    because many dictionaries would take longer than the physics.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 256,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = MAX_EPISODE_STEPS,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        camera: str | None = None,
+        **settings: Any,
+    ):
+        """Makes the environments; the first reset compiles them.
+
+        Args:
+          render_mode: "rgb_array" for pictures, in which the first four environments are tiled.
+          max_episode_steps: time limit of an episode in steps.
+          width: of an environment's picture, in pixels, as is `height`.
+          camera: name of a camera of the model; None for the overview.
+          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+
+        Raises:
+          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
+            argument is a TypeError too.
+        """
+        check_render_mode(render_mode)
+        self._batch = Batch(settings, num_envs, max_episode_steps)
+        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._statistics = EpisodeStatistics(num_envs)
+        self._actions: np.ndarray | None = None
+        self.render_mode = render_mode
+        self.spec: gymnasium.envs.registration.EnvSpec | None = None
+        super().__init__(
+            self._batch.num_envs, observation_space(self.task), action_space(self.task)
+        )
+        self.metadata["render_fps"] = round(1.0 / self.dt)
+
+    @property
+    def task(self) -> BounceBall:
+        """The environment on JAX."""
+        return self._batch.task
+
+    @property
+    def dt(self) -> float:
+        """Time of one step, s."""
+        return self._batch.config.control_dt
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """MuJoCo's model, to read; edits have no effect."""
+        return self.task.mj_model
+
+    def reset(self) -> np.ndarray:
+        """Starts a new episode in every environment: observations [B, N], float32. It uses the
+        seeds of `seed` and the options of `set_options` once."""
+        observation = self._restart(np.arange(self.num_envs), self._seeds, self._options)
+        self._reset_seeds()
+        self._reset_options()
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Takes the actions [B, n] of the next `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Advances every environment.
+
+        Returns:
+          Observations [B, N], rewards [B], dones [B], and an info of each environment.
+        """
+        result = self._batch.step(self._actions, reset_after=True)
+        ended = result.terminated | result.truncated
+        statistics = self._statistics.step(result.reward, ended)
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in ended]
+        for i in np.flatnonzero(ended):
+            infos[i] = {name: float(value[i]) for name, value in result.metrics.items()} | {
+                "TimeLimit.truncated": bool(result.truncated[i] and not result.terminated[i]),
+                "terminal_observation": result.final_observation[i],
+                "episode": {name: value[i].item() for name, value in statistics.items()},
+            }
+        return result.observation, result.reward.astype(np.float32), ended, infos
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Pictures of the first four environments, each [height, width, 3], uint8."""
+        if self._pictures is None:
+            return [None] * self.num_envs
+        return [self._picture(i) for i in range(min(self.num_envs, _SHOWN))]
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        if self._pictures is not None:
+            self._pictures.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """A common attribute of the environments, once for each index."""
+        return [getattr(self, attr_name)] * len(self._get_indices(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets an attribute of all environments.
+
+        Raises:
+          UserError: `indices` leaves some out, although the environments share their attributes.
+        """
+        if len(self._get_indices(indices)) != self.num_envs:
+            raise UserError(
+                f"set_attr of {attr_name} would change only some of the {self.num_envs} "
+                "environments, which share their attributes; omit indices"
+            )
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of single environments: `reset`, `render` or `get_wrapper_attr`.
+
+        Returns:
+          The results of the environments with these indices.
+
+        Raises:
+          UserError: there is no such method.
+        """
+        methods: dict[str, Callable[..., list[Any]]] = {
+            "reset": self._reset_some,
+            "render": lambda chosen: [self._pictures and self._picture(i) for i in chosen],
+            "get_wrapper_attr": lambda chosen, name: self.get_attr(name, chosen),
+        }
+        if method_name not in methods:
+            raise UserError(
+                f"env_method got {method_name!r}; the environments have the methods "
+                f"{', '.join(methods)}"
+            )
+        chosen = list(self._get_indices(indices))
+        return methods[method_name](chosen, *method_args, **method_kwargs)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
+    ) -> list[bool]:
+        """True for `Monitor`, whose statistics the infos have."""
+        return [issubclass(wrapper_class, Monitor)] * len(self._get_indices(indices))
+
+    def _reset_some(
+        self, chosen: list[int], seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> list[tuple[np.ndarray, dict[str, Any]]]:
+        observation = self._restart(
+            np.array(chosen), [seed] * self.num_envs, [options] * self.num_envs
+        )
+        return [(observation[i], {}) for i in chosen]
+
+    def _restart(
+        self, chosen: np.ndarray, seeds: list[int | None], options: list[dict[str, Any] | None]
+    ) -> np.ndarray:
+        mask = np.isin(np.arange(self.num_envs), chosen)
+        heights = [checked_options(o, "target_height").get("target_height") for o in options]
+        targets = np.array([checked_height(height) for height in heights])
+        self._statistics.restart(mask)
+        return self._batch.restart(seeds, np.random.default_rng(), mask, targets)
+
+    def _picture(self, index: int) -> np.ndarray:
+        return self._pictures.draw(self.task, *self._batch.pose(index))

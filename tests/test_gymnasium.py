@@ -1,0 +1,368 @@
+"""Gymnasium: its own checks pass, and many environments in one step equal its own vector of single
+ones."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordEpisodeStatistics
+
+from bounce_mjx import EnvConfig
+from bounce_mjx.adapters.gymnasium import batch, environments
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID
+from bounce_mjx.errors import UserError
+from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.viewers import offscreen
+
+NUM_ENVS = 3
+# A ball without a paddle reaches the floor after 30 steps.
+LIMIT, STEPS = 36, 45
+TARGET = 28
+"""Index of the target height in an observation."""
+NOTHING = np.zeros((NUM_ENVS, 6), np.float32)
+
+
+@pytest.fixture(scope="module")
+def single(opengl):
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array", max_episode_steps=LIMIT)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def vectorised(opengl):
+    env = gymnasium.make_vec(
+        ENV_ID, NUM_ENVS, render_mode="rgb_array", max_episode_steps=LIMIT, width=96, height=64
+    )
+    yield env
+    env.close()
+
+
+def make_vec(mode=AutoresetMode.NEXT_STEP, **settings) -> gymnasium.vector.VectorEnv:
+    return gymnasium.make_vec(
+        ENV_ID, NUM_ENVS, autoreset_mode=mode, max_episode_steps=LIMIT, **settings
+    )
+
+
+def make_sync(mode, wrap=lambda env: env) -> SyncVectorEnv:
+    """Gymnasium's vector of single environments."""
+    made = [lambda: wrap(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS
+    return SyncVectorEnv(made, autoreset_mode=mode)
+
+
+def falling_actions(steps: int) -> np.ndarray:
+    """Actions [steps, B, 6] that turn the arms of the last two environments away from the ball."""
+    actions = 0.1 * np.random.default_rng(0).normal(size=(steps, NUM_ENVS, 6))
+    actions[:, 1:, 0] += [1.0, -0.7]
+    return actions.astype(np.float32)
+
+
+def episode(env, seed: int, steps: int) -> list:
+    """Copies of everything that an environment returns for given actions."""
+    given = [env.reset(seed=seed)]
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        given.append(env.step(action))
+    return copy.deepcopy(given)
+
+
+def assert_same(left, right, tolerance: float) -> None:
+    """The same structure, keys, types and shapes, and nearly the same numbers."""
+    assert type(left) is type(right)
+    if isinstance(left, dict):
+        assert left.keys() == right.keys()
+        for key in left:
+            assert_same(left[key], right[key], 1e9 if key == "t" else tolerance)
+    elif isinstance(left, tuple) or (isinstance(left, np.ndarray) and left.dtype == object):
+        for one, other in zip(left, right, strict=True):
+            assert_same(one, other, tolerance)
+    elif isinstance(left, np.ndarray):
+        assert left.dtype == right.dtype and left.shape == right.shape
+        np.testing.assert_allclose(left, right, atol=tolerance, rtol=tolerance)
+    else:
+        assert left is right is None
+
+
+def test_import_registers_whichever_comes_first():
+    for order in ("import bounce_mjx, gymnasium", "import gymnasium, bounce_mjx"):
+        script = (
+            f"{order}\nprint(gymnasium.spec({ENV_ID!r}).id, 'torch' in __import__('sys').modules)"
+        )
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        assert done.stdout.split() == [ENV_ID, "False"], done.stderr
+
+
+def test_spaces_and_attributes_equal_the_specification(single, vectorised):
+    action, observation = single.action_space, single.observation_space
+    assert action == gymnasium.spaces.Box(-1.0, 1.0, (6,))
+    assert observation == gymnasium.spaces.Box(-np.inf, np.inf, (29,))
+    assert vectorised.single_action_space == action
+    assert vectorised.single_observation_space == observation
+    assert vectorised.action_space.shape == (NUM_ENVS, 6)
+    assert gymnasium.spec(ENV_ID).max_episode_steps == EnvConfig().episode_steps
+    for env in (single, vectorised):
+        assert env.unwrapped.mj_model.nu == 6 and env.metadata["render_fps"] == 100
+    assert single.get_wrapper_attr("dt") == vectorised.dt == 0.01
+    assert vectorised.call("dt") == (0.01,) * NUM_ENVS
+
+
+def test_gymnasium_checks_pass(single):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # An observation without limits is what the task has.
+        warnings.filterwarnings("ignore", message=".*A Box observation space m.*")
+        check_env(single.unwrapped, skip_close_check=True)
+
+
+def test_single_environment_truncates_and_reports(single):
+    *_, (_, reward, terminated, truncated, info) = episode(single, 0, LIMIT)
+    assert truncated and not terminated
+    terms = [value for name, value in info.items() if name.startswith("reward/")]
+    assert len(terms) == len(TERM_NAMES)
+    assert sum(terms) == pytest.approx(float(reward), rel=1e-4)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vector_equals_gymnasiums_vector_of_single_environments(mode):
+    """Observations, rewards, ends, infos and their masks, over falls, time-outs and resets."""
+    same_step = mode is AutoresetMode.SAME_STEP
+    envs, reference = make_vec(mode), make_sync(mode, *[RecordEpisodeStatistics] * same_step)
+    assert envs.autoreset_mode is envs.metadata["autoreset_mode"] is mode
+    assert_same(envs.reset(seed=[5, 6, 9]), reference.reset(seed=[5, 6, 9]), 1e-6)
+    ends = np.zeros((2, NUM_ENVS), bool)
+    for action in falling_actions(STEPS):
+        given, expected = envs.step(action), reference.step(action)
+        assert_same(given, expected, 1e-3)
+        ends |= np.stack(given[2:4])
+        mask = given[2] | given[3]
+        if mode is AutoresetMode.DISABLED and mask.any():
+            with pytest.raises(UserError, match="have ended; reset them with"):
+                envs.step(action)
+            given = envs.reset(options={"reset_mask": mask})
+            expected = reference.reset(options={"reset_mask": mask})
+            assert_same(given, expected, 1e-3)
+    assert ends.any(axis=1).all()
+
+
+def test_options_choose_the_target_and_the_environments(single, vectorised):
+    assert single.reset(seed=1, options={"target_height": 0.5})[0][TARGET] == 0.5
+    drawn = single.reset(seed=1)[0]
+    observation, _ = vectorised.reset(seed=[1, 2, None], options={"target_height": 0.5})
+    np.testing.assert_array_equal(observation[:, TARGET], 0.5)
+    # Only the target differs from the drawn episode.
+    np.testing.assert_allclose(observation[0, :TARGET], drawn[:TARGET], atol=1e-6)
+    mask = np.array([False, True, False])
+    after, _ = vectorised.reset(options={"reset_mask": mask, "target_height": 0.7})
+    np.testing.assert_array_equal(after[:, TARGET], np.float32([0.5, 0.7, 0.5]))
+    np.testing.assert_array_equal((after == observation).all(axis=1), ~mask)
+    # An episode's steps keep its target.
+    observation, *_ = vectorised.step(NOTHING)
+    np.testing.assert_array_equal(observation[:, TARGET], after[:, TARGET])
+
+
+def test_target_option_holds_in_an_observation_with_a_history():
+    settings = {"target_height": 3, "joint_angles": 0, "paddle_position": 0}
+    env = gymnasium.make(ENV_ID, observation=settings)
+    observation, _ = env.reset(seed=0, options={"target_height": 0.5})
+    targets = env.unwrapped.task.layout["target_height"]
+    np.testing.assert_array_equal(observation[targets], [0.5, 0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    "options, sentence",
+    [
+        ({"target_hight": 0.5}, "unexpected option 'target_hight'; known options are: target_h"),
+        ({"target_height": -1.0}, "target_height is -1.0, but must be a height"),
+        ({"target_height": "high"}, "target_height is 'high', but must be a height"),
+        ({"reset_mask": np.ones(2, bool)}, r"shape \(2,\), but must be .* \(3,\) with at least"),
+        ({"reset_mask": np.zeros(3, bool)}, "at least one True"),
+    ],
+)
+def test_wrong_options_give_one_sentence(vectorised, options, sentence):
+    kind = TypeError if "target_hight" in options else UserError
+    with pytest.raises(kind, match=sentence) as given:
+        vectorised.reset(options=options)
+    assert isinstance(given.value, UserError)
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        ({"target_hight_range": (0.3, 0.8)}, "unknown key target_hight_range; did you mean targ"),
+        # The words that TorchRL looks for.
+        ({"frameskip": 2}, "unexpected keyword argument 'frameskip'"),
+    ],
+)
+def test_unknown_arguments_are_a_type_error(arguments, sentence):
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(TypeError, match=sentence) as given:
+            make(ENV_ID, **arguments)
+        assert isinstance(given.value, UserError)
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        ({"render_mode": "human"}, "render_mode is 'human'"),
+        ({"autoreset_mode": "never"}, "autoreset_mode is 'never'; choose one of 'NextStep', 'S"),
+        ({"max_episode_steps": 0}, "max_episode_steps is 0, but must be a whole number"),
+        ({"num_envs": 0}, "num_envs is 0, but must"),
+        ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
+        ({"render_mode": "rgb_array", "width": 0}, "width is 0, but must be a whole number"),
+    ],
+)
+def test_wrong_arguments_give_one_sentence(opengl, arguments, sentence):
+    with pytest.raises(UserError, match=sentence):
+        gymnasium.make_vec(ENV_ID, **{"num_envs": 2} | arguments)
+
+
+def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
+    single, vector = environments.BounceBallEnv(), make_vec()
+    for env in (single, vector):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="before its reset"):
+            env.step(env.action_space.sample())
+        env.reset(seed=0)
+    with pytest.raises(UserError, match=r"shape \(5,\), but must have \(6,\)"):
+        single.step(np.zeros(5))
+    with pytest.raises(UserError, match=r"shape \(6,\), but must have \(3, 6\)"):
+        vector.step(np.zeros(6))
+    with pytest.raises(UserError, match="must be an array of numbers"):
+        vector.step("up")
+
+
+def test_equal_environments_share_their_programs():
+    first, second = make_vec(), make_vec(AutoresetMode.SAME_STEP)
+    other = make_vec(physics_dt=0.002)
+    assert first._batch._programs is second._batch._programs
+    assert first._batch._programs is not other._batch._programs
+
+
+def test_copies_and_pickles_continue_the_episodes(vectorised, single):
+    for env in (vectorised, single.unwrapped):
+        env.reset(seed=3)
+        action = env.action_space.sample()
+        env.step(action)
+        twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+        expected = env.step(action)
+        for twin in twins:
+            assert data_equivalence(twin.step(action), expected, exact=True)
+            assert data_equivalence(twin.render(), env.render(), exact=True)
+            twin.close()
+
+
+def test_wrappers_work_on_the_vector(vectorised):
+    """The observations and rewards of Gymnasium's wrappers on its own vector."""
+    wrappers = gymnasium.wrappers.vector
+
+    def wrap(env):
+        env = wrappers.NormalizeObservation(wrappers.RecordEpisodeStatistics(env))
+        return wrappers.NormalizeReward(env)
+
+    given = episode(wrap(vectorised), 1, STEPS)
+    expected = episode(wrap(make_sync(AutoresetMode.NEXT_STEP)), 1, STEPS)
+    for left, right in zip(given, expected, strict=True):
+        assert_same(left, right, 1e-2)
+
+
+def test_arrays_become_tensors(need):
+    torch = need("torch")
+    need("array_api_compat")
+    env = gymnasium.wrappers.vector.NumpyToTorch(make_vec())
+    observation, _ = env.reset(seed=0)
+    following, reward, *_ = env.step(torch.zeros(NUM_ENVS, 6))
+    assert all(isinstance(x, torch.Tensor) for x in (observation, following, reward))
+    assert following.shape == (NUM_ENVS, 29)
+
+
+def test_torchrl_wraps_single_and_vectorised_environments(need):
+    """TorchRL's own checks pass, and the next observation is the last one of an ended episode."""
+    torchrl = need("torchrl.envs")
+    torch = need("torch")
+    torchrl.utils.check_env_specs(torchrl.GymEnv(ENV_ID))
+    actions = torch.tensor(falling_actions(LIMIT))
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+        envs = torchrl.GymWrapper(make_vec(mode))
+        data = envs.reset(seed=[5, 6, 9])
+        for action in actions:
+            data = envs.step(data.set("action", action))
+            last, data = data["next"], torchrl.utils.step_mdp(data)
+            if last["done"].any():
+                target = last["observation"][:, TARGET]
+                data = envs.maybe_reset(data)
+                ended = last["done"].squeeze(-1)
+                assert (last["observation"][ended, 8] < 0.05).any() or last["truncated"].any()
+                assert torch.equal(data["observation"][:, TARGET] != target, ended)
+
+
+def test_returned_arrays_belong_to_the_user(vectorised):
+    observation, _ = vectorised.reset(seed=0)
+    following, reward, *_, info = vectorised.step(NOTHING)
+    twin = copy.deepcopy(vectorised)
+    for array in (observation, following, reward, info["bounced"], info["_bounced"]):
+        array[:] = 7.0
+    assert data_equivalence(vectorised.step(NOTHING), twin.step(NOTHING), exact=True)
+    twin.close()
+
+
+def test_pictures_show_the_state(single, vectorised):
+    single.reset(seed=0)
+    first = single.render()
+    assert first.shape == (480, 640, 3) and first.dtype == np.uint8
+    # The arm is orange.
+    red, green, blue = first.reshape(-1, 3).astype(int).T
+    assert ((red > 150) & (green > 50) & (green < 150) & (blue < 80)).sum() > 2000
+    for _ in range(8):
+        single.step(np.ones(6, np.float32))
+    assert (np.abs(single.render().astype(int) - first).max(axis=-1) > 60).sum() > 300
+    vectorised.reset(seed=0)
+    pictures = vectorised.render()
+    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * NUM_ENVS
+    assert not np.array_equal(pictures[0], pictures[1])
+    side = gymnasium.make_vec(
+        ENV_ID, NUM_ENVS, render_mode="rgb_array", camera="side", width=96, height=64
+    )
+    side.reset(seed=0)
+    assert not np.array_equal(side.render()[0], pictures[0])
+    side.close()
+
+
+def test_rendering_failure_gives_one_sentence(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
+    with pytest.raises(UserError, match="neither EGL nor OSMesa works here; .*libosmesa6"):
+        gymnasium.make(ENV_ID, render_mode="rgb_array")
+
+
+def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
+    env = environments.BounceBallEnv()
+    monkeypatch.setattr(batch, "_jax_process", 1)
+    with pytest.raises(UserError, match='context="forkserver"'):
+        env.reset()
+
+
+def test_async_environments_run_after_jax_ran_in_the_parent():
+    """Gymnasium's processes start from a server by default; a fork would hang."""
+    script = f"""
+import gymnasium, numpy as np, bounce_mjx
+if __name__ == "__main__":
+    single = gymnasium.make({ENV_ID!r})
+    expected, _ = single.reset(seed=3)
+    envs = gymnasium.make_vec({ENV_ID!r}, 1, vectorization_mode="async")
+    observation, _ = envs.reset(seed=3)
+    np.testing.assert_array_equal(observation[0], expected)
+    envs.step(np.zeros((1, 6), np.float32))
+    envs.close()
+    print("ran")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+    )
+    assert "ran" in done.stdout, done.stderr

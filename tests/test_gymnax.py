@@ -1,0 +1,94 @@
+"""The gymnax interface, and the example of PureJaxRL."""
+
+import runpy
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall, PureJaxRLBounceBall
+from bounce_mjx.errors import UserError
+
+LIMIT = 3
+
+
+@pytest.fixture(scope="module")
+def env() -> PureJaxRLBounceBall:
+    return PureJaxRLBounceBall(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
+
+
+def test_steps_are_those_of_the_task_until_the_time_limit(env):
+    """The plain environment is the reference; at the limit the observation is a new episode's, and
+    the last one is in the info."""
+    observation, state = jax.jit(env.reset)(jax.random.key(0))
+    plain = jax.jit(env.task.reset)(jax.random.key(0))
+    np.testing.assert_array_equal(observation, plain.obs)
+    step, plain_step = jax.jit(env.step), jax.jit(env.task.step)
+    assert env.default_params.max_steps_in_episode == LIMIT
+    for i in range(LIMIT):
+        action = env.action_space().sample(jax.random.key(i))
+        observation, state, reward, done, info = step(jax.random.key(10 + i), state, action)
+        plain = plain_step(plain, action)
+        np.testing.assert_allclose(info["final_observation"], plain.obs, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(reward, plain.reward, rtol=1e-5)
+        assert bool(done) == bool(info["truncated"]) == (i == LIMIT - 1)
+        assert not info["terminated"]
+    # The target height never changes within an episode.
+    assert observation[28] != info["final_observation"][28]
+    assert state.time == 0
+    fresh, _ = env.reset(jax.random.key(10 + LIMIT - 1))
+    np.testing.assert_allclose(observation, fresh, rtol=1e-6)
+
+
+def test_the_parameters_set_the_time_limit_and_a_fall_terminates(env):
+    """In the form of gymnax 1.x, whose steps tell the two ends apart."""
+    gymnax_env = GymnaxBounceBall()
+    params = gymnax_env.default_params._replace(max_steps_in_episode=1000)
+    _, state = gymnax_env.reset(jax.random.key(0), params)
+    under = state.env.pipeline_state.physics
+    under = under._replace(qpos=under.qpos.at[8].set(0.0))
+    state = state._replace(
+        env=state.env.replace(pipeline_state=state.env.pipeline_state._replace(physics=under))
+    )
+    _, _, _, terminated, truncated, _ = gymnax_env.step(
+        jax.random.key(1), state, jnp.zeros(6), params
+    )
+    assert terminated and not truncated
+
+
+def test_spaces_and_settings(env):
+    assert env.observation_space().shape == (29,) and env.num_actions == 6
+    actions = jax.vmap(env.action_space().sample)(jax.random.split(jax.random.key(0), 100))
+    assert actions.shape == (100, 6) and np.abs(actions).max() <= 1.0 and np.ptp(actions) > 1.9
+    with pytest.raises(UserError, match="unknown key target_hight_range"):
+        GymnaxBounceBall(target_hight_range=(0.3, 0.4))
+
+
+def test_gymnax_own_wrapper_logs_episodes():
+    pytest.importorskip("gymnax")
+    from gymnax.wrappers import LogWrapper
+
+    wrapped = LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
+    _, state = wrapped.reset(jax.random.key(0))
+    rewards = []
+    for i in range(2):
+        _, state, reward, _, truncated, info = wrapped.step(jax.random.key(i), state, jnp.zeros(6))
+        rewards.append(float(reward))
+    assert truncated and info["returned_episode_lengths"] == 2
+    np.testing.assert_allclose(info["returned_episode_returns"], sum(rewards), rtol=1e-5)
+
+
+def test_example_of_purejaxrl_trains():
+    main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "purejaxrl.py"))["main"]
+    rewards = np.array(main(num_envs=32, rollout=16, updates=40))
+    assert rewards.shape == (40,) and np.all(np.isfinite(rewards)) and np.ptp(rewards) > 0.0
+
+
+def test_example_of_evosax_searches():
+    pytest.importorskip("evosax")
+    main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))["main"]
+    best = np.array(main(population=16, generations=3, steps=10))
+    # The reward of the first steps lies near its bound, and no candidate exceeds it.
+    assert best.shape == (3,) and np.all(np.isfinite(best)) and np.all(best > 0.0)

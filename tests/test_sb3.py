@@ -1,0 +1,123 @@
+"""Stable-Baselines3: the whole batch equals its own `DummyVecEnv` of single environments, and its
+algorithms train on it."""
+
+import gymnasium
+import numpy as np
+import pytest
+import stable_baselines3
+import torch
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
+
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID
+from bounce_mjx.adapters.sb3 import Sb3VecEnv
+from bounce_mjx.errors import UserError
+
+NUM_ENVS = 3
+LIMIT, STEPS = 36, 45
+TARGET = 28
+"""Index of the target height in an observation."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def envs() -> Sb3VecEnv:
+    return Sb3VecEnv(NUM_ENVS, max_episode_steps=LIMIT)
+
+
+def test_vec_env_equals_sb3s_vector_of_single_environments(envs):
+    """Observations, rewards, dones, terminal observations, statistics and time-outs."""
+    reference = DummyVecEnv(
+        [lambda: Monitor(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS
+    )
+    for vector in (envs, reference):
+        assert vector.seed(5) == [5, 6, 7]
+        vector.set_options([{"target_height": 0.5}, {}, {"target_height": 0.7}])
+    np.testing.assert_allclose(envs.reset(), reference.reset(), atol=1e-6)
+    assert envs.step(np.zeros((NUM_ENVS, 6)))[0][:, TARGET].tolist()[::2] == [0.5, np.float32(0.7)]
+    reference.step(np.zeros((NUM_ENVS, 6)))
+    actions = 0.1 * np.random.default_rng(0).normal(size=(STEPS, NUM_ENVS, 6))
+    # The arms of the last two environments turn away from the ball.
+    actions[:, 1:, 0] += [1.0, -0.7]
+    timeouts = []
+    for action in actions.astype(np.float32):
+        (*given, infos), (*expected, expected_infos) = envs.step(action), reference.step(action)
+        for left, right in zip(given, expected, strict=True):
+            assert left.dtype == right.dtype
+            np.testing.assert_allclose(left, right, atol=1e-3, rtol=1e-3)
+        for info, reference_info in zip(infos, expected_infos, strict=True):
+            timeout = info["TimeLimit.truncated"]
+            assert timeout == reference_info["TimeLimit.truncated"]
+            if "terminal_observation" not in reference_info:
+                assert info.keys() == {"TimeLimit.truncated"}
+                continue
+            timeouts.append(timeout)
+            assert info.keys() == reference_info.keys()
+            last, expected_last = (i["terminal_observation"] for i in (info, reference_info))
+            np.testing.assert_allclose(last, expected_last, atol=1e-3, rtol=1e-3)
+            assert info["episode"]["l"] == reference_info["episode"]["l"]
+            assert info["episode"]["r"] == pytest.approx(reference_info["episode"]["r"], abs=1e-2)
+    assert set(timeouts) == {False, True}
+
+
+def test_attributes_and_methods_reach_single_environments(envs):
+    envs.seed(0)
+    first = envs.reset()
+    assert envs.get_attr("dt", [0, 2]) == [0.01, 0.01]
+    assert not envs.has_attr("gravity")
+    assert envs.env_method("get_wrapper_attr", "num_envs") == [NUM_ENVS] * NUM_ENVS
+    ((observation, info),) = envs.env_method(
+        "reset", seed=1, options={"target_height": 0.7}, indices=1
+    )
+    assert observation[TARGET] == np.float32(0.7) and info == {}
+    # Seed 1 was the second environment's seed.
+    np.testing.assert_allclose(observation[:TARGET], first[1, :TARGET], atol=1e-6)
+    assert envs.env_method("render") == [None] * NUM_ENVS
+    with pytest.raises(UserError, match="methods reset, render, get_wrapper_attr"):
+        envs.env_method("jump")
+    with pytest.raises(UserError, match="only some of the 3 environments"):
+        envs.set_attr("spec", None, indices=[0])
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        Sb3VecEnv(2, frameskip=2)
+
+
+@pytest.mark.parametrize(
+    "algorithm, settings",
+    [
+        ("PPO", {"n_steps": 16, "batch_size": 24, "n_epochs": 1}),
+        ("SAC", {"learning_starts": 30, "batch_size": 16}),
+    ],
+)
+def test_algorithm_trains_and_loads(envs, algorithm, settings, tmp_path):
+    make = getattr(stable_baselines3, algorithm)
+    settings = settings | {"policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
+    model = make("MlpPolicy", VecNormalize(envs), **settings)
+    model.learn(48 * NUM_ENVS)
+    assert model.num_timesteps == 48 * NUM_ENVS
+    # The statistics of the episodes, as Monitor gives them.
+    assert len(model.ep_info_buffer) == NUM_ENVS
+    model.save(tmp_path / "model")
+    observation = envs.reset()
+    expected, _ = model.predict(observation, deterministic=True)
+    given, _ = make.load(tmp_path / "model").predict(observation, deterministic=True)
+    np.testing.assert_array_equal(given, expected)
+
+
+def test_videos_tile_the_first_environments(opengl, need, tmp_path):
+    movies = need("moviepy")
+    envs = Sb3VecEnv(NUM_ENVS, render_mode="rgb_array", width=96, height=64)
+    recorder = VecVideoRecorder(envs, str(tmp_path), lambda step: step == 0, video_length=4)
+    recorder.reset()
+    for _ in range(5):
+        recorder.step(np.zeros((NUM_ENVS, 6), np.float32))
+    recorder.close()
+    (video,) = tmp_path.glob("*.mp4")
+    with movies.VideoFileClip(str(video)) as clip:
+        assert clip.size == [2 * 96, 2 * 64] and clip.fps == 100
