@@ -23,6 +23,7 @@ from bounce_mjx.robot.arm import locate
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
+from bounce_mjx.viewers.controllers import make_scripted_controller
 from random_worlds import random_parameters
 from test_parameters import assert_same_step, c_steps, uncompiled_steps
 from test_physics import States
@@ -302,6 +303,38 @@ def test_the_small_arm_has_servos_instead_of_motors(written) -> None:
     # Critical damping at 1 / control_dt: kp = kv^2 / (4 M), with kv = 2 M / control_dt.
     kp, kv = (np.array(values["robot"][f"servo_{key}"]) for key in ("stiffness", "damping"))
     np.testing.assert_allclose(kp / kv, 50.0, rtol=1e-3)
+
+
+LIFT = link(
+    SLIDE.format("lift", "0 0 1"),
+    "0 0 0.3",
+    link(
+        hinge("roll", "1 0 0"),
+        "0.3 0 0",
+        link(hinge("pitch", "0 1 0"), "0 0 0", '<site name="tool" quat="0.7071 0 0.7071 0"/>'),
+    ),
+)
+
+
+def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
+    """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
+    base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'
+    (tmp_path / "arm.xml").write_text(mjcf(base, motors("lift roll pitch", 60.0)))
+    adopt_command.main(
+        f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --no-view".split()
+    )
+    env = BounceBall(load_config(tmp_path / "arm.yaml").env)
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    after = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((3,), np.float32))
+    assert after.obs.shape == (env.observation_size,) == (23,)
+    assert env.layout["joint_velocities"] == slice(10, 13)
+    assert joint_names(env.mj_model) == ("lift", "roll", "pitch")
+    # A slide is slower: its action of 1 commands 0.6 m/s, that of a hinge 2 rad/s.
+    robot = env.config.robot
+    speed = env.config.action_scale * np.divide(robot.servo_stiffness, robot.servo_damping)
+    np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
+    with pytest.raises(UserError, match="the package's own arm only"):
+        make_scripted_controller(env)
 
 
 def test_changes_are_listed(tmp_path) -> None:

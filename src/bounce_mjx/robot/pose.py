@@ -25,8 +25,10 @@ _DAMPING = 1e-3
 _ITERATIONS = 60
 _MAX_STEP = 0.4
 _CLEARANCE = 0.09
-# Least height of the lines between the joints beyond the first: half the thickness of a link, m.
+# Least height of the lines between the joints, half the thickness of a link, m; the base, within a
+# radius around the first joint, may be lower.
 _FLOOR_CLEARANCE = 0.07
+_BASE_RADIUS = 0.2
 # Heights above the paddle that must be free of the arm, m: the ball flies there.
 _HEADROOM = 1.0
 
@@ -143,6 +145,11 @@ class _Search:
             raise UserError(
                 f"no reachable pose with a level paddle in front of the robot ({self._names()} "
                 "within their ranges); check the site, or the paddle's position and quaternion"
+            )
+        if not poses:
+            raise UserError(
+                "no level pose in which the links stay above the floor and out of the ball's way; "
+                f"put the base of the joints {self._names()} higher, or move the paddle"
             )
         able = [p for p in poses if p.manipulability >= _LEAST_MANIPULABILITY]
         if not able:
@@ -293,9 +300,10 @@ class _Search:
         the ball's way."""
         data = self._data
         points = [data.xanchor[j] for j in self._joints] + [data.xpos[self._body]]
-        for joint, (start, end) in enumerate(zip(points, points[1:], strict=False)):
+        for start, end in zip(points, points[1:], strict=False):
             samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
-            if joint and np.any(samples[:, 2] < _FLOOR_CLEARANCE):
+            beyond_base = np.linalg.norm(samples - self._base, axis=1) > _BASE_RADIUS
+            if np.any(beyond_base & (samples[:, 2] < _FLOOR_CLEARANCE)):
                 return False
             near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
             beside = (samples[:, 2] > paddle[2] - 0.03) & (samples[:, 2] < paddle[2] + _HEADROOM)

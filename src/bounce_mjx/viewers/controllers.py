@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Memory, Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
@@ -72,8 +73,15 @@ def make_scripted_controller(env: BounceBall) -> Controller:
     Joint5 keeps it level; the lift grows with the target height's distance above the apex that the
     ball's energy allows. Joint5 and Joint6 tilt the paddle against the ball's horizontal error and
     velocity.
+
+    Raises:
+      UserError: the robot is an adopted arm.
     """
     config = env.config
+    if config.robot.site is not None:
+        raise UserError(
+            "the scripted juggler moves the package's own arm only; choose --actions random or zero"
+        )
     home = jnp.array(config.default_joint_angles)[:, None]
 
     def control(states: State, key: jax.Array) -> jax.Array:
