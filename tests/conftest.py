@@ -18,7 +18,6 @@ import pytest
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.training.setup import set_up_cpu
 from bounce_mjx.viewers.offscreen import choose_backend
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
@@ -36,8 +35,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         os.environ[CACHE] = tempfile.mkdtemp(prefix="bounce_mjx_tests_")
     jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
-    # Processes that tests start inherit it too.
-    set_up_cpu()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -1,7 +1,6 @@
 """The console script: its commands, its help, and Ctrl-C while it starts."""
 
 import importlib
-import os
 import re
 import signal
 import subprocess
@@ -14,7 +13,6 @@ import pytest
 import bounce_mjx
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.training import setup
 
 PYTHON = [sys.executable, "-X", "importtime"]
 SCRIPT = ["-c", "from bounce_mjx.commands.main import main; main()"]
@@ -198,13 +196,3 @@ def test_usual_spellings_of_flags(flags: str) -> None:
     for name in path:
         value = getattr(value, name)
     assert value == expected
-
-
-@pytest.mark.parametrize(
-    "given", ["", "--xla_force_host_platform_device_count=2", "--xla_backend_extra_options=a"]
-)
-def test_the_users_flags_of_xla_have_priority(monkeypatch, given: str) -> None:
-    monkeypatch.setenv("XLA_FLAGS", given)
-    setup.set_up_cpu()
-    added = [] if "extra_options" in given else [setup.MULTI_OUTPUT_FUSION]
-    assert os.environ["XLA_FLAGS"].split() == given.split() + added

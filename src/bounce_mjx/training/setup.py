@@ -7,12 +7,9 @@ from pathlib import Path
 
 import jax
 
-MULTI_OUTPUT_FUSION = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
-
 
 def set_up_jax() -> None:
     """Sets JAX up for a command; the user's environment variables have priority."""
-    set_up_cpu()
     set_up_gpu()
     cache_compilations()
 
@@ -37,18 +34,6 @@ def find_devices() -> None:
             jax.devices()
 
     threading.Thread(target=start, daemon=True).start()
-
-
-def set_up_cpu() -> None:
-    """Lets XLA compute the physics once per step on a CPU; `xla_backend_extra_options` in the
-    user's `XLA_FLAGS` has priority.
-
-    By default XLA makes one loop for each group of results, and each loop repeats most of the
-    physics: compiling an evaluation then takes twice as long, and running it almost three times.
-    """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "--xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {MULTI_OUTPUT_FUSION}".strip()
 
 
 def set_up_gpu() -> None:

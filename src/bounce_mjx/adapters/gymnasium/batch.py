@@ -22,7 +22,7 @@ from bounce_mjx.gpu.elementwise import in_one_kernel
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
-from bounce_mjx.training.setup import cache_compilations, set_up_cpu
+from bounce_mjx.training.setup import cache_compilations
 
 _NO_LIMIT = 2**31 - 1
 # The process in which a program has run. JAX's threads are lost when this process forks.
@@ -221,7 +221,6 @@ def _programs_for(config: EnvConfig, num_envs: int) -> _Programs:
 @functools.lru_cache(maxsize=32)
 def _programs(config: EnvConfig, num_envs: int, edited: int | None) -> _Programs:
     del edited
-    set_up_cpu()
     cache_compilations()
     task = BounceBall(config)
     return _Programs(
