@@ -275,7 +275,7 @@ def test_troubleshooting_quotes_the_errors(
     name: str, args: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
 ) -> None:
     mjcf = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
-    (tmp_path / "euler.xml").write_text(mjcf.replace('"implicitfast"', '"Euler"'))
+    (tmp_path / "rk4.xml").write_text(mjcf.replace('"implicitfast"', '"RK4"'))
     (tmp_path / "nameless.xml").write_text(mjcf.replace('"blocker"', '"bat"'))
     (tmp_path / "wrong.yaml").write_text("num_envs: 64")
     (tmp_path / "run/checkpoints/latest/64").mkdir(parents=True)
@@ -292,8 +292,8 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
     from bounce_mjx import BounceBall, EnvConfig
 
     mjcf = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
-    (tmp_path / "euler.xml").write_text(mjcf.replace('"implicitfast"', '"Euler"'))
-    engine = BounceBall(EnvConfig(mjcf=tmp_path / "euler.xml")).engine
+    (tmp_path / "rk4.xml").write_text(mjcf.replace('"implicitfast"', '"RK4"'))
+    engine = BounceBall(EnvConfig(mjcf=tmp_path / "rk4.xml")).engine
     page = (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8")
     assert f"    physics: {engine.name} ({engine.reason})\n" in page
 

@@ -444,7 +444,7 @@ def holding_policy(networks):
         mean = params["gain"] * (wanted - obs[..., OBSERVATION["joint_angles"]])
         return Gaussian(mean, jnp.ones_like(mean))
 
-    network = policy.Network(init=None, apply=apply)
+    network = networks.policy_network._replace(apply=apply)
     holding = policy.Policy(init_normalizer(29), {"gain": jnp.float32(50.0)})
     return networks._replace(policy_network=network), holding
 

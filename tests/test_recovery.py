@@ -439,13 +439,13 @@ def test_a_lock_ends_with_its_process(run: Path, straight: Path) -> None:
 
 
 def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
-    refusals = []
+    refusals, train_block = [], PPOTrainer.run
 
-    def run_block(trainer: PPOTrainer, run_block=PPOTrainer.run):
+    def run_block(*args):
         with pytest.raises(UserError, match="is in use") as refused, lock_run(run):
             pass
         refusals.append(refused)
-        return run_block(trainer)
+        return train_block(*args)
 
     monkeypatch.setattr(PPOTrainer, "run", run_block)
     resume(run, "--total-steps", str(STEPS))
@@ -461,7 +461,7 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
 def test_a_path_may_have_square_brackets(tmp_path: Path, straight: Path, capfd) -> None:
     log_dir = tmp_path / "[/x]" / "exp[lr]"
     run = train(log_dir, STEPS // 2)
-    assert capfd.readouterr().out.count(str(run)) == 4
+    assert capfd.readouterr().out.count(str(run)) == 5
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
 

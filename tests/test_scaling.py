@@ -212,11 +212,11 @@ def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
 def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, monkeypatch, capsys):
     run_block = PPOTrainer.run
 
-    def spoilt(trainer: PPOTrainer):
+    def spoilt(trainer: PPOTrainer, *args):
         if int(trainer.state.iteration[0]) == 2:
             rates = trainer.state.learning_rate.at[1].set(jnp.nan)
             trainer.state = trainer.state._replace(learning_rate=rates)
-        return run_block(trainer)
+        return run_block(trainer, *args)
 
     monkeypatch.setattr(PPOTrainer, "run", spoilt)
     run = train(tmp_path / "runs", "--num-seeds", str(SEEDS), "--total-steps", "384")

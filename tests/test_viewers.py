@@ -39,6 +39,7 @@ from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers import native, offscreen, pace
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
+    Controller,
     make_policy_controller,
     make_random_controller,
     make_scripted_controller,
@@ -199,10 +200,11 @@ def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
 def exchangeable(env: BounceBall) -> Simulation:
     """One robot under a policy that is one constant action for all joints."""
 
-    def control(policy, states, key):
-        return policy + jnp.zeros_like(states.obs[: env.action_size])
+    def control(policy, states, key, memory):
+        return policy + jnp.zeros_like(states.obs[: env.action_size]), memory
 
-    return Simulation(env, control, 1, seed=0, policy=np.float32(0.0))
+    controller = Controller(control, start_memory=lambda batch: ())
+    return Simulation(env, controller, 1, seed=0, policy=np.float32(0.0))
 
 
 def test_an_exchanged_policy_acts(env: BounceBall, exchangeable: Simulation) -> None:

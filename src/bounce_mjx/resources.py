@@ -1,5 +1,6 @@
 """The data files that come with the package: `mjcf/`, `configs/` and `pretrained/`."""
 
+import os
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -11,4 +12,5 @@ def resource_path(name: str) -> Path:
     The folders are inside the package in a wheel, and at the top of a source checkout.
     """
     inside = _PACKAGE / name
-    return inside if inside.exists() else _PACKAGE.parent.parent / name
+    # Unlike os.path.exists, Path.exists raises an error for a name that is too long.
+    return inside if os.path.exists(inside) else _PACKAGE.parent.parent / name

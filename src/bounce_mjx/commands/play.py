@@ -14,6 +14,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ class PlayCommand(StrictModel):
     """Target height, m. By default each reset draws it from the range of the run's config."""
     physics: Literal["config", "fused", "mjx"] = "config"
     """Physics engine; config is the engine of the training."""
+    randomization: RandomizationConfig = RandomizationConfig()
+    """World of the episodes, if a term is given, in place of the world of the training."""
     log_dir: Path = Path("runs/bounce_ball")
     """Folder in which to look for the newest run."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
@@ -79,6 +82,8 @@ def _load(path: Path | None, command: PlayCommand, console: Console) -> "Shown":
     config = load_run_config(checkpoint.run)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
     changes = {} if command.physics == "config" else {"physics": command.physics}
+    if command.randomization.terms:
+        changes["randomization"] = command.randomization
     policy = load_policy(checkpoint, config)
 
     def make_controller(env: "BounceBall") -> "Controller":
