@@ -12,9 +12,11 @@ import matplotlib
 matplotlib.use("svg")
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
-IMAGES = Path(__file__).resolve().parent / "images"
-RESULTS = IMAGES.parents[1] / "benchmarks" / "RESULTS.md"
+CHECKOUT = Path(__file__).resolve().parents[1]
+IMAGES = CHECKOUT / "docs/images"
+RESULTS = CHECKOUT / "benchmarks/RESULTS.md"
 PAPER, BLUE, GREEN, ORANGE, GREY = "#f4f6f8", "#cfe3f7", "#d5efd8", "#fde3c8", "#52606d"
 LINES = ["#1f77b4", "#e8590c", "#2f9e44", "#9c36b5", "#868e96", "#c92a2a"]
 
@@ -428,7 +430,7 @@ def two_policies():
 
     from bounce_mjx import load_policy
 
-    sys.path.insert(0, str(IMAGES.parents[1] / "examples"))
+    sys.path.insert(0, str(CHECKOUT / "examples"))
     import deploy
 
     class Tracker(deploy.Camera):
@@ -565,15 +567,79 @@ def parity():
     return figure
 
 
+def arms():
+    """The four arms of `configs/robots/` in their start poses; needs the packages of their MJCF."""
+    import yaml
+
+    from bounce_mjx import BounceBall, EnvConfig
+    from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+
+    names = {"peitian": "AIR4-560", "ur5e": "UR5e", "panda": "Panda", "iiwa": "iiwa"}
+    figure, row = plt.subplots(1, 4, figsize=(9.6, 2.9), layout="constrained")
+    for axes, (name, title) in zip(row, names.items(), strict=True):
+        file = CHECKOUT / "configs/robots" / f"{name}.yaml"
+        config = EnvConfig.model_validate(yaml.safe_load(file.read_text())["env"])
+        env = BounceBall(config)
+        qpos = env.mj_model.qpos0.copy()
+        qpos[env._addresses.arm_qpos,] = config.default_joint_angles
+        qpos[env._addresses.ball_qpos[:3],] = config.ball_init_pos
+        with Renderer(env, 480, 520, choose_backend()) as renderer:
+            axes.imshow(renderer.render(qpos, np.mean(config.target_height_range)))
+        axes.set_title(title)
+        axes.axis("off")
+    return figure
+
+
+def page():
+    """A screenshot of the page of `bounce-mjx play`; needs Chromium and playwright."""
+    import shutil
+    import subprocess
+
+    from playwright.sync_api import sync_playwright
+
+    command = [sys.executable, "-u", "-m", "bounce_mjx.play", "pretrained", "--viewer", "browser"]
+    server = subprocess.Popen(
+        [*command, "--port", "8231"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        address = next(
+            found[0] for line in server.stdout if (found := re.search(r"http:\S+", line))
+        )
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=shutil.which("chromium"),
+                args="--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader".split(),
+            )
+            shown = browser.new_page(viewport={"width": 1280, "height": 720})
+            shown.goto(address)
+            shown.wait_for_timeout(25_000)
+            shown.screenshot(path=IMAGES / "page.png")
+            browser.close()
+    finally:
+        server.kill()
+
+
 PICTURES = (
     packages, algorithms, libraries, settings, checkpoints, scaling, control_step, troubleshooting,
-    start_times, episode, reward_terms, sensors, two_policies, gradient, parity,
+    start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
 )  # fmt: skip
+"""`parity` is the last one, as it switches JAX to float64."""
+
+
+def save(draw) -> None:
+    """Writes one picture: a diagram or a plot as SVG, a rendering as PNG with 200 colours."""
+    figure = draw()
+    raster = IMAGES / f"{draw.__name__}.png"
+    if draw is arms:
+        figure.savefig(raster, dpi=120)
+    elif figure is not None:
+        figure.savefig(raster.with_suffix(".svg"), facecolor="white", metadata={"Date": None})
+    if draw in (arms, page):
+        Image.open(raster).convert("RGB").quantize(200).save(raster, optimize=True)
+    plt.close("all")
+
 
 if __name__ == "__main__":
     for draw in PICTURES:
         if len(sys.argv) == 1 or draw.__name__ in sys.argv:
-            draw().savefig(
-                IMAGES / f"{draw.__name__}.svg", facecolor="white", metadata={"Date": None}
-            )
-            plt.close("all")
+            save(draw)
