@@ -498,18 +498,17 @@ def gradient():
     for i, colour in enumerate(LINES):
         bottom.plot(time, slopes[:, i], color=colour, lw=1.6, label=f"Joint{i + 1}")
     bottom.set(xlabel="time of the action, s", ylabel="d last height / d action, m", xlim=(0, 0.4))
-    bottom.legend(ncols=3, loc="lower right")
+    bottom.legend(ncols=6, loc="upper center", bbox_to_anchor=(0.5, 1.22))
     return figure
 
 
 def parity():
-    """The run of `test_2000_random_action_steps_are_mujocos`, with the differences of every step."""
+    """The run of `test_2000_random_action_steps_are_mujocos`, with every step's differences."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     sys.path.insert(0, str(CHECKOUT / "tests"))
     import test_physics as tests
-
     from bounce_mjx import BounceBall
     from bounce_mjx.physics import PhysicsState, make_engine
 
