@@ -287,10 +287,10 @@ def troubleshooting():
     diagram = Diagram(36)
     diagram.axes.add_patch(matplotlib.patches.Rectangle((1, 1), 55, 34, color="#1f2933"))
     lines = (
-        (4.5, "$ python train_jax.py", "“No module named 'bounce_mjx'”, a refused flag"),
+        (4.5, "$ python train_jax.py", "“No module named ...”, a refused flag"),
         (10.5, "physics: mjx (the fused ...", "slow: a feature that only MJX has"),
         (16.5, "device: cpu", "the GPU is not used"),
-        (22.5, "compiling ...", "the first start takes long; Mosaic or pallas"),
+        (22.5, "0.2M steps  95k steps/s ...", "late: the first start compiles"),
         (31, "report: not drawn (...)", "the report"),
     )
     for y, line, _ in lines:
