@@ -109,7 +109,7 @@ def test_example_films_randomised_worlds(tmp_path, opengl):
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "playground_rollout.py"))[
         "main"
     ]
-    heights = main(tmp_path / "video.mp4", steps=4, num_envs=3)
+    heights = main(video=tmp_path / "video.mp4", steps=4, num_envs=3)
     assert (tmp_path / "video.mp4").stat().st_size > 1000
     # 0.04 s of free fall from 0.45 m, in tilted gravity.
     np.testing.assert_allclose(heights, 0.45, atol=0.02)
