@@ -21,6 +21,7 @@ SMALL = ["--num-envs", "3", "--steps"]
     [
         # A ball that the arm misses reaches the floor after 0.3 s.
         ("gymnasium_policy.py", ["--steps", "150"], ["onnxruntime"], r"[2-9] bounces in 1\.50 s"),
+        ("gymnasium_policy.py", ["robust", "--steps", "150"], ["onnxruntime"], r"[2-9] bounces in"),
         ("sb3_ppo.py", [*SMALL, "96", "--judged-steps", "5"], ["stable_baselines3"], "5. stable"),
         ("sbx_ppo.py", [*SMALL, "96"], ["sbx"], ""),
         ("torchrl_ppo.py", [*SMALL, "96"], ["torchrl"], r"batch=0, reward=-?\d"),
