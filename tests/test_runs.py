@@ -195,7 +195,7 @@ def test_an_absolute_path_in_a_robot_is_refused(place: str, tmp_path: Path) -> N
     for folder in (own, mesh.parent):
         folder.mkdir()
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
-    (tmp_path / "more.xml").write_text("<mujoco/>")
+    (tmp_path / "more.xml").write_text("<mujoco><size/></mujoco>")
     part, named = {
         "meshdir": (
             f'<compiler meshdir="{mesh.parent}"/><asset><mesh file="m.obj"/></asset>',
