@@ -31,6 +31,7 @@ from brax.training.distribution import NormalDistribution
 from brax.training.networks import FeedForwardNetwork
 
 from bounce_mjx.adapters.brax import device_put_replicated
+from bounce_mjx.adapters.brax.ppo import ppo_settings
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Network, Policy, make_networks
 from bounce_mjx.learning.ppo import make_trainer, policy_of
@@ -143,6 +144,7 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
     env = BounceBall(config.env.model_copy(update={"physics": physics}))
     steps_per_epoch = block_iterations(config) * ppo.batch_steps
     epochs = -(-config.total_steps // steps_per_epoch)
+    settings = ppo_settings(config) | {"num_timesteps": epochs * steps_per_epoch}
     started = time.perf_counter()
     on_block.prepare()
 
@@ -164,26 +166,8 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
         with device_put_replicated():
             brax_ppo.train(
                 environment=CriticObservation(env, ppo.critic_metrics),
-                num_timesteps=epochs * steps_per_epoch,
-                num_envs=ppo.num_envs,
-                episode_length=config.env.episode_steps,
-                unroll_length=ppo.rollout_length,
-                batch_size=ppo.num_envs // ppo.num_minibatches,
-                num_minibatches=ppo.num_minibatches,
-                num_updates_per_batch=ppo.num_epochs,
-                learning_rate=ppo.learning_rate,
-                learning_rate_schedule="ADAPTIVE_KL",
-                learning_rate_schedule_min_lr=ppo.min_learning_rate,
-                learning_rate_schedule_max_lr=ppo.max_learning_rate,
-                desired_kl=ppo.target_kl,
-                discounting=ppo.discount,
-                gae_lambda=ppo.gae_lambda,
-                clipping_epsilon=ppo.clip_epsilon,
-                entropy_cost=ppo.entropy_cost,
+                **settings,
                 vf_loss_coefficient=2.0 * ppo.value_cost,
-                max_grad_norm=ppo.max_grad_norm,
-                reward_scaling=ppo.reward_scale,
-                normalize_observations=True,
                 normalize_observations_std_eps=MIN_VARIANCE,
                 network_factory=networks,
                 max_devices_per_host=1,

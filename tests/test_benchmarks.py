@@ -63,7 +63,7 @@ def test_the_newest_run_counts_even_if_it_is_incomplete(benchmark):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("torch_libraries")
-@pytest.mark.parametrize("methods", [("ours", "rsl_rl"), ("brax", "skrl"), ("skrl_jax",)])
+@pytest.mark.parametrize("methods", [("ours", "rsl_rl"), ("brax", "skrl_jax")])
 def test_trainers_are_compared(methods, tmp_path):
     """Each trainer runs in its own process; together they give one table, one plot, and one line
     per evaluation."""

@@ -1,6 +1,7 @@
 """The documentation: links resolve, commands and flags exist, and quotations are true."""
 
 import ast
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -8,8 +9,11 @@ import re
 import runpy
 import shlex
 import sys
+import types
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pydantic
 import pytest
@@ -28,12 +32,17 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task import rewards
 from bounce_mjx.task.randomization import TERMS
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
+PAGES = [
+    CHECKOUT / "README.md",
+    CHECKOUT / "CONTRIBUTING.md",
+    *sorted((CHECKOUT / "docs").rglob("*.md")),
+]
 
 
 def page_id(page: Path) -> str:
@@ -66,6 +75,21 @@ def test_links_resolve(page: Path) -> None:
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_page_shows_a_picture(page: Path) -> None:
+    pictures = re.findall(r"^!\[[^]]{15,}\]\(([^)]+)\)$", page.read_text("utf-8"), re.MULTILINE)
+    assert pictures
+    for picture in pictures:
+        assert (page.parent / picture).stat().st_size < 700_000, picture
+
+
+def test_pictures_are_used_and_small() -> None:
+    folder = CHECKOUT / "docs/images"
+    text = "".join(page.read_text("utf-8") for page in [*PAGES, CHECKOUT / "benchmarks/RESULTS.md"])
+    assert [file.name for file in folder.iterdir() if f"images/{file.name})" not in text] == []
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 2e6
 
 
 def commands(page: Path) -> list[tuple[str, list[str]]]:
@@ -324,6 +348,87 @@ def test_packages_import_in_the_order_of_the_map():
             if wrong := imported & set(order[i + 1 :]):
                 against.append(f"{path.relative_to(package)} imports {wrong}")
     assert order and not against
+
+
+def examples(page: str, language: str) -> list[str]:
+    """The code blocks of a page in a language."""
+    text = (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", ["rewards.md", "sensors.md", "training.md"])
+def test_files_on_pages_are_configs(page: str) -> None:
+    files = examples(page, "yaml")
+    assert files
+    for file in files:
+        TrainConfig.model_validate(yaml.safe_load(file))
+
+
+def test_new_term_of_the_rewards_page_is_a_term(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's code, at its place in the module."""
+    (example,) = examples("rewards.md", "python")
+    before, mark, after = Path(rewards.__file__).read_text().partition("class SharedRewardConfig(")
+    module = types.ModuleType("rewards_with_a_new_term")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(compile(f"{before}{example}\n\n{mark}{after}", "rewards.md", "exec"), vars(module))
+
+    config = module.RewardConfig(sideways_velocity={"weight": 2.0})
+    inputs = {name: np.zeros(3) for name in module.RewardInputs._fields}
+    inputs |= {"n_bounces": np.zeros(()), "target_height": np.zeros(())}
+    inputs |= {"ball_velocity": np.array([3.0, 4.0, 1.0]), "bounced": np.array(False)}
+    for height, expected in ((0.3, -2.0 * 25.0), (0.05, 0.0)):  # flying, and at the paddle
+        inputs["ball_position"] = np.array([0.0, 0.0, height])
+        terms = module.weighted_terms(config, module.RewardInputs(**inputs))
+        assert float(terms["sideways_velocity"]) == pytest.approx(expected)
+    assert terms.keys() == {*TERM_NAMES, "sideways_velocity"}
+
+
+@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md"])
+def test_examples_on_jax_run(page: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """Compiled functions are only traced, which takes a tenth of the time."""
+
+    def traced(function, **_):
+        shapes = functools.partial(jax.eval_shape, function)
+        return lambda *args: jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes(*args))
+
+    monkeypatch.setattr(jax, "jit", traced)
+    exec(compile(examples(page, "python")[-1], page, "exec"), {})
+    assert capsys.readouterr().out
+
+
+def content(page: str) -> str:
+    return (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
+
+
+def cells(table: str) -> list[list[str]]:
+    """The cells of a Markdown table without its head."""
+    rows = [row.strip().strip("|").split("|") for row in table.strip().splitlines()[2:]]
+    return [[cell.strip() for cell in row] for row in rows]
+
+
+def table_after(text: str, heading: str) -> list[list[str]]:
+    """The first table after a text."""
+    return cells(re.search(r"(?:^\|.*\n)+", text.split(heading, 1)[1], re.MULTILINE)[0])
+
+
+def test_figures_are_those_of_the_measurements() -> None:
+    """Figures that several pages repeat, from the newest table of RESULTS.md."""
+    results = (CHECKOUT / "benchmarks/RESULTS.md").read_text(encoding="utf-8")
+    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    starts = table_after(results, "measures cold and second starts by phase")
+    cold, second = (f"{float(row[6]):.0f} s" for row in starts)
+    assert f"| {cold}, second start {second} | 70 to 90 s |" in readme
+    assert f"({cold} on an H200, {second} from the second start on)" in content("quick-start.md")
+    assert f"takes {cold} on one H200\nand 70 to 90 s on 2 CPU cores" in content("README.md")
+    totals = [float(row[-1]) for row in table_after(results, "### 2-core CPU, 512 environments")]
+    assert round(min(totals), -1) == 70 and round(max(totals), -1) == 90
+
+    measured = table_after(results, "## Against other trainers")
+    ratios = [[row[0], row[5], row[7]] for row in measured]
+    assert table_after(readme, "Other trainers need") == ratios
+    speed = {row[0]: row[2] for row in table_after(results, "### One H200\n") if row[1] == "fused"}
+    quoted = {row[0]: row[1] for row in table_after(content("physics.md"), "## Speed")}
+    assert quoted == {count: f"{speed[count]} M" for count in quoted}
 
 
 def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:

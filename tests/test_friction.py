@@ -35,6 +35,7 @@ from test_physics import (
     random_states,
 )
 
+SUBSTEPS = 10
 CONES = ("pyramidal", "elliptic")
 # Single edits of the MJCF with a frictional pair.
 MODELS = {
@@ -197,23 +198,21 @@ def test_frictional_worlds_stay_with_mujoco_for_2000_steps(cone, record_property
         CEngine(m, PhysicsState(*(x[i : i + 1] for x in state[:2]))) for i, m in enumerate(models)
     ]
     engine = make_engine(base, "fused")
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 1)))
+    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), SUBSTEPS)))
     contacts, drops, errors = 0, 0, np.zeros(count)
-    for i in range(2000):
-        if i % 10 == 0:
-            action = rng.uniform(-0.03, 0.03, (count, 6))
-            state = PhysicsState(*(np.array(x) for x in state[:2]))
-            for c, qpos, qvel in zip(reference, *state[:2], strict=True):
-                data = c.data[0]
-                if data.qpos[8] < paddle_frame(c.model, data.qpos[:6])[0][2] - 0.1:
-                    drop_ball(c.model, data.qpos, data.qvel, rng)
-                    qpos[6:], qvel[6:] = data.qpos[6:], data.qvel[6:]
-                    drops += 1
-            ctrl = state.qpos[:, :6] + action
-            c_ctrl = np.concatenate([c.state.qpos[:, :6] for c in reference]) + action
-        state = step(parameters, state, ctrl)
+    for _ in range(2000 // SUBSTEPS):
+        action = rng.uniform(-0.03, 0.03, (count, 6))
+        state = PhysicsState(*(np.array(x) for x in state[:2]))
+        for c, qpos, qvel in zip(reference, *state[:2], strict=True):
+            data = c.data[0]
+            if data.qpos[8] < paddle_frame(c.model, data.qpos[:6])[0][2] - 0.1:
+                drop_ball(c.model, data.qpos, data.qvel, rng)
+                qpos[6:], qvel[6:] = data.qpos[6:], data.qvel[6:]
+                drops += 1
+        c_ctrl = np.concatenate([c.state.qpos[:, :6] for c in reference]) + action
+        state = step(parameters, state, state.qpos[:, :6] + action)
         for j, c in enumerate(reference):
-            contacts += c.step(c_ctrl[j : j + 1], 1)
+            contacts += c.step(c_ctrl[j : j + 1], SUBSTEPS)
         for j, c in enumerate(reference):
             here = PhysicsState(*(x[j : j + 1] for x in state[:2]))
             errors[j] = max(errors[j], *difference(here, c.state))

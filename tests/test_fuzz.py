@@ -169,7 +169,7 @@ def read_config(folder: Path, data: bytes) -> None:
 
 
 @pytest.mark.slow
-@cases(500)
+@cases(250)
 @given(tree=TREES | groups(TrainConfig), style=st.booleans(), unicode=st.booleans())
 def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: bool) -> None:
     text = yaml.safe_dump(tree, default_flow_style=style, allow_unicode=unicode)
@@ -177,14 +177,14 @@ def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: 
 
 
 @pytest.mark.slow
-@cases(500)
+@cases(250)
 @given(tree=groups(TrainConfig))
 def test_config_file_of_known_keys(folder: Path, tree: dict) -> None:
     read_config(folder, yaml.safe_dump(tree).encode("utf-8", "surrogatepass"))
 
 
 @pytest.mark.slow
-@cases(300)
+@cases(150)
 @given(data=st.binary() | st.text(alphabet="ab:-[]{}&*!|>'\"%@,?# \n\t01.~<e").map(str.encode))
 def test_config_file_of_any_bytes(folder: Path, data: bytes) -> None:
     read_config(folder, data)
@@ -226,7 +226,7 @@ def command_lines(flags: list[str]) -> st.SearchStrategy[list[str]]:
 
 
 @pytest.mark.slow
-@cases(300)
+@cases(100)
 @given(args=command_lines(FLAGS))
 @example(args=["--config", "x" * 5000])
 @example(args=["--resume", "x" * 5000])
@@ -244,7 +244,7 @@ def test_training_command_line(folder: Path, args: list[str]) -> None:
 
 
 @pytest.mark.slow
-@cases(200)
+@cases(100)
 @given(args=command_lines(EVAL_FLAGS))
 def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
     (folder / "fuzzed.yaml").write_bytes(b"")

@@ -48,7 +48,7 @@ def test_ctrl_c_does_not_wait_for_the_work() -> None:
 
 
 COMMANDS = {
-    "eval": ("bounce_mjx.eval --physics mjx --episodes 4", "evaluate"),
+    "eval": ("bounce_mjx.eval --physics mjx --episodes 4", "go_on"),
     "play": ("bounce_mjx.play --physics mjx --viewer browser --port 8321", "_advance"),
 }
 

@@ -36,7 +36,12 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
-from bounce_mjx.runs.folders import best_checkpoint, latest_checkpoint, save_config
+from bounce_mjx.runs.folders import (
+    best_checkpoint,
+    latest_checkpoint,
+    save_config,
+    stored_checkpoints,
+)
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
@@ -351,7 +356,7 @@ def _train_in_silence(args: list[str]) -> None:
 
 @pytest.mark.slow
 def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
-    """One training is killed with kill -9 nine times: while it starts, trains, writes a checkpoint
+    """One training is killed with kill -9 five times: while it starts, trains, writes a checkpoint
     and removes the previous one. Each process resumes from the checkpoint that the previous process
     left."""
     processes = multiprocessing.get_context("forkserver")
@@ -366,23 +371,28 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
         checkpoint."""
         return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints/latest")]
 
+    def steps_saved() -> int:
+        """Environment steps of the latest complete checkpoint."""
+        folders = log_dir.glob("*/checkpoints/latest")
+        return max((steps for folder in folders for steps in stored_checkpoints(folder)), default=0)
+
     def wait_until(happens: Callable[[], bool]) -> None:
         deadline = time.monotonic() + TIMEOUT
         while not happens():
             assert process.is_alive() and time.monotonic() < deadline
             time.sleep(0.0002)
 
-    for moment in 2 * ("start", "any", ".partial", ".discarded") + ("any",):
+    for moment in ("start", "any", ".partial", ".discarded", "any"):
         before = written()
         process = processes.Process(target=_train_in_silence, args=(args,))
         process.start()
         if moment == "start":
             time.sleep(random_seconds(0.0, 3.0))
+        elif moment == "any":
+            wait_until(lambda saved=saved: steps_saved() > saved)
+            time.sleep(random_seconds(0.0, 1.0))
         else:
             wait_until(lambda before=before: written() != before)
-        if moment == "any":
-            time.sleep(random_seconds(0.0, 1.0))
-        elif moment != "start":
             wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/latest/*{end}")))
         process.kill()
         process.join()

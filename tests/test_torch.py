@@ -1,6 +1,7 @@
 """The environment for PyTorch: shared memory, the same steps, and the interfaces of PyTorch
 libraries."""
 
+import copy
 import itertools
 import runpy
 import subprocess
@@ -328,15 +329,13 @@ def test_rsl_rl_scripts_find_what_they_touch(env):
     vec_env.close()
 
 
-def test_rsl_rl_exports_the_policy(learners, tmp_path, monkeypatch):
+def test_rsl_rl_exports_the_policy(learners, tmp_path):
     """TorchScript and ONNX give the actions of the trained network, beyond the normaliser's limit
     too, and with a quantity that never varied."""
     learner, _ = learners["rsl_rl"]
-    actor = learner.algorithm.get_policy()
-    std = actor.obs_normalizer.std.clone()
-    std[3] = 0.0
-    monkeypatch.setattr(actor.obs_normalizer, "std", std)
-    runner = types.SimpleNamespace(alg=learner.algorithm)
+    actor = copy.deepcopy(learner.algorithm.get_policy())
+    actor.obs_normalizer.std[3] = 0.0
+    runner = types.SimpleNamespace(alg=types.SimpleNamespace(get_policy=lambda: actor))
     OnPolicyRunner.export_policy_to_jit(runner, str(tmp_path))
     OnPolicyRunner.export_policy_to_onnx(runner, str(tmp_path))
     observation = 3.0 * torch.randn(8, 29) * torch.tensor([1.0] * 28 + [1e6])

@@ -33,6 +33,11 @@ def _on_one_line(text: str) -> str:
     return shorten(line, 3000)
 
 
+def reason_of(error: Exception) -> str:
+    """An exception's text on one line, for a sentence; its type if it has no text."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def shorten(text: str, length: int = 100) -> str:
     """A user's text, cut to fit into a sentence."""
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -30,12 +30,15 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import (
+    MODEL_PARAMETERS,
     PhysicsParameters,
     contact_pair,
     edited_fields,
     link_bodies,
+    to_direct_solref,
 )
 from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import RandomizationConfig, draw_world, physics_parameters
 
 Fields = dict[str, Any]
@@ -115,6 +118,19 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     _check_acting(mj_model, varied)
     _check_effect(mj_model, base_fields, batches, varied)
     return _read(mj_model, changed, varied)
+
+
+def randomized_task(
+    task: BounceBall, mj_model: mujoco.MjModel, base: Any, model: Any
+) -> BounceBall:
+    """The environment in the physics of a randomised model; itself if the model changes nothing.
+
+    The arguments after the task, and the errors, are those of `parameters_of`.
+    """
+    parameters = parameters_of(mj_model, base, model)
+    if parameters == MODEL_PARAMETERS:
+        return task
+    return BounceBall(task.config, randomize=lambda key: parameters)
 
 
 def _check_acting(mj_model: mujoco.MjModel, varied: Fields) -> None:
@@ -232,12 +248,8 @@ def _read(
     if "geom_solref" in varied and varied["geom_solref"][geoms, :].any():
         solref = mixed_solref(mj_model, geoms, *xp.asarray(changed["geom_solref"])[geoms, :], xp)
     if solref is not None:
-        first, second = solref
-        time_constant = xp.maximum(first, 2.0 * mj_model.opt.timestep)
-        given["contact_stiffness"] = xp.where(
-            first > 0.0, 1.0 / (time_constant * second) ** 2, -first
-        )
-        given["contact_damping"] = xp.where(first > 0.0, 2.0 / time_constant, -second)
+        direct = to_direct_solref(solref, mj_model.opt.timestep, xp)
+        given["contact_stiffness"], given["contact_damping"] = direct
     return PhysicsParameters(**given)
 
 

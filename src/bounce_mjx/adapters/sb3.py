@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 
 from bounce_mjx.adapters.gymnasium.batch import Batch, action_space, observation_space
 from bounce_mjx.adapters.gymnasium.environments import (
+    BounceBallEnv,
     EpisodeStatistics,
     checked_height,
     checked_options,
@@ -16,7 +16,6 @@ from bounce_mjx.adapters.gymnasium.environments import (
 from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
 from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.env import BounceBall
 
 try:
     from stable_baselines3.common.monitor import Monitor
@@ -73,20 +72,7 @@ class Sb3VecEnv(VecEnv):
         )
         self.metadata["render_fps"] = round(1.0 / self.dt)
 
-    @property
-    def task(self) -> BounceBall:
-        """The environment on JAX."""
-        return self._batch.task
-
-    @property
-    def dt(self) -> float:
-        """Time of one step, s."""
-        return self._batch.config.control_dt
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """MuJoCo's model, to read; edits have no effect."""
-        return self.task.mj_model
+    task, dt, mj_model = BounceBallEnv.task, BounceBallEnv.dt, BounceBallEnv.mj_model
 
     def reset(self) -> np.ndarray:
         """Starts a new episode in every environment: observations [B, N], float32. It uses the

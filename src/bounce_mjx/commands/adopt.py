@@ -96,7 +96,7 @@ def env_values(mjcf: Path, adoption: "Adoption") -> dict[str, Any]:
     path = EnvConfig(mjcf=mjcf).mjcf
     return {
         "mjcf": str(path),
-        "robot": _plain(adoption.config.model_dump(mode="json", exclude_defaults=True)),
+        "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
         "action_scale": adoption.action_scale,
         "default_joint_angles": [round(angle, 5) for angle in pose.angles],
         "ball_init_pos": [x, y, round(default.ball_init_pos[2] + lift, 4)],
@@ -152,9 +152,3 @@ def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adopt
         raise UserError(
             f"{out} cannot be written ({error.strerror}); choose another --out"
         ) from error
-
-
-def _plain(values: Any) -> Any:
-    if isinstance(values, dict):
-        return {key: _plain(value) for key, value in values.items()}
-    return list(values) if isinstance(values, tuple) else values

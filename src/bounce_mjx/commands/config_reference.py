@@ -16,6 +16,8 @@ Every setting of a training run. A YAML file (`--config FILE`, see [training](tr
 the keys as nested groups. Each key is also a flag of `train_jax.py`, and the flag wins over the
 file. Unknown keys and values out of range are refused.
 
+![Default, preset, robot and flag: each overrides the one before](images/settings.svg)
+
 A whole number may have an exponent (`1e6`). On the command line, the items of a list are separated
 by spaces or commas (`256 256` or `256,256`), and a switch has three forms, such as
 `--stop-when-solved`, `--no-stop-when-solved` and `--stop-when-solved=false`.

@@ -1,6 +1,7 @@
 """Compiled evaluations on the environment's own physics engine."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +9,21 @@ import numpy as np
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
+from bounce_mjx.learning.policy import Memory, Networks, Policy, act_with_memory
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import Ranges
 from bounce_mjx.task.state import State
+
+
+class _Episodes(NamedTuple):
+    """Episodes under way, batch last."""
+
+    states: State
+    memory: Memory
+    statistics: Statistics
+    recording: Recording
+    step: jax.Array
+    """Control steps so far [], int32."""
 
 
 def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callable[..., Statistics]:
@@ -49,25 +61,48 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
+    begun = _begin(env, networks, states, recorded)
+    ended = _run_until(env, networks, policy, begun, env.config.episode_steps)
+    return ended.statistics, ended.recording
 
-    def unfinished(carry):
-        _, _, statistics, _, step = carry
-        return jnp.any(statistics.running) & (step < env.config.episode_steps)
 
-    def advance(carry):
-        states, memory, statistics, recording, step = carry
-        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
-        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
-        recording = record(env, recording, states, statistics.running, step)
-        statistics = accumulate(env, statistics, states, step)
-        return states, memory, statistics, recording, step + 1
-
+def _begin(env: BounceBall, networks: Networks, states: State, recorded: int) -> _Episodes:
     episodes = states.done.shape[-1]
-    recording = empty_recording(env.config.episode_steps, env.action_size, min(recorded, episodes))
-    memory = networks.policy_network.start_memory((episodes,))
-    carry = (states, memory, empty_statistics(episodes), recording, jnp.int32(0))
-    _, _, statistics, recording, _ = jax.lax.while_loop(unfinished, advance, carry)
-    return statistics, recording
+    return _Episodes(
+        states=states,
+        memory=networks.policy_network.start_memory((episodes,)),
+        statistics=empty_statistics(episodes),
+        recording=empty_recording(
+            env.config.episode_steps, env.action_size, min(recorded, episodes)
+        ),
+        step=jnp.int32(0),
+    )
+
+
+def _run_until(
+    env: BounceBall,
+    networks: Networks,
+    policy: Policy,
+    progress: _Episodes,
+    last_step: int | jax.Array,
+) -> _Episodes:
+    """Goes on until all episodes have ended or `last_step` is reached."""
+
+    def unfinished(now: _Episodes) -> jax.Array:
+        return jnp.any(now.statistics.running) & (now.step < last_step)
+
+    def advance(now: _Episodes) -> _Episodes:
+        actions, memory = act_with_memory(networks, policy, now.states.obs.T, now.memory)
+        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
+        return _Episodes(
+            states=states,
+            memory=memory,
+            statistics=accumulate(env, now.statistics, states, now.step),
+            recording=record(env, now.recording, states, now.statistics.running, now.step),
+            step=now.step + 1,
+        )
+
+    return jax.lax.while_loop(unfinished, advance, progress)
 
 
 def reset_episodes(
@@ -97,32 +132,21 @@ def make_reporting_evaluator(
     the time limit that is simulated."""
 
     @jax.jit
-    def start(key: jax.Array):
-        memory = networks.policy_network.start_memory((episodes,))
-        return reset_episodes(env, key, episodes), memory, empty_statistics(episodes), jnp.int32(0)
+    def start(key: jax.Array) -> _Episodes:
+        return _begin(env, networks, reset_episodes(env, key, episodes), recorded=0)
 
     @jax.jit
-    def go_on(policy: Policy, carry, until: jax.Array):
-        def unfinished(carry):
-            _, _, statistics, step = carry
-            return jnp.any(statistics.running) & (step < until)
-
-        def advance(carry):
-            states, memory, statistics, step = carry
-            actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
-            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
-            return states, memory, accumulate(env, statistics, states, step), step + 1
-
-        return jax.lax.while_loop(unfinished, advance, carry)
+    def go_on(policy: Policy, now: _Episodes, last_step: jax.Array) -> _Episodes:
+        return _run_until(env, networks, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array) -> Statistics:
-        carry, limit = start(key), env.config.episode_steps
+        now, limit = start(key), env.config.episode_steps
         second = max(1, round(1.0 / env.dt))
         for done in range(0, limit, second):
-            carry = go_on(policy, carry, np.int32(min(done + second, limit)))
-            if not np.any(carry[2].running):
+            now = go_on(policy, now, np.int32(min(done + second, limit)))
+            if not np.any(now.statistics.running):
                 break
             progress(min(1.0, (done + second) / limit))
-        return carry[2]
+        return now.statistics
 
     return evaluate

@@ -44,8 +44,8 @@ def evaluate_policy(
     """Measures the five results of a policy without action noise.
 
     Args:
-      env_config, ppo_config: the settings of the policy's training; `ppo_config` defines the
-        networks.
+      env_config: the task of the policy's training.
+      ppo_config: the algorithm's settings in the policy's training, which define the networks.
       episodes: number of episodes, each from its own reset.
       seed: the seed of the resets.
       target_height: one target height for all episodes, m; None for the config's range.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.networks import MLP, PolicyNetwork, RecurrentPolicyNetwork
-from bounce_mjx.learning.statistics import Normalizer, normalize
+from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
 
 
 class Policy(NamedTuple):
@@ -90,6 +90,11 @@ def _policy_functions(
         apply=gru.apply,
         start_memory=lambda batch: (jnp.zeros((*batch, config.gru_size)),),
     )
+
+
+def untrained_policy(networks: Networks, observation_size: int, key: jax.Array) -> Policy:
+    """A policy before the first update; consumes the key."""
+    return Policy(init_normalizer(observation_size), networks.policy_network.init(key))
 
 
 def respond(

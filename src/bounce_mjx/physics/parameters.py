@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -213,17 +214,29 @@ def link_masses(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
-    """k and b of the contact pair's `solref` in MuJoCo's direct format, `solref="-k -b"`.
+    """k and b of the contact pair's `solref` in MuJoCo's direct format."""
+    solref = mj_model.pair_solref[contact_pair(mj_model)]
+    stiffness, damping = to_direct_solref(solref, mj_model.opt.timestep)
+    return float(stiffness), float(damping)
+
+
+def to_direct_solref(solref: Array, timestep: float, xp: ModuleType = np) -> tuple[Array, Array]:
+    """k and b of a `solref` [2] in MuJoCo's direct format, `solref="-k -b"`.
 
     The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
     documentation, "Modeling", solver parameters).
+
+    Args:
+      timestep: of the physics, s.
+      xp: numpy or jax.numpy, for the arrays.
     """
-    first, second = (float(x) for x in mj_model.pair_solref[contact_pair(mj_model)])
-    if first <= 0.0:
-        return -first, -second
+    first, second = solref
+    is_standard = first > 0.0
     # MuJoCo's lower limit for the time constant is two steps.
-    time_constant = max(first, 2.0 * mj_model.opt.timestep)
-    return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
+    time_constant = xp.maximum(first, 2.0 * timestep)
+    damping_ratio = xp.where(is_standard, second, 1.0)
+    stiffness = xp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
+    return stiffness, xp.where(is_standard, 2.0 / time_constant, -second)
 
 
 def contact_pair(mj_model: mujoco.MjModel) -> int:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.numbers import check_numbers
@@ -103,7 +103,7 @@ def _in_menagerie(name: str) -> Path:
         found = mujoco_menagerie.get(robot)
         return Path(found.xml(entry or found.default_model))
     except (mujoco_menagerie.MenagerieError, OSError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise UserError(
             f"menagerie:{shorten(name)} cannot be had ({shorten(reason, 300)}); give a model of "
             "MuJoCo Menagerie, and connect to the network for its first use"
@@ -122,7 +122,7 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     try:
         return _Builder(arm, model, config).build()
     except (ValueError, mujoco.FatalError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise UserError(
             f"the arm of {path} cannot be put into the task's scene ({reason}); simplify the MJCF"
         ) from error
@@ -298,7 +298,7 @@ class _Builder:
             branch = body
             while (parent := int(model.body_parentid[branch])) not in chain and parent:
                 branch = parent
-            if parent in chain[chain.index(last) :] if last in chain else False:
+            if parent in chain[chain.index(last) :]:
                 gripper.append(branch)
             elif joint in driven:
                 beside.append(_name(model, joint))
@@ -598,7 +598,7 @@ def _listed(names: Iterable[str], most: int = 8) -> str:
 
 
 def _not_compiled(path: Path, error: ValueError) -> UserError:
-    reason = " ".join(str(error).split())
+    reason = reason_of(error)
     return UserError(f"the MJCF file {path} does not compile ({reason}); correct it")
 
 

@@ -31,7 +31,6 @@ from rich.console import Console
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.arm import locate
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
@@ -90,7 +89,7 @@ def save_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's resolved config, and a copy of its robot unless the run has one."""
     if (mjcf := config.env.mjcf) is not None:
         if not mjcf.is_relative_to((run / ROBOT).absolute()):
-            mjcf = copy_robot(locate(mjcf), run).absolute()
+            mjcf = copy_robot(mjcf, run).absolute()
         # The run's folder may be moved.
         env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
         config = config.model_copy(update={"env": env})

@@ -15,9 +15,8 @@ import tensorstore
 
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.learning.ppo import TrainingState
-from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, read_json
 from bounce_mjx.runs.folders import Checkpoint
@@ -46,13 +45,9 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     size = config.env.layout.size
     networks = make_networks(config.ppo, size, config.env.num_joints)
-
-    def initial_policy() -> Policy:
-        params = networks.policy_network.init(jax.random.PRNGKey(0))
-        return Policy(init_normalizer(size), params)
-
     read_record(checkpoint)
-    return _read_arrays(checkpoint, "policy", jax.eval_shape(initial_policy))
+    shapes = jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
+    return _read_arrays(checkpoint, "policy", shapes)
 
 
 def load_training_state(

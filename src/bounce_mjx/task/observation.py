@@ -59,7 +59,9 @@ def parts(num_joints: int) -> tuple[Part, ...]:
     return tuple(Part(q.name, num_joints if q.size is None else q.size, q.unit) for q in QUANTITIES)
 
 
-BOUNCE_QUANTITIES = frozenset(quantity.name for quantity in QUANTITIES[10:])
+BOUNCE_QUANTITIES = frozenset(
+    "apex_error bounce_position bounce_interval bounce_joint_angles bounce_joint_velocities".split()
+)
 """Quantities that have one value per bounce instead of one per control step."""
 
 
@@ -114,7 +116,7 @@ class ObservationConfig(StrictModel):
     def is_momentary(self) -> bool:
         """Whether the true state of one instant determines the whole observation."""
         past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
-        remembered = any(getattr(self, p.name) for p in QUANTITIES[8:])
+        remembered = any(getattr(self, name) for name in {"action", "ball_age"} | BOUNCE_QUANTITIES)
         sources = {self.position, self.velocity}
         return not past and not remembered and sources == {"measured"}
 

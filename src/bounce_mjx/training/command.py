@@ -12,7 +12,7 @@ from rich.console import Console
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.files import differing_keys
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.interrupt import leave
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
@@ -177,7 +177,7 @@ def leave_report(outcome: "Outcome", console: Console) -> None:
 
         page = report_training(outcome.run, outcome.report, outcome.best_steps)
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         again = f"bounce-mjx report {shlex.quote(str(outcome.run))}"
         say(console, f"report: not drawn ({reason}); draw it with: {again}")
     else:

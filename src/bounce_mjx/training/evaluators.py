@@ -13,8 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
@@ -136,10 +135,7 @@ def policy_shapes(config: TrainConfig, env: BounceBall) -> Policy:
     """Shapes of a training's policy; with several seeds, the seeds are the first axis."""
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     shapes = jax.eval_shape(
-        lambda: Policy(
-            init_normalizer(env.observation_size),
-            networks.policy_network.init(jax.random.PRNGKey(0)),
-        )
+        lambda: untrained_policy(networks, env.observation_size, jax.random.PRNGKey(0))
     )
     seeds = (config.num_seeds,) if config.num_seeds > 1 else ()
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)

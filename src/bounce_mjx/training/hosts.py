@@ -25,7 +25,7 @@ from jax._src import distributed
 from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Address, Peers
 
 Tree = TypeVar("Tree")
@@ -95,7 +95,7 @@ def join(
             "give them more time with --host-timeout"
         ) from error
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = reason_of(error)[:200]
         raise UserError(
             f"the processes of this training cannot be joined ({reason}); start one process per "
             "host with --coordinator-address HOST:PORT, --num-processes N and --process-id I"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.runs.config import TrainConfig
 
 if typing.TYPE_CHECKING:
@@ -68,7 +68,7 @@ class WandbLog:
                 config=config.model_dump(mode="json"),
             )
         except Exception as error:
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise UserError(
                 f"--wandb {project} is refused ({reason}); run wandb login, or set WANDB_MODE to "
                 "offline"

@@ -60,8 +60,9 @@ class Trainer(Protocol):
         Args:
           iterations: a block's, or the rest of a block that was stopped.
 
-        Returns: Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of
-          `checked` that was not finite in an iteration; 0 if all were finite.
+        Returns:
+          Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
+          that was not finite in an iteration; 0 if all were finite.
         """
 
     def snapshot(self) -> Snapshot:

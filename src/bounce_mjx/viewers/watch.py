@@ -12,9 +12,9 @@ import numpy as np
 import viser
 from rich.console import Console
 
+from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
@@ -83,16 +83,15 @@ class TrainingPage:
                     page.run(None, lambda: self._tell(simulation, panel))
         # The training goes on without its page.
         except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = reason_of(error)
             self._say(f"the page is not served ({reason}); the training goes on without it")
 
     def _simulate(self) -> Simulation:
         config = self._config
         env = BounceBall(config.env)
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
-        untrained = Policy(
-            init_normalizer(env.observation_size),
-            networks.policy_network.init(jax.random.PRNGKey(config.seed)),
+        untrained = untrained_policy(
+            networks, env.observation_size, jax.random.PRNGKey(config.seed)
         )
         robots = _ROBOTS if env.engine.name == "fused" else 1
         controller = make_exchangeable_controller(networks)

@@ -14,10 +14,9 @@ from brax.io import image, mjcf
 from flax import struct
 
 from bounce_mjx.adapters.opengl import choose_opengl
-from bounce_mjx.adapters.randomization import parameters_of
+from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.state import State
@@ -108,9 +107,7 @@ class BraxBounceBall(brax.envs.Env):
         """Starts an episode; consumes the key `rng`."""
         task = self.task
         if self._sys is not self._base:
-            parameters = parameters_of(self._base.mj_model, self._base, self._sys)
-            if parameters != MODEL_PARAMETERS:
-                task = BounceBall(task.config, randomize=lambda key: parameters)
+            task = randomized_task(task, self._base.mj_model, self._base, self._sys)
         return self._to_brax(task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -3,16 +3,16 @@
 from typing import Any
 
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import TrainConfig, load_config
 
 
-def ppo_settings() -> dict[str, Any]:
-    """Keyword arguments of brax's `ppo.train`, from `configs/default.yaml`.
+def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
+    """Keyword arguments of brax's `ppo.train`, from a config or `configs/default.yaml`.
 
     brax's trainer lacks the bounce count as an input of the value network and the decay of the
     learning rate.
     """
-    config = load_config(resource_path("configs/default.yaml"))
+    config = config or load_config(resource_path("configs/default.yaml"))
     ppo = config.ppo
     return dict(
         num_timesteps=config.total_steps,

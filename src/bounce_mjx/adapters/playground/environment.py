@@ -13,11 +13,10 @@ from ml_collections import config_dict
 from mujoco import mjx
 
 from bounce_mjx.adapters.opengl import choose_opengl
-from bounce_mjx.adapters.randomization import parameters_of
+from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
 from bounce_mjx.task import state as core
@@ -101,9 +100,8 @@ class PlaygroundBounceBall(MjxEnv):
         """Starts an episode; consumes the key `rng`."""
         task = self.task
         if self._randomized is not None:
-            parameters = parameters_of(self.mj_model, self._own_mjx_model, self._randomized)
-            if parameters != MODEL_PARAMETERS:
-                task = BounceBall(task.config, randomize=lambda key: parameters)
+            own = self._own_mjx_model
+            task = randomized_task(task, self.mj_model, own, self._randomized)
         state = task.reset(rng)
         m, (qpos, qvel, act) = self.mj_model, state.pipeline_state.physics
         dtype = qpos.dtype

@@ -1,0 +1,628 @@
+"""Draws the pictures of the documentation: `python docs/pictures.py [NAME ...]`, all by default.
+
+The diagrams need matplotlib only; the others run the policies that come with the package.
+"""
+
+import re
+import sys
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("svg")
+import matplotlib.pyplot as plt
+import numpy as np
+from PIL import Image
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+IMAGES = CHECKOUT / "docs/images"
+RESULTS = CHECKOUT / "benchmarks/RESULTS.md"
+PAPER, BLUE, GREEN, ORANGE, GREY = "#f4f6f8", "#cfe3f7", "#d5efd8", "#fde3c8", "#52606d"
+LINES = ["#1f77b4", "#e8590c", "#2f9e44", "#9c36b5", "#868e96", "#c92a2a"]
+
+plt.rcParams |= {
+    "font.size": 10,
+    # Text stays text: small files, and words that a reader can search.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "bounce_mjx",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "legend.frameon": False,
+}
+
+
+class Diagram:
+    """Boxes and arrows on a page of 100 units in width."""
+
+    def __init__(self, height: float):
+        self.figure = plt.figure(figsize=(8.4, 8.4 * height / 100))
+        self.axes = self.figure.add_axes((0, 0, 1, 1))
+        self.axes.set(xlim=(0, 100), ylim=(height, 0))
+        self.axes.axis("off")
+
+    def box(self, x, y, width, height, title, text="", colour=PAPER, mono=False):
+        """A box with its upper left corner at (x, y)."""
+        shape = matplotlib.patches.FancyBboxPatch(
+            (x + 0.6, y + 0.6), width - 1.2, height - 1.2, "round,pad=0.6,rounding_size=1.2",
+            facecolor=colour, edgecolor=GREY, linewidth=0.8,
+        )  # fmt: skip
+        self.axes.add_patch(shape)
+        lines = text.count("\n") + 1 if text else 0
+        middle = y + height / 2
+        self.text(
+            x + width / 2, middle - 1.5 * lines, title, weight="bold",
+            family="monospace" if mono else None,
+        )  # fmt: skip
+        if text:
+            self.text(x + width / 2, middle + 1.6, text, size=9)
+
+    def text(self, x, y, text, size=10, align="center", **style):
+        self.axes.text(
+            x, y, text, size=size, ha=align, va="center", linespacing=1.25, color="#1f2933", **style
+        )
+
+    def arrow(self, start, end, both=False, colour=GREY):
+        style = {"arrowstyle": "<|-|>" if both else "-|>", "color": colour, "lw": 1.3}
+        style |= {"mutation_scale": 11, "shrinkA": 0, "shrinkB": 0}
+        self.axes.annotate("", end, start, arrowprops=style)
+
+
+def packages():
+    """The package's folders in the order of their imports."""
+    folders = {
+        "config": "types of\nsettings", "gpu": "kernels", "robot": "MJCF of\nthe arm",
+        "physics": "fused,\nMJX", "task": "reset, step,\nreward", "learning": "PPO,\nnetworks",
+        "evaluation": "the five\nresults", "runs": "folders,\ncheckpoints",
+        "deploy": "ONNX,\nload_policy", "reports": "curves,\nfigures", "training": "the job",
+        "viewers": "page,\nvideos", "adapters": "Gymnasium,\nbrax, torch", "commands": "bounce-mjx",
+    }  # fmt: skip
+    diagram = Diagram(38)
+    for i, (name, text) in enumerate(folders.items()):
+        row, column = divmod(i, 7)
+        colour = (GREEN if i < 3 else BLUE) if row == 0 else ORANGE
+        x, y = 1 + column * 14.1, 2 + row * 19
+        diagram.box(x, y, 12.4, 14, name, text, colour)
+        if column:
+            diagram.arrow((x, y + 7), (x - 1.7, y + 7))
+    diagram.text(
+        50, 18.5, "A package may import from all packages before it, in reading order.", size=9
+    )
+    return diagram.figure
+
+
+def algorithms():
+    """The interfaces of the environment, and the training job around a trainer."""
+    diagram = Diagram(60)
+    diagram.box(33, 1, 34, 10, "BounceBall", "pure reset and step", GREEN)
+    interfaces = (
+        ("task.vector", "your own loop in JAX,\nPPO of this project", BLUE),
+        ("brax, gymnax", "Playground, PureJaxRL,\nEvosax", BLUE),
+        ("Gymnasium, SB3", "SBX, TorchRL,\nCleanRL, skrl", ORANGE),
+        ("TorchVectorEnv", "rsl_rl, skrl", ORANGE),
+    )
+    for i, (title, text, colour) in enumerate(interfaces):
+        diagram.box(1 + 24.7 * i, 18, 23.5, 13, title, text, colour)
+        diagram.arrow((50 + (i - 1.5) * 7, 11), (12.7 + 24.7 * i, 18))
+    diagram.box(1, 38, 23.5, 20, "Trainer", "state_template, compile,\nstart, run, snapshot", BLUE)
+    steps = ("run a\nblock", "evaluate", "save", "log", "report")
+    for i, step in enumerate(steps):
+        diagram.box(33 + 13.5 * i, 42, 12, 11, step, colour=GREEN)
+        if i:
+            diagram.arrow((31.5 + 13.5 * i, 47.5), (33 + 13.5 * i, 47.5))
+    diagram.arrow((24.5, 47.5), (33, 47.5), both=True)
+    diagram.text(66, 39.5, "the training job, the same for every trainer", size=9)
+    diagram.text(66, 56, "also: resume, signals, seeds, faults, full disks", size=9)
+    return diagram.figure
+
+
+def libraries():
+    """One compiled step behind every adapter."""
+    diagram = Diagram(46)
+    diagram.box(
+        1,
+        13,
+        27,
+        20,
+        "one compiled step",
+        "B environments:\nphysics, task, reward,\nreset of ended episodes",
+        GREEN,
+    )
+    rows = (
+        ("NumPy", "make_vec, make", "Gymnasium, TorchRL, CleanRL, skrl"),
+        ("NumPy", "Sb3VecEnv", "Stable-Baselines3, SBX"),
+        ("tensors", "TorchVectorEnv", "rsl_rl, skrl; shared memory, no copy"),
+        ("arrays", "brax, Playground, gymnax", "their trainers, PureJaxRL, Evosax"),
+    )
+    for i, (kind, title, text) in enumerate(rows):
+        y = 1 + 11.3 * i
+        diagram.box(48, y, 51, 10, title, text, BLUE if kind == "arrays" else ORANGE)
+        start = 17 + 4 * i
+        diagram.arrow((28, start), (48, y + 5))
+        diagram.text(37, 0.55 * start + 0.45 * (y + 5), kind, size=9, backgroundcolor="white")
+    return diagram.figure
+
+
+def settings():
+    """The sources of a setting, from the weakest to the strongest."""
+    diagram = Diagram(27)
+    sources = (
+        ("default", "of the type"), ("preset", "--config FILE"), ("robot", "--robot FILE"),
+        ("flag", "--num-envs 64"), ("config.yaml", "in the run's\nfolder"),
+    )  # fmt: skip
+    for i, (title, text) in enumerate(sources):
+        diagram.box(1 + 20.2 * i, 2, 16.6, 13, title, text, GREEN if i == 4 else BLUE)
+        if i:
+            diagram.arrow((-2.6 + 20.2 * i, 8.5), (1 + 20.2 * i, 8.5))
+    diagram.text(40, 18.5, "each one overrides the one before, key by key", size=9)
+    diagram.arrow((90, 15), (90, 21))
+    diagram.text(98.5, 23.5, "resume, eval, play, export and report read it", size=9, align="right")
+    return diagram.figure
+
+
+def checkpoints():
+    """The course of a training, and how a checkpoint is written."""
+    diagram = Diagram(45)
+    names = (
+        "block",
+        "block",
+        "block",
+        "evaluate",
+        "save",
+        "block",
+        "block",
+        "block",
+        "evaluate",
+        "save",
+    )
+    x = 1.0
+    for name in names:
+        width = {"block": 9.5, "evaluate": 12.2, "save": 8}[name]
+        colour = {"block": BLUE, "evaluate": GREEN, "save": ORANGE}[name]
+        diagram.box(x, 2, width, 9, name, colour=colour)
+        x += width
+    diagram.text(50, 14.5, "time: one evaluation for every eval_every environment steps", size=9)
+    steps = (
+        ("write", "all files, as\n<steps>.partial"), ("sync", "to the disk"),
+        ("rename", "to <steps>:\nnow it counts"), ("remove", "the checkpoint\nbefore it"),
+    )  # fmt: skip
+    for i, (title, text) in enumerate(steps):
+        diagram.box(1 + 25.2 * i, 20, 21.5, 13, title, text, ORANGE)
+        if i:
+            diagram.arrow((-2.7 + 25.2 * i, 26.5), (1 + 25.2 * i, 26.5))
+    diagram.text(37, 37.5, "killed here: the old checkpoint is complete", size=9)
+    diagram.text(83, 37.5, "killed here: the new one is complete", size=9)
+    diagram.arrow((2, 35.2), (73.5, 35.2), both=True)
+    diagram.arrow((75, 35.2), (99, 35.2), both=True)
+    diagram.text(50, 42.5, "--resume continues from checkpoints/latest/<steps>", size=9)
+    return diagram.figure
+
+
+def scaling():
+    """Seeds, devices and hosts."""
+    diagram = Diagram(58)
+    for i, title in enumerate(("--num-seeds 4", "--num-devices 4")):
+        left = 1 + 50.5 * i
+        diagram.text(left + 24, 2.5, title, weight="bold", family="monospace")
+        for j in range(4):
+            x = left + 12.2 * j
+            shared = i == 1
+            title = f"GPU {j}" if shared else f"seed {j}"
+            diagram.box(
+                x, 6, 11.4, 15, title, "a quarter of\nnum_envs" if shared else "num_envs", GREEN
+            )
+            if shared:
+                diagram.arrow((x + 5.7, 21), (x + 5.7, 27))
+            else:
+                diagram.box(x, 26, 11.4, 11, "networks", colour=BLUE)
+                diagram.arrow((x + 5.7, 21), (x + 5.7, 26), both=True)
+    diagram.box(
+        51.5,
+        27,
+        48,
+        10,
+        "the same networks on each GPU",
+        "sum of the gradients, once per minibatch",
+        BLUE,
+    )
+    diagram.text(25, 40, "separate trainings in one program", size=9)
+    diagram.text(75.5, 40, "one training, the same for any number of GPUs", size=9)
+    diagram.box(
+        1,
+        45,
+        98.5,
+        11,
+        "--distributed",
+        "the same over the GPUs of all hosts; process 0 writes the run's folder",
+        ORANGE,
+        mono=True,
+    )
+    return diagram.figure
+
+
+def control_step():
+    """The delays between the ball and the arm, and the settings that simulate them."""
+    diagram = Diagram(56)
+    rows = ("ball", "camera", "encoders", "policy", "servos")
+    for i, name in enumerate(rows):
+        diagram.text(1, 7 + 10 * i, name, align="left", weight="bold")
+        diagram.axes.axhline(10.5 + 10 * i, 0.14, 0.99, color=GREY, lw=0.6)
+    scale = 2.05  # units for each millisecond, from x = 15
+
+    def at(milliseconds):
+        return 15 + scale * milliseconds
+
+    times = np.linspace(0.0, 40.0, 200)
+    diagram.axes.plot(at(times), 8.8 - 0.0045 * (1600 - (times - 40) ** 2), color=LINES[1], lw=2)
+    for picture in range(5):
+        diagram.axes.plot(2 * [at(1 + 8.33 * picture)], [14.5, 20.5], color=LINES[0], lw=2.5)
+    for step in range(5):
+        diagram.axes.plot(2 * [at(10 * step)], [24.5, 30.5], color=LINES[2], lw=2.5)
+    diagram.text(at(5.2), 12.6, "camera_rate", size=9, family="monospace", backgroundcolor="white")
+    diagram.axes.annotate(
+        "", (at(20), 36), (at(9.33), 20.5), arrowprops={"arrowstyle": "-|>", "color": LINES[0]}
+    )
+    diagram.text(at(18.6), 23, "ball_latency", size=9, family="monospace", backgroundcolor="white")
+    diagram.axes.annotate(
+        "", (at(20), 36), (at(20), 30.5), arrowprops={"arrowstyle": "-|>", "color": LINES[2]}
+    )
+    diagram.axes.barh(37.8, 2.5 * scale, 4, at(20), color=ORANGE, edgecolor=GREY)
+    diagram.text(at(23.2), 37.8, "policy.step: 1 to 2 ms with the filter", size=9, align="left")
+    diagram.axes.annotate(
+        "", (at(34), 46), (at(22.5), 39.8), arrowprops={"arrowstyle": "-|>", "color": LINES[3]}
+    )
+    diagram.text(at(23), 44, "action_latency", size=9, family="monospace", backgroundcolor="white")
+    lag = np.linspace(0, 6, 50)
+    diagram.axes.plot(at(34 + lag), 50 - 3.5 * (1 - np.exp(-lag / 2)), color=LINES[3], lw=2)
+    diagram.axes.plot(at(np.array([15, 34])), [50, 50], color=LINES[3], lw=2)
+    diagram.text(at(33.4), 47.2, "servo_lag", size=9, family="monospace", align="right")
+    for step in range(5):
+        diagram.text(at(10 * step), 53.5, f"{10 * step} ms", size=9)
+    return diagram.figure
+
+
+def troubleshooting():
+    """The first lines of a training, and the section for each."""
+    diagram = Diagram(36)
+    diagram.axes.add_patch(matplotlib.patches.Rectangle((1, 1), 55, 34, color="#1f2933"))
+    lines = (
+        (4.5, "$ python train_jax.py", "“No module named ...”, a refused flag"),
+        (10.5, "physics: mjx (the fused ...", "slow: a feature that only MJX has"),
+        (16.5, "device: cpu", "the GPU is not used"),
+        (22.5, "0.2M steps  95k steps/s ...", "late: the first start compiles"),
+        (31, "report: not drawn (...)", "the report"),
+    )
+    for y, line, _ in lines:
+        diagram.axes.text(3, y, line, family="monospace", color="white", va="center", size=9.5)
+    diagram.axes.text(3, 26.8, "...", family="monospace", color="white", va="center")
+    for y, line, text in lines:
+        diagram.arrow((62, y), (4.5 + 1.37 * len(line), y), colour=LINES[1])
+        diagram.text(62.8, y, text, size=8.5, align="left")
+    return diagram.figure
+
+
+def start_times():
+    """Where the time of a first start goes, from RESULTS.md."""
+    text = RESULTS.read_text(encoding="utf-8")
+    gpu = re.search(r"^\| cold \|(.+)\|$", text, re.MULTILINE)[1].split("|")
+    cpu = re.findall(r"^\| 0 +\| 2\.75 +\|(.+)\|$", text, re.MULTILINE)[0].split("|")
+    again = re.search(r"^\| second \|(.+)\|$", text, re.MULTILINE)[1].split("|")
+    bars = {"2-core CPU": cpu[:5], "H200": gpu[:5], "H200, second start": again[:5]}
+    figure, axes = plt.subplots(figsize=(8.4, 2.5), layout="constrained")
+    names = ("import", "setup", "compile", "train", "evaluate")
+    for row, (label, values) in enumerate(bars.items()):
+        left = 0.0
+        for i, value in enumerate(map(float, values)):
+            axes.barh(label, value, left=left, color=LINES[i], label=None if row else names[i])
+            left += value
+        axes.text(left + 0.7, row, f"{left:.0f} s", va="center")
+    axes.invert_yaxis()
+    axes.set(xlabel="time until all five results are met, s", xlim=(0, 78))
+    axes.grid(axis="y", visible=False)
+    axes.legend(loc="lower right", ncols=5, columnspacing=1.0, handlelength=1.0)
+    return figure
+
+
+def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
+    """An episode of `pretrained`, which acts on the true state: times, observations and their
+    layout, true quantities, metrics."""
+    import jax
+
+    from bounce_mjx import BounceBall
+    from bounce_mjx.learning.policy import act, make_networks
+    from bounce_mjx.runs.config import load_run_config
+    from bounce_mjx.runs.folders import pretrained_checkpoint
+    from bounce_mjx.runs.reading import load_policy
+    from bounce_mjx.task.config import EnvConfig
+    from bounce_mjx.task.observation import OBSERVATION
+
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    networks = make_networks(config.ppo, OBSERVATION.size, 6)
+    policy = load_policy(checkpoint, config)
+    changes = {"observation": observation or {}, "randomization": randomization or {}}
+    env = BounceBall(EnvConfig(target_height_range=(target, target), **changes))
+
+    def step(state, _):
+        truth = env.kinematics(state.pipeline_state)
+        values = truth._asdict() | {"target_height": state.pipeline_state.task.target_height[None]}
+        state = env.step(state, act(networks, policy, OBSERVATION.pack(values)))
+        return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
+
+    run = jax.jit(lambda key: jax.lax.scan(step, env.reset(key), None, round(seconds / env.dt))[1])
+    seen, truth, metrics = jax.tree.map(np.asarray, run(jax.random.key(0)))
+    return env.dt * np.arange(1, len(seen) + 1), seen, env.layout, truth, metrics
+
+
+def episode():
+    """The ball's height at the start of an episode, with the quantities of the task."""
+    time, _, _, truth, metrics = rollout()
+    figure, axes = plt.subplots(figsize=(8.4, 3.6), layout="constrained")
+    axes.axhspan(0.4, 0.6, color=GREEN, label="result 3: apex within 0.1 m of the target")
+    axes.axhline(0.5, color=LINES[2], lw=1, label="target height")
+    axes.plot(time, truth.ball_position[:, 2], color=LINES[1], lw=2, label="ball")
+    axes.plot(time, truth.paddle_position[:, 2], color=LINES[0], lw=2, label="paddle")
+    bounces = metrics["bounced"] > 0
+    axes.plot(
+        time[bounces], truth.ball_position[bounces, 2], "o", color="black", ms=5, label="bounce"
+    )
+    axes.axhline(0.05, color=LINES[5], lw=1, ls="--", label="the ball is lost")
+    axes.set(xlabel="time, s", ylabel="height, m", ylim=(0, 0.68), xlim=(0, time[-1]))
+    axes.legend(loc="upper center", ncols=3, bbox_to_anchor=(0.5, 1.3))
+    return figure
+
+
+def reward_terms():
+    """Weighted terms over two bounces."""
+    time, _, _, truth, metrics = rollout()
+    part = (time > 1.0) & (time < 2.2)
+    names = (
+        "height",
+        "position",
+        "velocity_matching",
+        "controlled_upward",
+        "alignment",
+        "paddle_home",
+    )
+    figure, axes = plt.subplots(figsize=(8.4, 3.6), layout="constrained")
+    for name, colour in zip(names, LINES, strict=True):
+        axes.plot(time[part], metrics[f"reward/{name}"][part], color=colour, lw=1.6, label=name)
+    total = sum(value for name, value in metrics.items() if name.startswith("reward/"))
+    axes.plot(time[part], total[part], color="black", lw=2, label="sum of all fifteen")
+    for bounce in time[part & (metrics["bounced"] > 0)]:
+        axes.axvline(bounce, color=GREY, lw=0.8, ls=":")
+    axes.set(xlabel="time, s", ylabel="weighted reward", xlim=(1.0, 2.2))
+    axes.legend(loc="upper center", ncols=4, bbox_to_anchor=(0.5, 1.25))
+    return figure
+
+
+def sensors():
+    """A camera's pictures and the filter's estimates of the same flight."""
+    camera = {"camera_rate": (60.0, 60.0), "ball_latency": (0.02, 0.02)}
+    camera |= {"ball_position_noise": (0.005, 0.005)}
+    time, seen, layout, truth, _ = rollout({}, camera)
+    filtered = rollout({"position": "filter", "velocity": "filter"}, camera)
+    rough = rollout({"velocity": "differences"}, camera)
+    part = (time > 1.0) & (time < 2.2)
+    figure, (top, bottom) = plt.subplots(
+        2, 1, figsize=(8.4, 4.8), layout="constrained", sharex=True
+    )
+    for axes, name, true in (
+        (top, "ball_position", truth.ball_position[:, 2]),
+        (bottom, "ball_velocity", truth.ball_velocity[:, 2]),
+    ):
+        measured = seen if name == "ball_position" else rough[1]
+        label = "last picture" if name == "ball_position" else "difference of two pictures"
+        where = layout[name].start + 2
+        axes.plot(time[part], true[part], color="black", lw=2, label="true")
+        axes.plot(time[part], measured[part, where], ".", color=LINES[1], ms=4, label=label)
+        axes.plot(time[part], filtered[1][part, where], color=LINES[0], lw=1.4, label="filter")
+        axes.legend(loc="upper right", bbox_to_anchor=(1.0, 1.17), ncols=3)
+    top.set(ylabel="height of the ball, m")
+    bottom.set(ylabel="vertical velocity, m/s", xlabel="time, s", xlim=(1.0, 2.2))
+    return figure
+
+
+def two_policies():
+    """Both shipped policies on the C engine, with and without a camera."""
+    import mujoco
+
+    from bounce_mjx import load_policy
+
+    sys.path.insert(0, str(CHECKOUT / "examples"))
+    import deploy
+
+    class Tracker(deploy.Camera):
+        """A camera that also records the true height."""
+
+        def look(self, time, ball):
+            self.heights = [*getattr(self, "heights", []), (time, ball[2])]
+            super().look(time, ball)
+
+    class Perfect(Tracker):
+        """The true state of the present instant."""
+
+        def look(self, time, ball):
+            super().look(time, ball)
+            before = self.now[1] if hasattr(self, "now") else ball
+            self.now = time, np.array(ball), (ball - before) / 0.001
+
+        def measure(self, time):
+            return {"ball_position": self.now[1], "ball_velocity": self.now[2], "ball_age": 0.0}
+
+    del mujoco
+    figure, row = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained", sharey=True)
+    for axes, title, camera in (
+        (row[0], "perfect sensors", Perfect),
+        (row[1], "camera: 120 Hz, 2 mm, 20 ms late", Tracker),
+    ):
+        axes.axhline(0.5, color=LINES[2], lw=1, ls="--")
+        for name, colour in (("pretrained", LINES[1]), ("robust", LINES[0])):
+            eye = camera()
+            deploy.simulate(load_policy(name), eye, 5.0, 0.5)
+            time, height = np.array(eye.heights)[::10].T
+            axes.plot(time, height, color=colour, lw=1.6, label=name)
+        axes.set(title=title, xlabel="time, s", xlim=(0, 5), ylim=(0, 0.72))
+        axes.legend(loc="upper right", ncols=2)
+    row[0].set(ylabel="height of the ball, m")
+    return figure
+
+
+def gradient():
+    """The derivative of the ball's height by every earlier action, through a bounce."""
+    import jax
+    import jax.numpy as jnp
+
+    from bounce_mjx import BounceBall
+
+    env = BounceBall()
+    start = jax.jit(env.reset)(jax.random.key(0))
+
+    def height(actions):
+        def step(state, action):
+            state = env.step(state, action)
+            return state, env.kinematics(state.pipeline_state).ball_position[2]
+
+        heights = jax.lax.scan(step, start, actions)[1]
+        return heights[-1], heights
+
+    program = jax.jit(jax.value_and_grad(height, has_aux=True))
+    (_, heights), slopes = jax.tree.map(np.asarray, program(jnp.zeros((40, env.action_size))))
+    time = env.dt * np.arange(1, 41)
+    figure, (top, bottom) = plt.subplots(
+        2, 1, figsize=(8.4, 4.2), layout="constrained", sharex=True
+    )
+    top.plot(time, heights, color=LINES[1], lw=2)
+    top.set(ylabel="ball height, m")
+    for i, colour in enumerate(LINES):
+        bottom.plot(time, slopes[:, i], color=colour, lw=1.6, label=f"Joint{i + 1}")
+    bottom.set(xlabel="time of the action, s", ylabel="d last height / d action, m", xlim=(0, 0.4))
+    bottom.legend(ncols=6, loc="upper center", bbox_to_anchor=(0.5, 1.22))
+    return figure
+
+
+def parity():
+    """The run of `test_2000_random_action_steps_are_mujocos`, with every step's differences."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    sys.path.insert(0, str(CHECKOUT / "tests"))
+    import test_physics as tests
+    from bounce_mjx import BounceBall
+    from bounce_mjx.physics import PhysicsState, make_engine
+
+    model, rng = BounceBall().mj_model, np.random.default_rng(4)
+    step = tests.batched(make_engine(model, "fused").step)
+    state = tests.bouncing_states(model, rng)
+    reference = tests.CEngine(model, state)
+    errors, contacts = [], []
+    for i in range(2000):
+        if i % 10 == 0:
+            action = rng.uniform(-0.03, 0.03, (tests.BATCH, 6))
+            state = PhysicsState(*(np.array(x) for x in state[:2]))
+            for data, qpos, qvel in zip(reference.data, *state[:2], strict=True):
+                if data.qpos[8] < tests.paddle_frame(model, data.qpos[:6])[0][2] - 0.1:
+                    tests.drop_ball(model, data.qpos, data.qvel, rng)
+                    qpos[6:9], qvel[6:] = data.qpos[6:9], data.qvel[6:]
+            ctrl, c_ctrl = state.qpos[:, :6] + action, reference.state.qpos[:, :6] + action
+        state, single = step(state, ctrl, 1), step(reference.state, c_ctrl, 1)
+        contacts.append(reference.step(c_ctrl, 1))
+        after = reference.state
+        errors.append([max(tests.difference(x, after)) for x in (state, single)])
+    figure, axes = plt.subplots(figsize=(8.4, 3.2), layout="constrained")
+    for error, label, colour in zip(
+        np.transpose(errors), ("running freely", "one step from C's state"), LINES, strict=False
+    ):
+        axes.semilogy(np.arange(1, 2001), np.maximum(error, 1e-17), color=colour, lw=1, label=label)
+    axes.axhline(1e-9, color="black", lw=0.8, ls="--")
+    axes.axhline(1e-11, color="black", lw=0.8, ls="--")
+    axes.set(
+        xlabel=f"physics step ({tests.BATCH} environments, {sum(contacts):,} steps with contact)",
+        ylabel="largest difference from C",
+        ylim=(1e-16, 1e-8),
+        xlim=(0, 2000),
+    )
+    axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.2))
+    return figure
+
+
+def arms():
+    """The four arms of `configs/robots/` in their start poses; needs the packages of their MJCF."""
+    import yaml
+
+    from bounce_mjx import BounceBall, EnvConfig
+    from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+
+    names = {"peitian": "AIR4-560", "ur5e": "UR5e", "panda": "Panda", "iiwa": "iiwa"}
+    figure, row = plt.subplots(1, 4, figsize=(9.6, 2.9), layout="constrained")
+    for axes, (name, title) in zip(row, names.items(), strict=True):
+        file = CHECKOUT / "configs/robots" / f"{name}.yaml"
+        config = EnvConfig.model_validate(yaml.safe_load(file.read_text())["env"])
+        env = BounceBall(config)
+        qpos = env.mj_model.qpos0.copy()
+        qpos[env._addresses.arm_qpos,] = config.default_joint_angles
+        qpos[env._addresses.ball_qpos[:3],] = config.ball_init_pos
+        with Renderer(env, 480, 520, choose_backend()) as renderer:
+            axes.imshow(renderer.render(qpos, np.mean(config.target_height_range)))
+        axes.set_title(title)
+        axes.axis("off")
+    return figure
+
+
+def page():
+    """A screenshot of the page of `bounce-mjx play`; needs Chromium and playwright."""
+    import shutil
+    import subprocess
+
+    from playwright.sync_api import sync_playwright
+
+    command = [sys.executable, "-u", "-m", "bounce_mjx.play", "pretrained", "--viewer", "browser"]
+    server = subprocess.Popen(
+        [*command, "--port", "8231"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        address = next(
+            found[0] for line in server.stdout if (found := re.search(r"http:\S+", line))
+        )
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=shutil.which("chromium"),
+                args="--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader".split(),
+            )
+            shown = browser.new_page(viewport={"width": 1280, "height": 720})
+            shown.goto(address)
+            shown.wait_for_timeout(25_000)
+            for close in shown.locator("[class*=Notification-closeButton]").all():
+                close.click()
+            shown.wait_for_timeout(1_000)
+            shown.screenshot(path=IMAGES / "page.png")
+            browser.close()
+    finally:
+        server.kill()
+
+
+PICTURES = (
+    packages, algorithms, libraries, settings, checkpoints, scaling, control_step, troubleshooting,
+    start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
+)  # fmt: skip
+"""`parity` is the last one, as it switches JAX to float64."""
+
+
+def save(draw) -> None:
+    """Writes one picture: a diagram or a plot as SVG, a rendering as PNG with 200 colours."""
+    figure = draw()
+    raster = IMAGES / f"{draw.__name__}.png"
+    if draw is arms:
+        figure.savefig(raster, dpi=120)
+    elif figure is not None:
+        figure.savefig(raster.with_suffix(".svg"), facecolor="white", metadata={"Date": None})
+    if draw in (arms, page):
+        Image.open(raster).convert("RGB").quantize(200).save(raster, optimize=True)
+    plt.close("all")
+
+
+if __name__ == "__main__":
+    for draw in PICTURES:
+        if len(sys.argv) == 1 or draw.__name__ in sys.argv:
+            save(draw)
