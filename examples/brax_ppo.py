@@ -35,12 +35,11 @@ def main(folder: Path = Path("brax_ppo"), rollout_steps: int = 500, **settings: 
       settings: arguments of brax's `ppo.train` that replace the tuned ones.
     """
     env, history = get_environment(adapter.ENV_NAME, target_height_range=(0.4, 0.6)), []
+    network = functools.partial(networks.make_ppo_networks, **adapter.network_settings())
     with adapter.device_put_replicated():
         ppo.train(
             env,
-            network_factory=functools.partial(
-                networks.make_ppo_networks, **adapter.network_settings()
-            ),
+            network_factory=network,
             randomization_fn=randomize,
             progress_fn=lambda step, metrics: history.append(metrics),
             save_checkpoint_path=folder.resolve(),
@@ -51,9 +50,8 @@ def main(folder: Path = Path("brax_ppo"), rollout_steps: int = 500, **settings: 
     for _ in range(rollout_steps):
         state = step(state, policy(state.obs, jax.random.key(0))[0])
         states.append(state.pipeline_state)
-    (folder / "rollout.html").write_text(
-        html.render(env.sys.tree_replace({"opt.timestep": env.dt}), states)
-    )
+    page = html.render(env.sys.tree_replace({"opt.timestep": env.dt}), states)
+    (folder / "rollout.html").write_text(page)
     return history
 
 

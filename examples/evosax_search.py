@@ -19,11 +19,10 @@ def main(population: int = 1024, generations: int = 200, steps: int = 200) -> li
     def episode_return(weights: jax.Array, key: jax.Array) -> jax.Array:
         def act(state, _):
             state = env.step(state, jnp.tanh(weights @ jnp.append(state.obs, 1.0)))
-            alive = state.info["alive"] * (1.0 - state.done)
-            return state.replace(info={"alive": alive}), alive * state.reward
+            return state, (state.reward, 1.0 - state.done)
 
-        state = env.reset(key).replace(info={"alive": jnp.ones(())})
-        return jax.lax.scan(act, state, length=steps)[1].sum()
+        _, (rewards, alive) = jax.lax.scan(act, env.reset(key), length=steps)
+        return jnp.sum(rewards * jnp.cumprod(alive))
 
     def generation(state, key: jax.Array):
         ask, reset, tell = jax.random.split(key, 3)
@@ -34,7 +33,7 @@ def main(population: int = 1024, generations: int = 200, steps: int = 200) -> li
 
     state = search.init(jax.random.key(0), zeros, search.default_params)
     keys = jax.random.split(jax.random.key(1), generations)
-    return jax.jit(lambda: jax.lax.scan(generation, state, keys)[1])().tolist()
+    return jax.lax.scan(generation, state, keys)[1].tolist()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Gymnasium: one environment, the shipped policy, and an own target height.
+"""Gymnasium: one environment, a policy, and an own target height.
 
-python examples/gymnasium_policy.py
+python examples/gymnasium_policy.py [pretrained | robust | RUN]
 """
 
 import argparse
@@ -10,12 +10,13 @@ import gymnasium
 import bounce_mjx
 
 parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("policy", nargs="?", default="pretrained", help="name, file or run")
 parser.add_argument("--steps", type=int, default=2000)
 parser.add_argument("--target-height", type=float, default=0.5)
 arguments = parser.parse_args()
 
 env = gymnasium.make("bounce_mjx/BounceBall-v0")
-policy = bounce_mjx.load_policy("pretrained")
+policy = bounce_mjx.load_policy(arguments.policy)
 layout = env.get_wrapper_attr("task").layout
 
 observation, _ = env.reset(seed=0, options={"target_height": arguments.target_height})

@@ -1,23 +1,31 @@
-"""MuJoCo Playground: the environment from its registry, randomised worlds and a video.
+"""MuJoCo Playground: a policy in randomised worlds of the environment from its registry, filmed.
 
-`python examples/playground_rollout.py` needs `pip install playground`. A training is
-`python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own program.
+`python examples/playground_rollout.py [pretrained | robust | RUN]` needs `pip install playground`.
+A training is `python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own
+program.
 """
 
 import functools
+import sys
 from pathlib import Path
 
 import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
 import mediapy
+import numpy as np
 from mujoco_playground import registry, wrapper
 
-import bounce_mjx.adapters.playground  # noqa: F401  (registers the environment)
+import bounce_mjx.adapters.playground
 
 
-def main(video: Path = Path("playground.mp4"), steps: int = 50, num_envs: int = 4) -> jax.Array:
-    """Drops the ball in worlds of their own and films the first; the final heights [B], m."""
+def main(
+    policy: str = "robust",
+    video: Path = Path("playground.mp4"),
+    steps: int = 300,
+    num_envs: int = 4,
+) -> jax.Array:
+    """Bounces the ball in several worlds and films the first; the final heights [B], m."""
     env = registry.load("BounceBall", config_overrides={"task.target_height_range": [0.5, 0.5]})
     randomizer = functools.partial(
         registry.get_domain_randomizer("BounceBall"),
@@ -25,9 +33,14 @@ def main(video: Path = Path("playground.mp4"), steps: int = 50, num_envs: int = 
     )
     worlds = wrapper.wrap_for_brax_training(env, randomization_fn=randomizer)
     state = jax.jit(worlds.reset)(jax.random.split(jax.random.PRNGKey(1), num_envs))
-    step, states = jax.jit(worlds.step), []
+    policies = [bounce_mjx.load_policy(policy) for _ in range(num_envs)]
+    layout, step, states = env.task.layout, jax.jit(worlds.step), []
     for _ in range(steps):
-        state = step(state, jnp.zeros((num_envs, env.action_size)))
+        actions = [
+            one.step({name: observation[layout[name]] for name in one.needs})
+            for one, observation in zip(policies, np.asarray(state.obs), strict=True)
+        ]
+        state = step(state, jnp.asarray(actions, jnp.float32))
         states.append(jax.tree.map(lambda x: x[0], state))
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     mediapy.write_video(video, env.render(states, 240, 320, camera="overview"), fps=1.0 / env.dt)
@@ -35,4 +48,4 @@ def main(video: Path = Path("playground.mp4"), steps: int = 50, num_envs: int = 
 
 
 if __name__ == "__main__":
-    print(main())
+    print(main(*sys.argv[1:2]))

@@ -252,6 +252,18 @@ def test_config_reference_has_the_true_ranges() -> None:
     assert checked > 50
 
 
+def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
+    page = (CHECKOUT / "docs/libraries.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \| (`.+`) \|$", page, re.MULTILINE)
+    examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {"deploy.py"}
+    assert set(re.findall(r"examples/([\w.]+)", "".join(row[0] for row in rows))) == examples
+    for _, tests in rows:
+        for test in re.findall(r"`(.+?)`", tests):
+            file, _, name = test.partition("::")
+            text = (CHECKOUT / file).read_text(encoding="utf-8")
+            assert not name or f"\ndef {name}(" in text, test
+
+
 PACKAGE = Path(bounce_mjx.__file__).parent
 
 

@@ -594,8 +594,9 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
     said_first, now = [], 0.0
     monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
 
-    def evaluate(*_, progress, **__):
+    def evaluate(*_, started, progress, **__):
         nonlocal now
+        started("mujoco")
         said_first.append(capsys.readouterr().out)
         for share in (0.05, 0.1, 0.15, 0.2, 0.25):
             now += 6.0
@@ -608,10 +609,10 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
         eval_command.main([str(resource_path("pretrained")), "--json", str(results)])
     assert exit_info.value.code == 1
     assert re.search(r"^checkpoint: .*/pretrained/checkpoints/best/\d+ \(", said_first[0])
+    assert said_first[0].endswith("physics: mujoco  1,024 episodes of 20 s\n")
     shown = capsys.readouterr().out
     # A line after each tenth, and never more often than every 10 s.
     assert re.findall(r"(\d+)% evaluated", shown) == ["10", "20"]
-    assert "physics: mujoco  1,024 episodes of 20 s\n" in shown
     assert "warning: the solver [CG] stops.\n" in shown
     assert "|apex error| -" in shown
     plain = json.loads(results.read_text(), parse_constant=pytest.fail)

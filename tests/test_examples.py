@@ -1,11 +1,14 @@
-"""The examples run to their end."""
+"""The examples and the notebook run to their end."""
 
+import json
 import re
 import runpy
 import sys
 from pathlib import Path
 
 import pytest
+
+from bounce_mjx.runs.config import load_config
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 # Three environments, whose compiled step the examples share.
@@ -17,6 +20,7 @@ SMALL = ["--num-envs", "3", "--steps"]
     [
         # A ball that the arm misses reaches the floor after 0.3 s.
         ("gymnasium_policy.py", ["--steps", "150"], ["onnxruntime"], r"[2-9] bounces in 1\.50 s"),
+        ("gymnasium_policy.py", ["robust", "--steps", "150"], ["onnxruntime"], r"[2-9] bounces in"),
         ("sb3_ppo.py", [*SMALL, "96", "--judged-steps", "5"], ["stable_baselines3"], "5. stable"),
         ("sbx_ppo.py", [*SMALL, "96"], ["sbx"], ""),
         ("torchrl_ppo.py", [*SMALL, "96"], ["torchrl"], r"batch=0, reward=-?\d"),
@@ -34,4 +38,61 @@ def test_example_runs(example, arguments, libraries, printed, need, monkeypatch,
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / example), run_name="__main__")
     assert re.search(printed, capsys.readouterr().out)
-    assert 15 <= len((EXAMPLES / example).read_text().splitlines()) <= 60
+
+
+# In place of a training, which other tests run: the run that its flags would make, with the
+# pretrained policy. The full training takes minutes.
+TRAINED = """
+import json, sys
+from tensorboardX import SummaryWriter
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
+from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.training.command import TrainingCommand, config_of, read_command
+
+config = config_of(read_command(TrainingCommand, sys.argv[1:], prog="train", description=""))
+run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())
+writer = CheckpointWriter(run, config)
+writer.save(("best",), 64, load_policy(pretrained_checkpoint(), config), results=results)
+writer.close()
+with SummaryWriter(logdir=str(run)) as log:
+    log.add_scalar("episode/return", 1.0, 1000)
+    log.add_scalar("episode/return", 2.0, 2000)
+"""
+
+
+def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeypatch):
+    """Every cell, with a short video: the video, a table of the two runs' results, curves."""
+    nbformat, nbclient = need("nbformat"), need("nbclient")
+    need("ipykernel")
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    notebook = nbformat.read(EXAMPLES / "notebook.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    (parameters,) = (cell for cell in code if "parameters" in cell.metadata.get("tags", ()))
+    video = "--seconds 0.1 --size 96 64 --fps 20"
+    parameters.source = f"SOURCE, TRAINING, VIDEO = '', '--stop-when-solved', '{video}'"
+    (tmp_path / "train.py").write_text(TRAINED)
+    for cell in code:
+        cell.source = cell.source.replace("{COMMAND}.train", "{sys.executable} train.py")
+    nbclient.NotebookClient(
+        notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    shown = [output.data for cell in code for output in cell.outputs if "data" in output]
+    video, table, curves = shown
+    assert "data:video/mp4" in video["text/html"] and "image/png" in curves
+    runs = [next((tmp_path / "runs" / name).iterdir()) for name in ("first", "calm")]
+    configs = [load_config(run / "config.yaml") for run in runs]
+    assert [config.env.reward.action_rate.weight for config in configs] == [0.0001, 0.02]
+    assert all(config.stop_when_solved for config in configs)
+    rows = re.findall(r"^\| (.+) \| .+ \| (.+) \| (.+) \|$", table["text/markdown"], re.MULTILINE)
+    for i, run in enumerate(runs):
+        results = json.loads((run / "results.json").read_text())["results"]
+        expected = [(x["name"], pytest.approx(x["value"], rel=1e-3)) for x in results]
+        assert [(row[0], float(row[1 + i])) for row in rows[1:]] == expected
+
+
+def test_examples_are_short():
+    """Except a robot's control loop, which belongs to no library."""
+    for path in set(EXAMPLES.glob("*.py")) - {EXAMPLES / "deploy.py"}:
+        assert 15 <= len(path.read_text().splitlines()) <= 60, path.name

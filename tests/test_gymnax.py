@@ -1,6 +1,8 @@
 """The gymnax interface, and the example of PureJaxRL."""
 
 import runpy
+import sys
+import types
 from pathlib import Path
 
 import jax
@@ -66,11 +68,10 @@ def test_spaces_and_settings(env):
         GymnaxBounceBall(target_hight_range=(0.3, 0.4))
 
 
-def test_gymnax_own_wrapper_logs_episodes():
-    pytest.importorskip("gymnax")
-    from gymnax.wrappers import LogWrapper
-
-    wrapped = LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
+def test_gymnax_own_wrapper_logs_episodes(need, monkeypatch):
+    # gymnax imports its own environments, one of which has seaborn's colours.
+    monkeypatch.setitem(sys.modules, "seaborn", types.ModuleType("seaborn"))
+    wrapped = need("gymnax.wrappers").LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
     _, state = wrapped.reset(jax.random.key(0))
     rewards = []
     for i in range(2):
@@ -86,8 +87,8 @@ def test_example_of_purejaxrl_trains():
     assert rewards.shape == (5,) and np.all(np.isfinite(rewards)) and np.ptp(rewards) > 0.0
 
 
-def test_example_of_evosax_searches():
-    pytest.importorskip("evosax")
+def test_example_of_evosax_searches(need):
+    need("evosax")
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))["main"]
     best = np.array(main(population=16, generations=3, steps=10))
     # The reward of the first steps lies near its bound, and no candidate exceeds it.

@@ -187,6 +187,41 @@ def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
     assert fingerprint(copy) == fingerprint(load_model(packaged, 0.001))
 
 
+@pytest.mark.parametrize("place", ["meshdir", "file", "include"])
+def test_an_absolute_path_in_a_robot_is_refused(place: str, tmp_path: Path) -> None:
+    """The copy would use the original file."""
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    own, mesh = tmp_path / "own", tmp_path / "meshes/m.obj"
+    for folder in (own, mesh.parent):
+        folder.mkdir()
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+    (tmp_path / "more.xml").write_text("<mujoco><size/></mujoco>")
+    part, named = {
+        "meshdir": (
+            f'<compiler meshdir="{mesh.parent}"/><asset><mesh file="m.obj"/></asset>',
+            mesh,
+        ),
+        "file": (f'<asset><mesh file="{mesh}"/></asset>', mesh),
+        "include": (f'<include file="{tmp_path}/more.xml"/>', tmp_path / "more.xml"),
+    }[place]
+    mjcf = own / "robot.xml"
+    mjcf.write_text(text.replace("<worldbody>", f"{part}<worldbody>", 1), encoding="utf-8")
+    assert load_model(mjcf, 0.001).nmesh == (place != "include")
+    with pytest.raises(UserError, match=f"names {named} by an absolute path"):
+        create_run(TrainConfig(env={"mjcf": mjcf}, log_dir=tmp_path / "runs"))
+    assert not list((tmp_path / "runs").iterdir())
+
+
+def test_a_linked_robot_is_copied(tmp_path: Path) -> None:
+    """The links' own places count, as MuJoCo follows them."""
+    shutil.copy(resource_path("mjcf/bounce_ball.xml"), tmp_path / "original.xml")
+    (tmp_path / "robot.xml").symlink_to("original.xml")
+    config = TrainConfig(env={"mjcf": tmp_path / "robot.xml"}, log_dir=tmp_path / "runs")
+    run = create_run(config)
+    assert [path.name for path in (run / "robot").glob("*.xml")] == ["robot.xml"]
+    assert load_run_config(run).env.mjcf == run / "robot/robot.xml"
+
+
 @pytest.mark.parametrize("name", ["mjcf/my robot.xml", "mjcf/more.xml", "meshes/m.obj"])
 def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, name: str, capsys) -> None:
     with (robot_run / "robot" / name).open("a") as file:

@@ -16,6 +16,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
 from skrl.envs.wrappers.torch import wrap_env
 from skrl.trainers.torch import SequentialTrainer
@@ -448,6 +449,33 @@ def test_skrl_wraps_the_vector_env(env):
     torch.testing.assert_close((observation, reward), expected)
     assert first.shape == observation.shape and terminated.shape == truncated.shape == (NUM_ENVS, 1)
     wrapped.render()
+
+
+def test_skrl_env_passes_through_skrls_wrap_env(env):
+    """`wrap_env` was imported before the adapter, as a script may do it."""
+    skrl_env = SkrlEnv(env)
+    assert wrap_env(skrl_env, verbose=False) is skrl_env
+
+
+def test_gymnasium_records_the_statistics_of_the_vector_env(env):
+    """Returns and lengths of all episodes, over falls and time-outs."""
+    envs = RecordEpisodeStatistics(TorchGymnasiumVectorEnv(env))
+    envs.reset(seed=3)
+    returns, lengths = np.zeros(NUM_ENVS), np.zeros(NUM_ENVS, int)
+    expected, given = [], []
+    actions = random_actions(2 * EPISODE_STEPS + 5)
+    for action in actions:
+        _, reward, terminated, truncated, info = envs.step(action)
+        returns, lengths = returns + reward.numpy().astype(float), lengths + 1
+        over = (terminated | truncated).numpy()
+        expected += [(returns[i], lengths[i]) for i in np.flatnonzero(over)]
+        if over.any():
+            np.testing.assert_array_equal(info["_episode"], over)
+            given += list(zip(*(info["episode"][key][over] for key in "rl"), strict=True))
+        returns[over], lengths[over] = 0.0, 0
+    assert len(expected) >= 2 * NUM_ENVS and envs.episode_count == len(expected)
+    np.testing.assert_allclose(given, expected, rtol=1e-5)
+    np.testing.assert_allclose(envs.length_queue, [length for _, length in expected])
 
 
 # Networks

@@ -79,7 +79,7 @@ def domain_randomize(
         fields, options = edited_fields(mj_model, physics_parameters(world, mj_model))
         return fields | {f"opt.{name}": value for name, value in options.items()}
 
-    fields = jax.vmap(draw)(rng)
+    fields = jax.jit(jax.vmap(draw))(rng)
     axes = jax.tree.map(lambda _: None, model)
     return model.tree_replace(fields), axes.tree_replace(dict.fromkeys(fields, 0))
 

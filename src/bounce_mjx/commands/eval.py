@@ -80,6 +80,7 @@ def main(args: Sequence[str] | None = None) -> None:
         console.out(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False
         )
+        length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
         with _Progress(console) as progress:
             report, engine, warnings = run_interruptible(
                 evaluate_policy,
@@ -91,10 +92,9 @@ def main(args: Sequence[str] | None = None) -> None:
                 target_height=command.target_height,
                 nominal=command.nominal,
                 physics=command.physics,
+                started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
                 progress=progress.show,
             )
-        length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
-        console.out(f"physics: {engine}  {length}", highlight=False)
         for warning in warnings:
             console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
         console.print(results_table(report, "the five results"))

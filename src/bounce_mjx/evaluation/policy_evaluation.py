@@ -38,6 +38,7 @@ def evaluate_policy(
     target_height: float | None = None,
     nominal: bool = False,
     physics: Physics = "config",
+    started: Callable[[str], None] = lambda engine: None,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
     """Measures the five results of a policy without action noise.
@@ -50,6 +51,7 @@ def evaluate_policy(
       target_height: one target height for all episodes, m; None for the config's range.
       nominal: whether the worlds are the model's own; else they are drawn as in the training.
       physics: the engine; "mujoco" is MuJoCo's C engine, "config" the config's choice.
+      started: called with the engine's name before anything is compiled.
       progress: called now and then with the share of the work that is done, from 0 to 1.
 
     Raises:
@@ -68,6 +70,8 @@ def evaluate_policy(
     env = BounceBall(validate(EnvConfig, dict(env_config) | changes, "evaluation"))
     networks = make_networks(ppo_config, env.observation_size, env.action_size)
     on_c = physics == "mujoco"
+    engine = "mujoco" if on_c else env.engine.name
+    started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
     if progress is not None:
         make = make_mujoco_evaluator if on_c else make_reporting_evaluator
@@ -75,7 +79,7 @@ def evaluate_policy(
     statistics = make(env, networks, episodes)(policy, jax.random.PRNGKey(seed))
     return Evaluation(
         judge(env, statistics),
-        engine="mujoco" if on_c else env.engine.name,
+        engine,
         # The warnings concern models on which MuJoCo's solver does not converge, unlike the fused
         # physics.
         warnings=env.engine.warnings if on_c else (),

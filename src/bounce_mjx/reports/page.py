@@ -115,7 +115,7 @@ def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 <h2>Where the time went</h2>
 {_table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
 <h2>All evaluations</h2>
-{_table(["environment steps", *names, "all five"], evaluations)}
+{_table(["environment steps", *names, "all met"], evaluations)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>
 </body>
 </html>

@@ -49,7 +49,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     table.add_column("seed", justify="right")
     for result in known[0].results:
         table.add_column(result.name.split()[0], justify="right")
-    for column in ("bounces", "apex, cm", "all five"):
+    for column in ("bounces", "apex, cm", "all met"):
         table.add_column(column, justify="right")
 
     for seed, report in reports.items():

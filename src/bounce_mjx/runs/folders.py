@@ -61,7 +61,7 @@ def create_run(config: TrainConfig) -> Path:
     """Creates a new run's folder, named after the current time, with the config in it.
 
     Raises:
-      UserError: the folder cannot be written.
+      UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
     stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     try:
@@ -72,7 +72,11 @@ def create_run(config: TrainConfig) -> Path:
                 folder.mkdir()
             except FileExistsError:
                 continue
-            save_config(folder, config)
+            try:
+                save_config(folder, config)
+            except UserError:
+                folder.rmdir()
+                raise
             return folder
     except OSError as error:
         raise UserError(

@@ -21,7 +21,7 @@ ROBOT = "robot"
 
 def copy_robot(mjcf: Path, run: Path) -> Path:
     """Copies an MJCF file with its meshes, textures and included files into a run's folder, sealed
-    by a manifest. An absolute path inside the MJCF still leads to the original file.
+    by a manifest.
 
     Args:
       mjcf: a file that MuJoCo compiles, as for `locate`.
@@ -31,19 +31,32 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
 
     Raises:
       OSError: a file cannot be read or written.
-      UserError: the file is missing.
+      UserError: the file is missing, or names another file by its absolute path.
     """
     from bounce_mjx.robot.arm import locate
 
-    mjcf = locate(mjcf)
-    files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(mjcf))]
+    mjcf, folder = locate(mjcf), run / ROBOT
+    files = _files_of(mjcf)
     root = Path(os.path.commonpath([path.parent for path in files]))
     for path in files:
-        copy = run / ROBOT / path.relative_to(root)
+        copy = folder / path.relative_to(root)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, copy)
-    seal(run / ROBOT)
-    return run / ROBOT / mjcf.resolve().relative_to(root)
+    seal(folder)
+    copied = folder / Path(os.path.abspath(mjcf)).relative_to(root)
+    # An absolute path in the copy still leads to the original.
+    if outside := set(_files_of(copied)) & set(files):
+        shutil.rmtree(folder)
+        raise UserError(
+            f"the MJCF file {mjcf} names {min(outside)} by an absolute path, so that a run could "
+            f"not keep a copy of the robot; name it relative to the folder of {mjcf.name}"
+        )
+    return copied
+
+
+def _files_of(mjcf: Path) -> list[Path]:
+    """An MJCF file and every file that it names."""
+    return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
 
 
 def check_robot(mjcf: Path, run: Path) -> None:

@@ -16,7 +16,8 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     """B environments; an ended episode is reset within the step that ends it.
 
     `info["final_obs"]` [B, N] is every environment's observation after the step, before any reset;
-    `info["_final_obs"]` [B] is true where the episode ended.
+    `info["_final_obs"]` [B] is true where the episode ended. Rewards and ends may be the operands
+    of NumPy's functions, with which Gymnasium's `RecordEpisodeStatistics` works.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": [], "torch": True}
@@ -53,7 +54,8 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
         tensor = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         result = self.env.step(tensor)
         info = {"final_obs": result.final_observation, "_final_obs": result.done}
-        return result.observation, result.reward, result.terminated, result.truncated, info
+        numbers = (result.reward, result.terminated, result.truncated)
+        return result.observation, *(x.as_subclass(_Operand) for x in numbers), info
 
     def render(self) -> None:
         """Does nothing, as there is no render mode; skrl's trainers call it at every step."""
@@ -63,3 +65,15 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
         for each environment [B]."""
         value = getattr(self, name)
         return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+
+
+class _Operand(torch.Tensor):
+    """A tensor that NumPy's functions take from any device; they return arrays. (From a plain one
+    on the CPU, they return tensors, in which truth values are bytes.) PyTorch's functions return
+    plain tensors."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        arrays = (x.cpu().numpy() if isinstance(x, torch.Tensor) else x for x in inputs)
+        return getattr(ufunc, method)(*arrays, **kwargs)

@@ -12,6 +12,8 @@
 | advantages              | normalised over the whole rollout (here in each minibatch)          |
 """
 
+import functools
+import sys
 from typing import Any
 
 import gymnasium
@@ -35,6 +37,7 @@ from bounce_mjx.learning.ppo import max_learning_rate
 try:
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.envs.wrappers.torch import Wrapper
+    from skrl.envs.wrappers.torch import wrap_env as _skrls_wrap_env
     from skrl.memories.torch import RandomMemory
     from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
     from skrl.resources.schedulers.torch import KLAdaptiveLR
@@ -45,7 +48,8 @@ except ImportError as error:
 
 
 class SkrlEnv(Wrapper):
-    """B environments with the interface of skrl's trainers.
+    """B environments with the interface of skrl's trainers; skrl's `wrap_env` returns them as they
+    are.
 
     Rewards, terminated and truncated are [B, 1]; `state()` is the value network's input, the
     observation and the critic metrics [B, N + K].
@@ -108,6 +112,18 @@ class SkrlEnv(Wrapper):
 
     def close(self) -> None:
         """Does nothing: the environment holds no resources."""
+
+
+@functools.wraps(_skrls_wrap_env)
+def _wrap_env(env: Any, *args: Any, **kwargs: Any) -> Any:
+    return env if isinstance(env, SkrlEnv) else _skrls_wrap_env(env, *args, **kwargs)
+
+
+# skrl's function knows only the classes of other packages, and scripts call it on every
+# environment. They may have imported it already.
+for _module in list(sys.modules.values()):
+    if getattr(_module, "__dict__", {}).get("wrap_env") is _skrls_wrap_env:
+        _module.wrap_env = _wrap_env
 
 
 class SkrlLearner(Learner):
