@@ -35,7 +35,7 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.randomization import RandomizationConfig
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.viewers import native, offscreen, pace
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
@@ -342,9 +342,9 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
 # The camera of the page
 
 
-def projected(points: np.ndarray, aspect: float, on_phone: bool, offsets) -> np.ndarray:
+def projected(points: np.ndarray, reward, aspect: float, on_phone: bool, offsets) -> np.ndarray:
     """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
-    position, gaze = camera_pose(offsets, aspect, on_phone)
+    position, gaze = camera_pose(offsets, reward, aspect, on_phone)
     forward = (gaze - position) / np.linalg.norm(gaze - position)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -352,16 +352,28 @@ def projected(points: np.ndarray, aspect: float, on_phone: bool, offsets) -> np.
     return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
 
 
+HOMES = {
+    "default": (0.58856, 0.0, 0.05),
+    "raised": (0.67, 0.0, 0.4),
+    "turned": (0.0, 0.55, 0.25),
+    "behind": (-0.6, 0.0, 0.3),
+}
+
+
+@pytest.mark.parametrize("home", HOMES.values(), ids=HOMES)
 @pytest.mark.parametrize("number", [1, 2, 4, 16])
 @pytest.mark.parametrize(
     ("aspect", "on_phone", "lowest"), [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
 )
-def test_the_camera_sees_every_robot(number: int, aspect, on_phone, lowest) -> None:
+def test_the_camera_sees_every_robot(number: int, home, aspect, on_phone, lowest) -> None:
     """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
-    parts = np.array([(-0.1, 0.0, 0.0), (0.64, 0.0, 0.05), (0.59, 0.0, 0.85)])
+    x, y, z = home
+    reward = RewardConfig(target_x=x, target_y=y, paddle_home_height=z)
+    paddle = np.array([x, y, 0.0]) * (1.0 + 0.05 / np.hypot(x, y)) + (0.0, 0.0, z)
+    parts = np.array([(-0.1, 0.0, 0.0), paddle, (x, y, z + 0.8)])
     offsets = scene_grid(number)
     points = (offsets[:, None] + parts).reshape(-1, 3)
-    across, up = projected(points, aspect, on_phone, offsets).T
+    across, up = projected(points, reward, aspect, on_phone, offsets).T
     assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.rewards import RewardConfig
 from bounce_mjx.viewers.display import MARKERS, TARGET_SITE, Display, body_scenes, site_mesh
 from bounce_mjx.viewers.simulation import Frame
 
@@ -21,8 +22,10 @@ _ANNOUNCED_SECONDS = 1.5
 _TRAIL_SECONDS = 0.6
 _TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
-# The camera sees one arm, its ball and the highest targets.
+# The camera sees one arm, its ball and the highest targets; these are its point of view and its
+# distance from it for the default reward.
 _LOOK_AT = np.array([0.34, 0.0, 0.44])
+_HIGHEST = 0.85
 _VIEW = np.array([1.06, -1.17, 0.42])
 _FIELD_OF_VIEW = math.radians(40.0)
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
@@ -123,11 +126,11 @@ class Scene:
             for i, place in enumerate(self._label_places)
         ]
         self._lost = np.zeros(num_envs, bool)
-        self._gaze = _LOOK_AT
+        self._gaze = camera_pose(self._offsets, reward)[1]
         for client in self._server.get_clients().values():
             self._frame(client)
         initial = self._server.initial_camera
-        initial.position, initial.look_at = map(tuple, camera_pose(self._offsets))
+        initial.position, initial.look_at = map(tuple, camera_pose(self._offsets, reward))
         initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
 
     def update(self, frames: Sequence[Frame]) -> None:
@@ -223,25 +226,32 @@ class Scene:
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
             on_phone = client.client_id in self._phones
-            position, gaze = camera_pose(self._offsets, client.camera.aspect, on_phone)
+            reward, aspect = self._env.config.reward, client.camera.aspect
+            position, gaze = camera_pose(self._offsets, reward, aspect, on_phone)
             if np.all(np.isfinite(position)):
                 client.camera.position, client.camera.look_at = position, gaze
 
 
 def camera_pose(
-    offsets: np.ndarray, aspect: float = 1.0, on_phone: bool = False
+    offsets: np.ndarray, reward: RewardConfig, aspect: float = 1.0, on_phone: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
 
     Args:
       offsets: positions of the environments [N, 3], m.
+      reward: its paddle's home and target point are in the middle of the picture.
       aspect: width / height of the picture.
       on_phone: whether the controls cover the lower part of the picture.
     """
-    extent = 1.0 + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
+    usual = RewardConfig()
+    aside = np.array([reward.target_x - usual.target_x, reward.target_y - usual.target_y])
+    rise = max(0.0, reward.paddle_home_height - usual.paddle_home_height)
+    size = 1.0 + max(rise / _HIGHEST, np.linalg.norm(aside))
+    look_at = _LOOK_AT + (*0.5 * aside, 0.5 * rise)
+    extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
     down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if on_phone else 0.0
-    return _LOOK_AT + view, _LOOK_AT - (0.0, 0.0, down * np.linalg.norm(view))
+    return look_at + view, look_at - (0.0, 0.0, down * np.linalg.norm(view))
 
 
 def _grid(number: int) -> np.ndarray:
