@@ -596,6 +596,12 @@ MJX_ONLY = {
         'biastype="affine" biasprm="0 -9 0" actearly="true"/>',
         "actearly",
     ),
+    "limited affine gain": (
+        '<position name="act2" joint="Joint2"/>',
+        '<general name="act2" joint="Joint2" gaintype="affine" gainprm="9 3 -2" '
+        'biastype="affine" biasprm="0 -9 -1" ctrlrange="-1 1" ctrllimited="true"/>',
+        "gaintype affine",
+    ),
     "noslip": ("<option ", '<option noslip_iterations="3" ', "noslip_iterations"),
     "surface velocity": ("<geom contype", '<geom surfacevel="1 0 0 0 0 0" contype', "surfacevel"),
 }

@@ -65,6 +65,9 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
             integrator not in _INTEGRATORS
         ),
         "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
+        "limits of a servo whose gain depends on its state (gaintype affine)": (
+            integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and _has_limited_affine_gain(m)
+        ),
         "plugins": m.nplugin > 0,
         "flexes (flex, flexcomp)": m.nflex > 0,
         "delayed actuators (delay)": np.any(m.actuator_delay),
@@ -95,6 +98,18 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
     except NotImplementedError as error:
         return f"a feature of the MJCF ({str(error).rstrip('.')})"
     return None
+
+
+def _has_limited_affine_gain(m: mujoco.MjModel) -> bool:
+    """Whether a servo's gain depends on its state, and a limit acts on it.
+
+    MuJoCo's C engine differentiates such a force at the clipped input, and a saturated one not at
+    all; MJX's implicitfast integrator does neither.
+    """
+    affine = m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
+    by_velocity = affine & (m.actuator_gainprm[:, 2] != 0.0)
+    limited_input = by_velocity & m.actuator_ctrllimited.astype(bool)
+    return bool(np.any(limited_input | (affine & m.actuator_forcelimited.astype(bool))))
 
 
 def step(
