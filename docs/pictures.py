@@ -426,8 +426,6 @@ def sensors():
 
 def two_policies():
     """Both shipped policies on the C engine, with and without a camera."""
-    import mujoco
-
     from bounce_mjx import load_policy
 
     sys.path.insert(0, str(CHECKOUT / "examples"))
@@ -451,7 +449,6 @@ def two_policies():
         def measure(self, time):
             return {"ball_position": self.now[1], "ball_velocity": self.now[2], "ball_age": 0.0}
 
-    del mujoco
     figure, row = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained", sharey=True)
     for axes, title, camera in (
         (row[0], "perfect sensors", Perfect),
@@ -552,6 +549,7 @@ def arms():
     import yaml
 
     from bounce_mjx import BounceBall, EnvConfig
+    from bounce_mjx.robot.model import find_addresses
     from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
     names = {"peitian": "AIR4-560", "ur5e": "UR5e", "panda": "Panda", "iiwa": "iiwa"}
@@ -560,9 +558,9 @@ def arms():
         file = CHECKOUT / "configs/robots" / f"{name}.yaml"
         config = EnvConfig.model_validate(yaml.safe_load(file.read_text())["env"])
         env = BounceBall(config)
-        qpos = env.mj_model.qpos0.copy()
-        qpos[env._addresses.arm_qpos,] = config.default_joint_angles
-        qpos[env._addresses.ball_qpos[:3],] = config.ball_init_pos
+        qpos, addresses = env.mj_model.qpos0.copy(), find_addresses(env.mj_model)
+        qpos[addresses.arm_qpos,] = config.default_joint_angles
+        qpos[addresses.ball_qpos[:3],] = config.ball_init_pos
         with Renderer(env, 480, 520, choose_backend()) as renderer:
             axes.imshow(renderer.render(qpos, np.mean(config.target_height_range)))
         axes.set_title(title)

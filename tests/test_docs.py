@@ -49,6 +49,10 @@ def page_id(page: Path) -> str:
     return str(page.relative_to(CHECKOUT))
 
 
+def content(page: str) -> str:
+    return (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
+
+
 def code(page: Path) -> list[str]:
     """The lines of a page's code blocks, and its inline code."""
     text = page.read_text(encoding="utf-8")
@@ -186,7 +190,7 @@ def test_flags_in_sentences_exist(page: Path) -> None:
 
 
 def test_config_reference_is_fresh() -> None:
-    page = (CHECKOUT / "docs/config.md").read_text(encoding="utf-8")
+    page = content("config.md")
     assert page == config_reference.reference(), (
         "docs/config.md is stale; it names the command that prints it"
     )
@@ -253,7 +257,7 @@ def test_config_reference_has_the_true_ranges() -> None:
 
 
 def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
-    page = (CHECKOUT / "docs/libraries.md").read_text(encoding="utf-8")
+    page = content("libraries.md")
     rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \| (`.+`) \|$", page, re.MULTILINE)
     examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {"deploy.py"}
     assert set(re.findall(r"examples/([\w.]+)", "".join(row[0] for row in rows))) == examples
@@ -282,7 +286,7 @@ def test_map_has_every_folder_of_the_package() -> None:
 
 
 def test_task_page_has_the_weights() -> None:
-    page = (CHECKOUT / "docs/task.md").read_text(encoding="utf-8")
+    page = content("task.md")
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| `", page, re.MULTILINE)
     defaults = RewardConfig()
     assert {name: float(weight) for name, weight in rows} == {
@@ -297,7 +301,7 @@ MAINS = {
 }
 TROUBLES = re.findall(
     r"^ {4}\$ (python train_jax\.py|bounce-mjx \w+)(.*)\n {4}(error: .+)$",
-    (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8"),
+    content("troubleshooting.md"),
     re.MULTILINE,
 )
 
@@ -330,7 +334,7 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
     mjcf = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     (tmp_path / "rk4.xml").write_text(mjcf.replace('"implicitfast"', '"RK4"'))
     engine = BounceBall(EnvConfig(mjcf=tmp_path / "rk4.xml")).engine
-    page = (CHECKOUT / "docs/troubleshooting.md").read_text(encoding="utf-8")
+    page = content("troubleshooting.md")
     assert f"    physics: {engine.name} ({engine.reason})\n" in page
 
 
@@ -352,8 +356,7 @@ def test_packages_import_in_the_order_of_the_map():
 
 def examples(page: str, language: str) -> list[str]:
     """The code blocks of a page in a language."""
-    text = (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", content(page), re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("page", ["rewards.md", "sensors.md", "training.md"])
@@ -396,10 +399,6 @@ def test_examples_on_jax_run(page: str, capsys) -> None:
     assert capsys.readouterr().out
 
 
-def content(page: str) -> str:
-    return (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
-
-
 def cells(table: str) -> list[list[str]]:
     """The cells of a Markdown table without its head."""
     rows = [row.strip().strip("|").split("|") for row in table.strip().splitlines()[2:]]
@@ -432,7 +431,7 @@ def test_figures_are_those_of_the_measurements() -> None:
 
 
 def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:
-    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    page = content("real-robot.md")
     section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
     assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
@@ -443,7 +442,7 @@ def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_f
 
 
 def test_robot_page_example_runs() -> None:
-    page = (CHECKOUT / "docs/real-robot.md").read_text(encoding="utf-8")
+    page = content("real-robot.md")
     (example,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     names: dict = {}
     exec(compile(example, "real-robot.md", "exec"), names)

@@ -59,6 +59,8 @@ def record(
       step: index of the step [], from 0.
     """
     episodes = recording.running.shape[-1]
+    if not episodes:
+        return recording
     states, running = jax.tree.map(lambda x: x[..., :episodes], (states, running))
     kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
     now = Recording(

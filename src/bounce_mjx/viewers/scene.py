@@ -22,11 +22,11 @@ _ANNOUNCED_SECONDS = 1.5
 _TRAIL_SECONDS = 0.6
 _TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
-# The camera sees one arm, its ball and the highest targets; these are its point of view and its
-# distance from it for the default reward.
+# With the default reward, the camera looks at this point, from a place that far from it, and sees
+# one arm and its ball up to the highest target.
 _LOOK_AT = np.array([0.34, 0.0, 0.44])
-_HIGHEST = 0.85
 _VIEW = np.array([1.06, -1.17, 0.42])
+_HIGHEST = 0.85
 _FIELD_OF_VIEW = math.radians(40.0)
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
 _FULL_ASPECT = 0.9
@@ -126,11 +126,11 @@ class Scene:
             for i, place in enumerate(self._label_places)
         ]
         self._lost = np.zeros(num_envs, bool)
-        self._gaze = camera_pose(self._offsets, reward)[1]
+        position, self._gaze = camera_pose(self._offsets, reward)
         for client in self._server.get_clients().values():
             self._frame(client)
         initial = self._server.initial_camera
-        initial.position, initial.look_at = map(tuple, camera_pose(self._offsets, reward))
+        initial.position, initial.look_at = tuple(position), tuple(self._gaze)
         initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
 
     def update(self, frames: Sequence[Frame]) -> None:
