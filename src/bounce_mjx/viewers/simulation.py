@@ -115,10 +115,10 @@ class Simulation:
 
     def step(self) -> Frame:
         """Advances one control step."""
-        self._key, self._states, self._steps, self._memory, frame = self._step_program(
-            *self._inputs()
-        )
+        inputs = self._inputs()
+        # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
+        self._key, self._states, self._steps, self._memory, frame = self._step_program(*inputs)
         self.frame = jax.device_get(frame)
         if self.frame.over.any():
             self._reset(self.frame.over)
