@@ -98,8 +98,7 @@ def measure_conditions(
     """Measures the five results of a deterministic policy, in the order of the conditions.
 
     One compiled program simulates all conditions with the same structure; their ranges are its
-    inputs. The episodes of all conditions start from the same keys. Conditions with dry friction
-    run on MuJoCo's C engine, the only engine that simulates it.
+    inputs. The episodes of all conditions start from the same keys.
 
     Args:
       ppo_config: config of the policy's training; it defines the networks.
@@ -116,10 +115,10 @@ def measure_conditions(
         programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
     outcomes: list[Outcome | None] = [None] * len(conditions)
     done = 0
-    for (_, separate), indices in programs.items():
+    on_c = physics == "mujoco"
+    for indices in programs.values():
         members = [conditions[index] for index in indices]
         env = BounceBall(_spanning_config(members, physics))
-        on_c = physics == "mujoco" or "joint_frictionloss" in separate
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
         size = _batch_size(len(members), episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator

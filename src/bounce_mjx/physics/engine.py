@@ -68,11 +68,6 @@ def _engine(
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
         check_shapes(parameters, num_joints)
-        if parameters.frictionloss is not None:
-            raise UserError(
-                f"the {name} physics does not compute dry friction that differs between "
-                "environments (frictionloss); simulate it with --physics mujoco"
-            )
         return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(

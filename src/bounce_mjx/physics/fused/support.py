@@ -104,7 +104,6 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     nonlinear = np.any(m.jnt_stiffnesspoly)
     _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
     _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
-    _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
     inertia = m.body_inertia[addresses.ball_body]
     plain_ball = (
@@ -114,6 +113,7 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
         and not np.any(m.geom_pos[addresses.ball_geom])
         and not np.any(m.dof_damping.reshape(m.nv, -1)[addresses.ball_qvel,])
         and not np.any(m.dof_armature[addresses.ball_qvel,])
+        and not np.any(m.dof_frictionloss[addresses.ball_qvel,])
         and not m.jnt_stiffness[m.body_jntadr[addresses.ball_body]]
     )
     _require(plain_ball, "a ball that is not one free homogeneous sphere")
