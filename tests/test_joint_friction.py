@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -151,6 +152,14 @@ def test_dry_friction_follows_its_flag():
     without, _ = c_steps([model] * 6, states)
     assert np.abs(without.qvel - expected.qvel).max() > 1e-3
     assert_same_step(fused_steps(model, given, states), without)
+
+
+def test_mjx_refuses_given_dry_friction(mj_model):
+    engine = make_engine(mj_model, "mjx")
+    state = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
+    given = PhysicsParameters(frictionloss=jnp.full(6, 10.0))
+    with pytest.raises(UserError, match="dry friction .*--physics fused"):
+        engine.step(given, state, Control(jnp.zeros(mj_model.nu)), 1)
 
 
 def test_no_dry_friction_leaves_the_program_alone(mj_model):

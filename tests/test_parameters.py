@@ -217,17 +217,18 @@ def num_operations(jaxpr) -> int:
     return len(jaxpr.eqns) + sum(num_operations(getattr(x, "jaxpr", x)) for x in inner)
 
 
+@pytest.mark.parametrize("choice", ("fused", pytest.param("mjx", marks=pytest.mark.separate_loops)))
 @pytest.mark.usefixtures("float64")
-def test_paddle_position_follows_its_parameter(mj_model):
+def test_paddle_position_follows_its_parameter(mj_model, choice):
     parameters = random_parameters(mj_model, 1, seed=8)
     qpos = np.random.default_rng(0).uniform(-1.0, 1.0, mj_model.nq)
     expected, _ = paddle_frame(edited_model(mj_model, world(parameters, 0)), qpos[:6])
-    for choice in ("fused", "mjx"):
-        engine = make_engine(mj_model, choice)
-        position = jax.jit(engine.paddle_position)(world(parameters, 0), qpos)
-        np.testing.assert_allclose(position, expected, atol=1e-12)
+    engine = make_engine(mj_model, choice)
+    position = jax.jit(engine.paddle_position)(world(parameters, 0), qpos)
+    np.testing.assert_allclose(position, expected, atol=1e-12)
 
 
+@pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
     """Free run against C over control steps, in random worlds with friction and filtered servos at

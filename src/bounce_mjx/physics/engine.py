@@ -68,6 +68,14 @@ def _engine(
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
         check_shapes(parameters, num_joints)
+        if name == "mjx" and parameters.frictionloss is not None:
+            # In 2 of 24 states of test_joint_friction.py MJX differs from C, by up to 0.02 rad/s,
+            # whatever the solver's tolerance.
+            raise UserError(
+                "the mjx physics does not compute dry friction that differs between environments "
+                "(frictionloss), as MJX's solver does not always converge with it; use --physics "
+                "fused or mujoco"
+            )
         return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(

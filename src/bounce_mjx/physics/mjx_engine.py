@@ -2,8 +2,6 @@
 
 import contextlib
 import copy
-import itertools
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -16,7 +14,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
-from bounce_mjx.robot.arm import allow_dry_friction
 from bounce_mjx.robot.model import Addresses, find_addresses
 
 _INTEGRATORS = (
@@ -29,39 +26,30 @@ _INTEGRATORS = (
 class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
 
-    models: Mapping[tuple[bool, bool], mjx.Model]
-    """Models by whether sliding friction and whether dry friction of the joints are given; MJX
-    cannot add constraints to a model later."""
+    model: mjx.Model
+    frictional: mjx.Model
+    """`model` with a frictional contact pair; MJX cannot change a pair's dimension later."""
     mj_model: mujoco.MjModel
-    """Source of the models."""
+    """Source of both models."""
     addresses: Addresses
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that has no `unsupported_feature`."""
     return MjxModel(
-        {
-            given: mjx.put_model(_with_constraints(mj_model, *given))
-            for given in itertools.product((False, True), repeat=2)
-        },
+        mjx.put_model(mj_model),
+        mjx.put_model(_with_frictional_pair(mj_model)),
         copy.copy(mj_model),
         find_addresses(mj_model),
     )
 
 
-def _with_constraints(
-    mj_model: mujoco.MjModel, sliding_friction: bool, dry_friction: bool
-) -> mujoco.MjModel:
-    """Copy of the model with sliding friction in the contact pair of ball and paddle, if any, and
-    with dry friction in the arm's joints."""
+def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Copy of the model with sliding friction in the contact pair of ball and paddle, if any."""
     model = copy.copy(mj_model)
-    if sliding_friction:
-        with contextlib.suppress(UserError):
-            fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
-            model.pair_dim[:] = fields["pair_dim"]
-    if dry_friction:
-        model.dof_frictionloss[find_addresses(model).arm_qvel,] = 1.0
-        allow_dry_friction(model.opt)
+    with contextlib.suppress(UserError):
+        fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
+        model.pair_dim[:] = fields["pair_dim"]
     return model
 
 
@@ -214,8 +202,8 @@ def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     # MJX transforms every geom, even one flagged as sharing its body's frame.
     replaced.pop("geom_sameframe", None)
     replaced.pop("pair_dim", None)
-    given = parameters.contact_friction is not None, parameters.frictionloss is not None
-    return constants.models[given].tree_replace(replaced)
+    model = constants.model if parameters.contact_friction is None else constants.frictional
+    return model.tree_replace(replaced)
 
 
 def _full_precision() -> contextlib.AbstractContextManager:

@@ -49,7 +49,7 @@ class PhysicsParameters(NamedTuple):
     damping: Array | None = None
     """Viscous damping [n] of the joints, N m s/rad."""
     frictionloss: Array | None = None
-    """Dry friction [n] of the joints, N m."""
+    """Dry friction [n] of the joints, N m; the mjx engine refuses it."""
     link_mass: Array | None = None
     """Masses [n] of the links, kg; first moment and inertia scale in proportion, the centre of mass
     stays in place."""
