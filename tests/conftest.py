@@ -1,12 +1,15 @@
 """Tests of an optional package are skipped if the package is missing; CI must have all packages.
 
-All tests and their processes share one cache of compiled programs, which is deleted at the end.
+All tests and their processes share one cache of compiled programs, which is deleted at the end. XLA
+joins the loops of the programs, as in the commands, which halves the compilation.
 """
 
 import importlib
 import importlib.util
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import types
 from collections.abc import Callable, Iterator
@@ -18,6 +21,7 @@ import pytest
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.training.loop_fusion import OPTION
 from bounce_mjx.viewers.offscreen import choose_backend
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
@@ -30,6 +34,10 @@ if OPTIONAL and not importlib.util.find_spec("stable_baselines3"):
     collect_ignore.append("test_sb3.py")
 
 
+# Before JAX starts its devices.
+os.environ.setdefault("XLA_FLAGS", OPTION)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # The workers of pytest-xdist inherit the folder.
     if not hasattr(config, "workerinput"):
@@ -40,6 +48,25 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         shutil.rmtree(os.environ[CACHE], ignore_errors=True)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Tests that compile MJX run in a process of their own, as XLA aborts if it joins its loops."""
+    marked = pyfuncitem.get_closest_marker("separate_loops") is not None
+    if not marked or OPTION not in os.environ["XLA_FLAGS"]:
+        return None
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", pyfuncitem.nodeid]
+    flags = os.environ["XLA_FLAGS"].replace(OPTION, "")
+    done = subprocess.run(
+        command,
+        cwd=pyfuncitem.config.rootpath,
+        env=os.environ | {"XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+    return True
 
 
 def pytest_report_header() -> list[str]:

@@ -23,6 +23,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictMo
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.training.loop_fusion import join_loops
 
 # An evaluation that is not slower needs no lines about its progress.
 _SILENT_SECONDS = 10.0
@@ -63,6 +64,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
+        join_loops(command.physics)
         with interruptible_imports():
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table

@@ -15,6 +15,7 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.randomization import RandomizationConfig
+from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def main(args: Sequence[str] | None = None) -> None:
             raise UserError(
                 f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
             )
+        join_loops()
         with interruptible_imports():
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.show import show

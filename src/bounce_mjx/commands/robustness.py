@@ -15,6 +15,7 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.interrupt import interruptible_imports, run_interruptible
 from bounce_mjx.resources import resource_path
+from bounce_mjx.training.loop_fusion import join_loops
 
 if TYPE_CHECKING:
     from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
@@ -55,6 +56,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx robustness",
             description="Measures the five results of a trained policy in perturbed worlds.",
         )
+        join_loops(command.physics)
         with interruptible_imports():
             from bounce_mjx.evaluation.robustness import RobustnessReport
             from bounce_mjx.reports.robustness import robustness_table

@@ -18,6 +18,7 @@ from bounce_mjx.training.command import (
     run_command,
 )
 from bounce_mjx.training.command import read_command as read
+from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
 PROG = "bounce-mjx train"
@@ -54,6 +55,9 @@ def main(args: Sequence[str] | None = None) -> None:
         if asks_for_help(args):
             read_command(args)
     several_hosts = _hosts(args)
+    if several_hosts is None:
+        # A process of several hosts also aborts when another one is lost.
+        join_loops(early_flag(args, "--physics"))
     with interruptible_imports():
         from bounce_mjx.training.setup import find_devices, set_up_jax
 

@@ -15,6 +15,7 @@ from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import ROBOTS, load_config, named_file
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.command import path_flag
+from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import ViewerOptions
 
 
@@ -43,6 +44,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
+        join_loops(command.env.physics)
         with interruptible_imports():
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.controllers import (
