@@ -569,7 +569,7 @@ def _is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
 def allow_dry_friction(option: mujoco.MjOption) -> None:
     """Raises the limits of MuJoCo's solver to MuJoCo's defaults, in place.
 
-    The shipped limits suffice for a contact alone. With dry friction as well, the solver would stop
+    The shipped limits suffice for a frictionless contact. With dry friction, the solver would stop
     before it converges.
     """
     default = mujoco.MjOption()
