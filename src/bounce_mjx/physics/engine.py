@@ -69,8 +69,8 @@ def _engine(
     ) -> PhysicsState:
         check_shapes(parameters, num_joints)
         if name == "mjx" and parameters.frictionloss is not None:
-            # In 2 of 24 states of test_joint_friction.py MJX differs from C, by up to 0.02 rad/s,
-            # whatever the solver's tolerance.
+            # After one step from 2 of 24 states with a slow arm, MJX differed from C by up to 0.02
+            # rad/s, whatever the solver's tolerance.
             raise UserError(
                 "the mjx physics does not compute dry friction that differs between environments "
                 "(frictionloss), as MJX's solver does not always converge with it; use --physics "
