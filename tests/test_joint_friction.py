@@ -154,6 +154,15 @@ def test_dry_friction_follows_its_flag():
     assert_same_step(fused_steps(model, given, states), without)
 
 
+def test_the_noslip_solver_is_refused_only_with_friction():
+    model = frictionless()
+    model.opt.noslip_iterations = 3
+    assert fused.unsupported_feature(model) is None
+    for with_friction in (with_own_friction(), frictional("elliptic")):
+        with_friction.opt.noslip_iterations = 3
+        assert "noslip_iterations" in fused.unsupported_feature(with_friction)
+
+
 def test_mjx_refuses_given_dry_friction(mj_model):
     engine = make_engine(mj_model, "mjx")
     state = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))

@@ -134,6 +134,8 @@ def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
         m.pair_dim[0] in (1, 3),
         f"torsional or rolling friction (condim {m.pair_dim[0]}; only condim 1 and 3)",
     )
+    friction = m.pair_dim[0] > 1 or np.any(m.dof_frictionloss)
+    _require(not (friction and m.opt.noslip_iterations), "the noslip solver (noslip_iterations)")
     _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(m.pair_adhesion[0] == 0.0, "adhesion")
     solref, width = m.pair_solref[0], m.pair_solimp[0, 2]
