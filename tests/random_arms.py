@@ -11,10 +11,10 @@ RADIUS = 0.02
 def random_arm(num_joints: int, seed: int) -> mujoco.MjModel:
     """An arm of hinges and slides that holds a level paddle, and a ball.
 
-    The joints have anchors, skew axes, references, springs, damping, armature and dry friction, and
-    MuJoCo's solver converges to rounding error; the servos have
-    gears, biases and limits; bodies are welded to the base, to links and to the paddle, each with
-    its own inertial frame and share of gravity compensation. Two joints share one body.
+    The joints have anchors, skew axes, references, springs, damping, armature and dry friction; the
+    servos have gears, biases and limits; bodies are welded to the base, to links and to the paddle,
+    each with its own inertial frame and share of gravity compensation. Two joints share one body.
+    MuJoCo's solver converges to rounding error.
     """
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
