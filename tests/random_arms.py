@@ -11,14 +11,16 @@ RADIUS = 0.02
 def random_arm(num_joints: int, seed: int) -> mujoco.MjModel:
     """An arm of hinges and slides that holds a level paddle, and a ball.
 
-    The joints have anchors, skew axes, references, springs, damping and armature; the servos have
-    gears, biases and limits; bodies are welded to the base, to links and to the paddle, each with
-    its own inertial frame and share of gravity compensation. Two joints share one body.
+    The joints have anchors, skew axes, references, springs, damping, armature and dry friction; the
+    servos have gears, biases and limits; bodies are welded to the base, to links and to the paddle,
+    each with its own inertial frame and share of gravity compensation. Two joints share one body.
+    MuJoCo's solver converges to rounding error.
     """
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     spec.option.timestep = 1e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.tolerance = 1e-15
     spec.compiler.degree = False
     body = _add_body(spec.worldbody, rng, welded=True)
     for i in range(num_joints):
@@ -100,6 +102,7 @@ def _add_joint(
         springref=rng.uniform(-0.5, 0.5),
         damping=rng.uniform(0.0, 3.0),
         armature=0.02,
+        frictionloss=2.0 * (index % 2),
         limited=False,
     )
     if index % 2 == 0:

@@ -71,7 +71,9 @@ def random_worlds(env: BounceBall, batch: int) -> PhysicsParameters:
     drawn = random_parameters(env.mj_model, batch, seed=0)
     drawn = jax.tree.map(lambda array: jnp.moveaxis(jnp.asarray(array), 0, -1), drawn)
     return drawn._replace(
-        gravity=jnp.array([0.5, -0.5, -9.0]), contact_friction=jnp.linspace(0.0, 1.0, batch)
+        gravity=jnp.array([0.5, -0.5, -9.0]),
+        contact_friction=jnp.linspace(0.0, 1.0, batch),
+        frictionloss=jnp.linspace(jnp.zeros(6), jnp.arange(6.0), batch).T,
     )
 
 

@@ -48,7 +48,7 @@ from test_physics import (
 )
 
 MODEL = PhysicsParameters()
-# Parameters of the shipped model; test_friction.py covers the contact's friction.
+# Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss")
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
 NUM_WORLDS = 16
@@ -409,25 +409,3 @@ def test_filtered_servos_start_at_rest():
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.actuator_force, 0.0, atol=0.01)
     assert resting_activations(load_model(None, 0.001), list(data.qpos)) is None
-
-
-def test_dry_friction_acts_on_c_alone(mj_model):
-    """A joint under a torque below its dry friction hardly moves."""
-    model = edited_model(mj_model, PhysicsParameters(frictionloss=np.full(6, 10.0)))
-    addresses = find_addresses(mj_model)
-    speeds = []
-    for m in (edited_model(mj_model, MODEL), model):
-        data = mujoco.MjData(m)
-        m.actuator_gainprm[:], m.actuator_biasprm[:] = 0.0, 0.0
-        m.opt.gravity[:] = 0.0
-        data.qfrc_applied[addresses.arm_qvel[0]] = 5.0
-        for _ in range(100):
-            mujoco.mj_step(m, data)
-        speeds.append(abs(data.qvel[addresses.arm_qvel[0]]))
-    assert speeds[0] > 0.1
-    # A soft constraint creeps.
-    assert speeds[1] < 0.05 * speeds[0]
-    state = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
-    given = PhysicsParameters(frictionloss=jnp.full(6, 10.0))
-    with pytest.raises(UserError, match="dry friction .*--physics mujoco"):
-        make_engine(mj_model, "fused").step(given, state, Control(jnp.zeros(mj_model.nu)), 1)

@@ -494,7 +494,7 @@ UNSUPPORTED = {
     "mixed solref": ('solref="-98696 -31.4"', 'solref="-98696 1"', "solref"),
     "solimp width": ('solimp="0.95 0.99 0.001"', 'solimp="0.95 0.99 0"', "solimp"),
     "limited": ('limited="false"', 'limited="true"', 'limited="true"'),
-    "frictionloss": ("<joint ", '<joint frictionloss="0.1" ', "frictionloss"),
+    "dry friction of the ball": ("<freejoint ", '<joint type="free" frictionloss="0.1" ', "ball"),
     "stiffness polynomial": ("<joint ", '<joint stiffness="0 1 0" ', "stiffness"),
     "damping polynomial": ("<joint ", '<joint damping="1 1 0" ', "damping"),
     "extra joint": (
@@ -579,7 +579,7 @@ def test_unsupported_models_are_refused(name):
         assert text == f"the fused physics does not support {refusal.value}; use --physics mjx"
 
 
-@pytest.mark.parametrize("name", ["RK4", "frictionloss", "condim 4"])
+@pytest.mark.parametrize("name", ["RK4", "limited", "condim 4"])
 def test_auto_takes_mjx_for_unsupported_models(name):
     """The reason is a whole sentence."""
     old, new, feature = UNSUPPORTED[name]

@@ -19,7 +19,7 @@ from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt
-from bounce_mjx.robot.arm import locate
+from bounce_mjx.robot.arm import compile_spec, locate
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
@@ -342,8 +342,13 @@ def test_changes_are_listed(tmp_path) -> None:
     (tmp_path / "arm.xml").write_text(text)
     found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=False)
     changes = "\n".join(found.arm.changes)
-    for words in ("own contacts", "joint limits", "dry friction of j1 (0.2)", "added a paddle"):
+    for words in ("own contacts", "joint limits", "added a paddle"):
         assert words in changes
+    # Dry friction stays, with limits of MuJoCo's solver that suffice for it.
+    model = compile_spec(found.arm.spec, tmp_path / "arm.xml")
+    losses = [float(model.dof_frictionloss[model.joint(f"j{i}").dofadr[0]]) for i in range(1, 7)]
+    assert losses == [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert model.opt.ls_iterations == mujoco.MjOption().ls_iterations
     assert len(re.findall("by a position servo: kp", changes)) == 6
 
 

@@ -288,7 +288,7 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         *[("late", s) for s in (0, 5, 10, 15, 20)],
         ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02), ("dry", 5),
     ]  # fmt: skip
-    assert [o.physics for o in outcomes] == ["fused"] * 9 + ["mujoco"]
+    assert {o.physics for o in outcomes} == {"fused"}
     lengths = [1.0, 1.05, 1.1, 1.15, 1.2, 1.6, 2.2, 1.0, 2.0, 1.0]
     np.testing.assert_allclose([o.mean_length_s for o in outcomes], lengths, rtol=1e-6)
     # The neutral target height is the task's own; at 0.8 m the speed is not judged.

@@ -37,8 +37,7 @@ class RobustnessCommand(StrictModel):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     physics: Physics = "config"
-    """Engine: mujoco is MuJoCo's C engine, which always simulates dry friction; config is the
-    engine of the training."""
+    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
     for a policy that comes with the package."""

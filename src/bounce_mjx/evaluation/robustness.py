@@ -98,8 +98,8 @@ def measure_conditions(
     """Measures the five results of a deterministic policy, in the order of the conditions.
 
     One compiled program simulates all conditions with the same structure; their ranges are its
-    inputs. The episodes of all conditions start from the same keys. Conditions with dry friction
-    run on MuJoCo's C engine, the only engine that simulates it.
+    inputs. The episodes of all conditions start from the same keys. In place of the mjx engine,
+    which refuses dry friction, MuJoCo's C engine simulates it.
 
     Args:
       ppo_config: config of the policy's training; it defines the networks.
@@ -119,7 +119,8 @@ def measure_conditions(
     for (_, separate), indices in programs.items():
         members = [conditions[index] for index in indices]
         env = BounceBall(_spanning_config(members, physics))
-        on_c = physics == "mujoco" or "joint_frictionloss" in separate
+        dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
+        on_c = physics == "mujoco" or dry_in_mjx
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
         size = _batch_size(len(members), episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.robot.arm import allow_dry_friction
 from bounce_mjx.robot.model import find_addresses
 
 Array = np.ndarray | jax.Array
@@ -48,7 +49,7 @@ class PhysicsParameters(NamedTuple):
     damping: Array | None = None
     """Viscous damping [n] of the joints, N m s/rad."""
     frictionloss: Array | None = None
-    """Dry friction [n] of the joints, N m; only MuJoCo's C engine simulates it."""
+    """Dry friction [n] of the joints, N m; the mjx engine refuses it."""
     link_mass: Array | None = None
     """Masses [n] of the links, kg; first moment and inertia scale in proportion, the centre of mass
     stays in place."""
@@ -108,7 +109,8 @@ def edited_fields(
     NumPy parameters give NumPy arrays, for MuJoCo's C engine; traced ones give JAX arrays, for MJX.
 
     `body_invweight0` scales the softness of the contact and follows the ball's mass. The last
-    link's share of the softness, a thousandth of the sum, keeps its value of the unedited model.
+    link's share of the softness, a thousandth of the sum, keeps its value of the unedited model. So
+    does `dof_invweight0`, which scales the softness of dry friction.
     """
     m, addresses, p = mj_model, find_addresses(mj_model), parameters
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
@@ -197,6 +199,8 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     model = copy.copy(mj_model)
     _assign(model, fields)
     _assign(model.opt, options)
+    if parameters.frictionloss is not None:
+        allow_dry_friction(model.opt)
     return model
 
 

@@ -397,18 +397,8 @@ class _Builder:
             geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
-        frictional = [j for j in joints if model.dof_frictionloss[model.jnt_dofadr[j]] != 0.0]
-        if frictional:
-            losses = ", ".join(
-                f"{model.dof_frictionloss[model.jnt_dofadr[j]]:g}" for j in frictional
-            )
-            self._changes.append(
-                f"removed the dry friction of {_listed(_name(model, j) for j in frictional)} "
-                f"({losses})"
-            )
         for joint in joints:
             parts[joint].limited = mujoco.mjtLimited.mjLIMITED_FALSE
-            parts[joint].frictionloss = 0.0
 
     def _hide_contact_shapes(self) -> None:
         """Leaves only the pictured geoms of a body visible, where it has both kinds."""
@@ -429,6 +419,8 @@ class _Builder:
         differing = _differing_options(self._model.opt, scene.option)
         if differing:
             self._changes.append(f"replaced the physics options by the task's ({differing})")
+        if np.any(self._model.dof_frictionloss):
+            allow_dry_friction(scene.option)
         arm.option = scene.option
         with _silent():
             scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
@@ -572,6 +564,17 @@ def _is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
     while body and body not in ancestors:
         body = int(model.body_parentid[body])
     return body in ancestors
+
+
+def allow_dry_friction(option: mujoco.MjOption) -> None:
+    """Raises the limits of MuJoCo's solver to MuJoCo's defaults, in place.
+
+    The shipped limits suffice for a frictionless contact. With dry friction, the solver would stop
+    before it converges.
+    """
+    default = mujoco.MjOption()
+    option.iterations = max(option.iterations, default.iterations)
+    option.ls_iterations = max(option.ls_iterations, default.ls_iterations)
 
 
 def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> str:

@@ -67,6 +67,12 @@ class Link:
     """Stiffness of the joint's spring, N m/rad or N/m."""
     spring_position: float = 0.0
     """Joint position at which the spring is at rest, rad or m."""
+    frictionloss: Scalar = 0.0
+    """Largest force of the joint's dry friction, N m or N."""
+    friction_softness: float = 0.0
+    """Regulariser of the dry friction, 1/(kg m^2) or 1/kg."""
+    friction_damping: float = 0.0
+    """b of the dry friction's reference acceleration, 1/s."""
     floating_mass: Scalar = 0.0
     """Mass whose weight `gravcomp` carries, kg."""
     floating_moment: Vec3 = ZERO3

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, servo_target
-from bounce_mjx.physics.fused import chain, friction
+from bounce_mjx.physics.fused import chain, friction, joint_friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import (
@@ -197,7 +197,7 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
 
 def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
     """One physics step: the equivalent of `mj_step`."""
-    keep = stored if motion.turning is not None else lambda values: values
+    keep = _keep(model, motion)
     pose = keep(chain.forward_kinematics(model.links, motion.q))
     arm_gravity = scale(model.gravity, model.weight)
     bias = keep(chain.bias_force(model.links, pose, motion.v, arm_gravity))
@@ -211,7 +211,7 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         spring = mul(link.stiffness, sub(q, link.spring_position))
         applied.append(joint_force(servo, force, carried) - link.damping * v - add(b, spring))
         servo_damping.append(derivative)
-    contact_torque, ball_acceleration, spin_acceleration = contact_response(
+    constraint_torque, ball_acceleration, spin_acceleration = constraint_response(
         model, motion, pose, inertia, applied
     )
     return integrate(
@@ -219,7 +219,7 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         motion,
         inertia,
         servo_damping,
-        [add(a, c) for a, c in zip(applied, contact_torque, strict=True)],
+        [add(a, c) for a, c in zip(applied, constraint_torque, strict=True)],
         ball_acceleration,
         spin_acceleration,
     )
@@ -252,15 +252,15 @@ def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
     return add(jnp.clip(force, *servo.joint_range), carried)
 
 
-def contact_response(
+def constraint_response(
     model: FusedModel,
     motion: Motion,
     pose: chain.Pose,
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
 ) -> tuple[list[Scalar], Vec3, Vec3 | None]:
-    """Joint forces from the contact, total acceleration of the ball (m/s^2) and angular
-    acceleration of the ball (rad/s^2, world); the last is None without friction."""
+    """Joint forces from the contact and dry friction, total acceleration of the ball (m/s^2) and
+    angular acceleration of the ball (rad/s^2, world); the last is None without sliding friction."""
     contact = sphere_box(
         model.contact,
         motion.ball_position,
@@ -288,7 +288,8 @@ def contact_response(
         -entry
         for entry in chain.point_jacobian(model.links, pose, motion.ball_position, contact.normal)
     ]
-    factor = chain.cholesky(inertia)
+    keep = _keep(model, motion)
+    factor = keep(chain.cholesky(inertia))
     half_jacobian = chain.solve_lower(factor, jacobian)
     half_applied = chain.solve_lower(factor, applied)
 
@@ -299,11 +300,23 @@ def contact_response(
         normal_velocity = normal_velocity + j * v
         free_acceleration = free_acceleration + half_j * half_a
         inverse_inertia = inverse_inertia + half_j * half_j
-    force = normal_force(
-        model.contact, contact, normal_velocity, free_acceleration, inverse_inertia
+
+    def contact_force(matrix: tuple[Scalar], acceleration: tuple[Scalar]) -> tuple[jax.Array]:
+        return (normal_force(model.contact, contact, normal_velocity, *acceleration, *matrix),)
+
+    (force,), dry_friction = joint_friction.contact_and_friction(
+        model.links,
+        factor,
+        motion.v,
+        half_applied,
+        [half_jacobian],
+        (inverse_inertia,),
+        (free_acceleration,),
+        contact_force,
     )
     ball_acceleration = vadd(ball_free, scale(contact.normal, force / model.ball_mass))
-    return [j * force for j in jacobian], ball_acceleration, None
+    torque = [add(j * force, f) for j, f in zip(jacobian, dry_friction, strict=True)]
+    return torque, ball_acceleration, None
 
 
 def integrate(
@@ -325,9 +338,7 @@ def integrate(
         if model.implicit_servos:
             damping = damping - derivative
         implicit[i][i] = add(implicit[i][i], dt * damping)
-    factor = chain.cholesky(implicit)
-    if motion.turning is not None:
-        factor = stored(factor)
+    factor = _keep(model, motion)(chain.cholesky(implicit))
     acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
     v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
@@ -352,6 +363,12 @@ def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[S
     sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
     cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
     return quaternion_product(unit, (cosine, *scale(spin, sine)))
+
+
+def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
+    """`stored` in the long programs of models with friction, else the identity."""
+    frictional = motion.turning is not None or any(map(joint_friction.has_friction, model.links))
+    return stored if frictional else lambda values: values
 
 
 def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:

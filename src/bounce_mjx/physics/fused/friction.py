@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.contact import Contact, ContactModel, impedance, softness
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.scalars import (
@@ -60,10 +60,10 @@ class Turning(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Effect of the contact's force on the joints and the ball."""
+    """Effect of the contact's force and of dry friction on the joints and the ball."""
 
     joint_torque: list[Scalar]
-    """Joint torques, N m."""
+    """Joint torques of both, N m."""
     ball_acceleration: Vec3
     """Acceleration of the ball by the contact alone, m/s^2."""
     spin_acceleration: Vec3
@@ -89,11 +89,11 @@ def contact_response(
     ball: tuple[Vec3, Vec3, Vec3],
     free_acceleration: Vec3,
 ) -> Response:
-    """Effect of the contact's force on the joints and the ball.
+    """Effect of the contact's force and of dry friction on the joints and the ball.
 
     Args:
       factor: Cholesky factor L of the arm's inertia matrix.
-      half_applied: L^-1 times the joint torques without the contact.
+      half_applied: L^-1 times the joint torques without the contact and dry friction.
       ball: position, velocity and spin in the world.
       free_acceleration: the ball's acceleration without the contact.
     """
@@ -147,13 +147,22 @@ def contact_response(
     offsets[0] = offsets[0] + model.stiffness * d * contact.distance
 
     matrix, offsets = stored((matrix, tuple(offsets)))
-    force = contact_force(model, matrix, tuple(offsets), softness(model, d))
-    force = tuple(jnp.where(contact.distance < 0.0, f, 0.0) for f in force)
+
+    def force_of(matrix: tuple[Scalar, ...], offsets: Vec3) -> Vec3:
+        force = contact_force(model, matrix, offsets, softness(model, d))
+        return tuple(jnp.where(contact.distance < 0.0, f, 0.0) for f in force)
+
+    force, dry_friction = joint_friction.contact_and_friction(
+        links, factor, joint_velocity, half_applied, half, matrix, tuple(offsets), force_of
+    )
     force = stored(force)
     along = vadd(scale(normal, force[0]), vadd(scale(first, force[1]), scale(second, force[2])))
     torque = vadd(scale(torques[0], force[1]), scale(torques[1], force[2]))
     return Response(
-        [dot(column, force) for column in zip(*rows, strict=True)],
+        [
+            add(dot(column, force), f)
+            for column, f in zip(zip(*rows, strict=True), dry_friction, strict=True)
+        ],
         scale(along, 1.0 / ball_mass),
         scale(torque, 1.0 / ball_inertia),
     )

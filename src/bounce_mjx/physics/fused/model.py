@@ -89,6 +89,8 @@ class FusedModel:
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
     """Whether the integrator is implicit in the joints' damping."""
+    dry_friction: bool = True
+    """Whether the joints' dry friction acts (the flag `frictionloss`)."""
     ball_force: Vec3 = ZERO3
     """External force on the ball, N."""
 
@@ -132,6 +134,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
         ball_weight=1.0 - float(m.body_gravcomp[addresses.ball_body]),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
+        dry_friction=_has_dry_friction(m),
     )
 
 
@@ -165,7 +168,12 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
         contact = dataclasses.replace(contact, damping=damping)
     none = (None,) * len(model.links)
     links = zip(
-        model.links, p.link_mass or none, p.armature or none, p.damping or none, strict=True
+        model.links,
+        p.link_mass or none,
+        p.armature or none,
+        p.damping or none,
+        (p.frictionloss if model.dry_friction else None) or none,
+        strict=True,
     )
     servos = zip(
         model.servos,
@@ -193,7 +201,11 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
 
 
 def _link_in_world(
-    link: chain.Link, mass: Scalar | None, armature: Scalar | None, damping: Scalar | None
+    link: chain.Link,
+    mass: Scalar | None,
+    armature: Scalar | None,
+    damping: Scalar | None,
+    frictionloss: Scalar | None,
 ) -> chain.Link:
     # A body with several joints is the link of the last one; the others have no mass.
     if mass is not None and link.mass != 0.0:
@@ -207,7 +219,10 @@ def _link_in_world(
             floating_moment=scale(link.floating_moment, ratio),
         )
     return dataclasses.replace(
-        link, armature=_given(armature, link.armature), damping=_given(damping, link.damping)
+        link,
+        armature=_given(armature, link.armature),
+        damping=_given(damping, link.damping),
+        frictionloss=_given(frictionloss, link.frictionloss),
     )
 
 
@@ -269,6 +284,8 @@ def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Lin
     m = mj_model
     dof, at = m.jnt_dofadr[joint], m.jnt_qposadr[joint]
     springs = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
+    dmin, dmax = _impedance_limits(m.dof_solimp[dof, :2])
+    d = dmin if m.dof_solimp[dof, 2] > _MIN_VALUE else 0.5 * (dmin + dmax)
     return chain.Link(
         offset=frame.origin,
         rotation=frame.rotation,
@@ -282,6 +299,9 @@ def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Lin
         damping=float(m.dof_damping[dof]),
         stiffness=float(m.jnt_stiffness[joint]) if springs else 0.0,
         spring_position=float(m.qpos_spring[at]),
+        frictionloss=float(m.dof_frictionloss[dof]) if _has_dry_friction(m) else 0.0,
+        friction_softness=float((1.0 - d) / d * m.dof_invweight0[dof]),
+        friction_damping=_reference_damping(m, m.dof_solref[dof], dmax),
     )
 
 
@@ -372,15 +392,12 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int, joint: int) -> Servo:
 
 def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactModel:
     solref, solimp = mj_model.pair_solref[0], mj_model.pair_solimp[0]
-    # MuJoCo's limits for solimp (mjMINIMP, mjMAXIMP).
-    dmin, dmax, midpoint = np.clip(solimp[[0, 1, 3]], 1e-4, 1.0 - 1e-4)
+    dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]])
     if solref[0] > 0.0:
-        # solref is (time constant, damping ratio), with a time constant of at least two steps.
-        time_constant = max(solref[0], 2.0 * mj_model.opt.timestep)
+        time_constant = _time_constant(mj_model, solref)
         stiffness = 1.0 / (dmax * time_constant * solref[1]) ** 2
-        damping = 2.0 / (dmax * time_constant)
     else:
-        stiffness, damping = -solref[0] / dmax**2, -solref[1] / dmax
+        stiffness = -solref[0] / dmax**2
     power = max(1.0, float(solimp[4]))
     frictional = mj_model.pair_dim[0] > 1
     friction = np.maximum(mj_model.pair_friction[0, :2], MIN_FRICTION)
@@ -391,7 +408,7 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
         radius=float(mj_model.geom_size[addresses.ball_geom, 0]),
         half_size=floats(mj_model.geom_size[addresses.paddle_geom]),
         stiffness=float(stiffness),
-        damping=float(damping),
+        damping=_reference_damping(mj_model, solref, dmax),
         solimp=(
             float(dmin),
             float(dmax),
@@ -408,11 +425,34 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
     )
 
 
+def _impedance_limits(solimp: np.ndarray) -> np.ndarray:
+    """Impedances of a `solimp` within MuJoCo's limits (mjMINIMP, mjMAXIMP)."""
+    return np.clip(solimp, 1e-4, 1.0 - 1e-4)
+
+
+def _reference_damping(mj_model: mujoco.MjModel, solref: np.ndarray, max_impedance: float) -> float:
+    """b of the reference acceleration: `solref` is (time constant, damping ratio) or (-k, -b); a
+    time constant of 0.02 s, MuJoCo's default, replaces one of mixed signs."""
+    if (solref[0] > 0.0) != (solref[1] > 0.0):
+        solref = np.array([0.02, 1.0])
+    if solref[0] > 0.0:
+        return float(2.0 / (max_impedance * _time_constant(mj_model, solref)))
+    return float(-solref[1] / max_impedance)
+
+
+def _time_constant(mj_model: mujoco.MjModel, solref: np.ndarray) -> float:
+    """Time constant of a `solref`, at least two steps, s."""
+    return max(solref[0], 2.0 * mj_model.opt.timestep)
+
+
+def _has_dry_friction(mj_model: mujoco.MjModel) -> bool:
+    """Whether the flag `frictionloss` lets the joints' dry friction act."""
+    return not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+
+
 def _tangent_damping(mj_model: mujoco.MjModel, max_impedance: float) -> float | None:
     """b of the pair's `solreffriction`; None if the pair's `solref` applies."""
-    first, second = (float(x) for x in mj_model.pair_solreffriction[0])
-    if (first > 0.0) != (second > 0.0) or (first == 0.0 and second == 0.0):
+    solref = mj_model.pair_solreffriction[0]
+    if (solref[0] > 0.0) != (solref[1] > 0.0) or not np.any(solref):
         return None
-    if first > 0.0:
-        return 2.0 / (max_impedance * max(first, 2.0 * mj_model.opt.timestep))
-    return -second / max_impedance
+    return _reference_damping(mj_model, solref, max_impedance)

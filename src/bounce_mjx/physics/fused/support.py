@@ -104,7 +104,6 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     nonlinear = np.any(m.jnt_stiffnesspoly)
     _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
     _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
-    _require(not np.any(m.dof_frictionloss), "joint friction (frictionloss)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
     inertia = m.body_inertia[addresses.ball_body]
     plain_ball = (
@@ -114,6 +113,7 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
         and not np.any(m.geom_pos[addresses.ball_geom])
         and not np.any(m.dof_damping.reshape(m.nv, -1)[addresses.ball_qvel,])
         and not np.any(m.dof_armature[addresses.ball_qvel,])
+        and not np.any(m.dof_frictionloss[addresses.ball_qvel,])
         and not m.jnt_stiffness[m.body_jntadr[addresses.ball_body]]
     )
     _require(plain_ball, "a ball that is not one free homogeneous sphere")
@@ -134,6 +134,8 @@ def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
         m.pair_dim[0] in (1, 3),
         f"torsional or rolling friction (condim {m.pair_dim[0]}; only condim 1 and 3)",
     )
+    friction = m.pair_dim[0] > 1 or np.any(m.dof_frictionloss)
+    _require(not (friction and m.opt.noslip_iterations), "the noslip solver (noslip_iterations)")
     _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(m.pair_adhesion[0] == 0.0, "adhesion")
     solref, width = m.pair_solref[0], m.pair_solimp[0, 2]
