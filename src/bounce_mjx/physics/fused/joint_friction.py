@@ -120,7 +120,8 @@ def _solve(
                 contact = contact_force(problem.contact_matrix, _contact_offset(problem, friction))
         return stored(_eliminate_sticking(problem, limits, friction, contact_force))
 
-    none = tuple(jnp.zeros_like(x) for x in problem.offset)
+    # Not a constant, which Mosaic would keep in another layout than the loop's results.
+    none = tuple(x - x for x in problem.offset)
     start = contact_force(problem.contact_matrix, problem.contact_offset), none
     return lax.fori_loop(0, _ROUNDS, one_round, start)
 
