@@ -12,7 +12,6 @@ nonnegative combinations of the four edges (1, +-1, 0), (1, 0, +-1). Both solver
 operations in every state, so that the threads of a GPU kernel do not diverge.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -115,17 +114,14 @@ def contact_response(
     half = [chain.solve_lower(factor, row) for row in rows]
     half, half_applied = stored((half, list(half_applied)))
 
-    def inverse_inertia(i: int, j: int) -> Scalar:
-        return functools.reduce(add, map(mul, half[i], half[j]))
-
     along_tangent = 1.0 / ball_mass + lever * lever / ball_inertia
     matrix = (
-        inverse_inertia(0, 0) + 1.0 / ball_mass,
-        inverse_inertia(0, 1),
-        inverse_inertia(0, 2),
-        inverse_inertia(1, 1) + along_tangent,
-        inverse_inertia(1, 2),
-        inverse_inertia(2, 2) + along_tangent,
+        dot(half[0], half[0]) + 1.0 / ball_mass,
+        dot(half[0], half[1]),
+        dot(half[0], half[2]),
+        dot(half[1], half[1]) + along_tangent,
+        dot(half[1], half[2]),
+        dot(half[2], half[2]) + along_tangent,
     )
     d = impedance(model, contact.distance)
     damping = model.damping if model.tangent_damping is None else model.tangent_damping

@@ -16,7 +16,6 @@ found the right ones. Every state runs the same operations, so that the threads 
 not diverge.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused import chain
-from bounce_mjx.physics.fused.scalars import Scalar, add, is_constant, mul, neg, stored, sub
+from bounce_mjx.physics.fused.scalars import Scalar, add, dot, is_constant, mul, neg, stored, sub
 
 Scalars = Sequence[Scalar]
 ContactForce = Callable[[tuple[Scalar, ...], tuple[Scalar, ...]], tuple[Scalar, ...]]
@@ -85,17 +84,17 @@ def contact_and_friction(
         return contact_force(contact_matrix, contact_offset), friction
     units = [[1.0 if i == j else 0.0 for i in range(len(links))] for j in joints]
     half = stored([chain.solve_lower(factor, unit) for unit in units])
-    matrix = [[_dot(a, b) for b in half] for a in half]
+    matrix = [[dot(a, b) for b in half] for a in half]
     for i, j in enumerate(joints):
         matrix[i][i] = add(matrix[i][i], links[j].friction_softness)
     problem = Problem(
         matrix=matrix,
         inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
         offset=[
-            add(_dot(column, half_applied), mul(links[j].friction_damping, joint_velocity[j]))
+            add(dot(column, half_applied), mul(links[j].friction_damping, joint_velocity[j]))
             for j, column in zip(joints, half, strict=True)
         ],
-        coupling=[[_dot(row, column) for column in half] for row in half_rows],
+        coupling=[[dot(row, column) for column in half] for row in half_rows],
         contact_matrix=contact_matrix,
         contact_offset=contact_offset,
     )
@@ -133,9 +132,9 @@ def _sweep(
     (projected Gauss-Seidel)."""
     new = list(friction)
     for j, (row, limit) in enumerate(zip(problem.matrix, limits, strict=True)):
-        pull = _dot([of_contact[j] for of_contact in problem.coupling], contact)
+        pull = dot([of_contact[j] for of_contact in problem.coupling], contact)
         pull = add(
-            add(problem.offset[j], pull), _dot(row[:j] + row[j + 1 :], new[:j] + new[j + 1 :])
+            add(problem.offset[j], pull), dot(row[:j] + row[j + 1 :], new[:j] + new[j + 1 :])
         )
         new[j] = _limited(neg(mul(pull, problem.inverse_diagonal[j])), limit)
     return tuple(new)
@@ -158,7 +157,7 @@ def _eliminate_sticking(
     ]
     factor = stored(chain.cholesky(masked))
     pulls = [
-        mul(s, add(x, _dot(row, kept)))
+        mul(s, add(x, dot(row, kept)))
         for s, x, row in zip(sticks, problem.offset, problem.matrix, strict=True)
     ]
     half = chain.solve_lower(factor, pulls)
@@ -168,11 +167,11 @@ def _eliminate_sticking(
     pairs = [(i, j) for i in range(size) for j in range(i, size)]
     contact = contact_force(
         tuple(
-            sub(entry, _dot(half_rows[i], half_rows[j]))
+            sub(entry, dot(half_rows[i], half_rows[j]))
             for entry, (i, j) in zip(problem.contact_matrix, pairs, strict=True)
         ),
         tuple(
-            sub(offset, _dot(row, half))
+            sub(offset, dot(row, half))
             for offset, row in zip(_contact_offset(problem, kept), half_rows, strict=True)
         ),
     )
@@ -187,14 +186,10 @@ def _eliminate_sticking(
 def _contact_offset(problem: Problem, friction: Scalars) -> tuple[Scalar, ...]:
     """`Problem.contact_offset` with dry friction."""
     return tuple(
-        add(offset, _dot(row, friction))
+        add(offset, dot(row, friction))
         for offset, row in zip(problem.contact_offset, problem.coupling, strict=True)
     )
 
 
 def _limited(force: Scalar, limit: Scalar) -> Scalar:
     return jnp.clip(force, neg(limit), limit)
-
-
-def _dot(a: Scalars, b: Scalars) -> Scalar:
-    return functools.reduce(add, map(mul, a, b), 0.0)

@@ -5,7 +5,9 @@ the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees th
 has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
 """
 
+import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -80,9 +82,9 @@ def scale(a: Vec3, s: Scalar) -> Vec3:
     return (mul(a[0], s), mul(a[1], s), mul(a[2], s))
 
 
-def dot(a: Vec3, b: Vec3) -> Scalar:
-    """Inner product."""
-    return add(add(mul(a[0], b[0]), mul(a[1], b[1])), mul(a[2], b[2]))
+def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
+    """Inner product of two sequences of one length; 0 if they are empty."""
+    return functools.reduce(add, map(mul, a, b), 0.0)
 
 
 def cross(a: Vec3, b: Vec3) -> Vec3:
