@@ -28,6 +28,7 @@ from bounce_mjx.task.randomization import (
     draw_world,
     physics_parameters,
 )
+from test_friction import converged
 from test_physics import difference
 
 # Draws
@@ -220,7 +221,7 @@ def free_run() -> Run:
         "restitution": (0.7, 0.95), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
         "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
         "servo_lag": (0.0, 0.02), "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
-        "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3),
+        "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3), "torque_limit": (20.0, 100.0),
         "paddle_offset": (-0.01, 0.01), "paddle_tilt": (-0.02, 0.02),
         "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035), "push_speed": (0.02, 0.05),
         "push_interval": (0.3, 0.6), "target_height": (0.3, 0.8), "target_interval": (0.4, 0.7),
@@ -261,7 +262,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
     (model,) = episode_models(free_run.env, of_world)
-    model.opt.tolerance = 1e-15
+    converged(model, 20, 50)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
     data.qpos[8] += shift
