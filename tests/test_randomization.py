@@ -446,6 +446,15 @@ def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property
     assert np.mean(errors[2] < 1e-9) > 0.85
 
 
+def test_starts_are_displaced(free_run: Run) -> None:
+    start = free_run.starts.pipeline_state
+    config, qpos = free_run.env.config, np.asarray(start.physics.qpos)
+    displaced = qpos[:6] - np.array(config.default_joint_angles)[:, None]
+    np.testing.assert_allclose(displaced, start.world["joint_start"], atol=1e-9)
+    ball = qpos[6:9] - np.array(config.ball_init_pos)[:, None] - start.world["ball_start"]
+    assert 0.9 * config.ball_position_noise < np.abs(ball).max() <= config.ball_position_noise
+
+
 def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
     world, pushes = free_run.starts.pipeline_state.world, free_run.control.ball_push
     size = np.linalg.norm(pushes, axis=1)
@@ -531,6 +540,8 @@ class Watch(NamedTuple):
     parts: dict
     """Values of each part [N, T, n, size], the newest first."""
     actions: np.ndarray
+    targets: np.ndarray
+    """Servo targets [N, T, 6]."""
     privileged: dict
     """Metrics for the critic alone [N, T]."""
 
@@ -556,10 +567,10 @@ def watching(camera: bool, velocity: str):
 
             def step(state, inputs):
                 action, physics = inputs
-                state, _ = env.begin_step(state, action)
+                state, control = env.begin_step(state, action)
                 state = env.finish_step(state, action, physics)
-                metrics = state.metrics.items()
-                return state, (state.obs, {n: x for n, x in metrics if n.startswith(PRIVILEGED)})
+                metrics = {n: x for n, x in state.metrics.items() if n.startswith(PRIVILEGED)}
+                return state, (state.obs, control.ctrl, metrics)
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
             _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
@@ -571,14 +582,14 @@ def watching(camera: bool, velocity: str):
         ranges = {name: PERFECT[name] for name in sensors} | changed
         ranges = {n: tuple(jnp.full(EPISODES, e) for e in r) for n, r in ranges.items()}
         keys = jax.random.split(jax.random.PRNGKey(0), EPISODES)
-        world, phase, obs, privileged = jax.device_get(watch(ranges, keys))
+        world, phase, obs, targets, privileged = jax.device_get(watch(ranges, keys))
         parts = {
             part.name: obs[..., env.layout[part.name]].reshape(
                 EPISODES, STEPS, PARTS[part.name], -1
             )
             for part in env.layout.parts
         }
-        return Watch(world, phase, parts, actions, privileged)
+        return Watch(world, phase, parts, actions, targets, privileged)
 
     return run
 
@@ -688,6 +699,15 @@ def test_biases_are_constant_in_an_episode(watch) -> None:
         expected = np.broadcast_to(seen.world[bias][:, None], error.shape)
         np.testing.assert_allclose(error, expected, atol=1e-9)
         assert np.unique(expected[:, 0].round(9)).size == expected[:, 0].size
+
+
+def test_servo_targets_start_from_the_measured_angles(watch) -> None:
+    """With the noise that the policy saw. The servo shares the error of its encoder's zero, which
+    therefore has no effect on the true target."""
+    seen = watch(joint_angle_noise=(0.01, 0.01), encoder_bias=(-0.05, 0.05))
+    measured = seen.parts["joint_angles"][:, :-1, 0] - seen.world["encoder_bias"][:, None]
+    np.testing.assert_allclose(seen.targets[:, 1:], measured + 0.02 * seen.actions[1:], atol=1e-7)
+    assert np.abs(measured - trajectory()[0][1:-1, :6]).max() > 0.03
 
 
 def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
