@@ -110,8 +110,11 @@ def run_command(
     make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
     watcher: "Watcher | None" = None,
+    modules: Sequence[str] | None = None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
+
+    The arguments after `prog`, and the errors, are those of `train`.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -135,6 +138,7 @@ def run_command(
             report=command.report,
             wandb=command.wandb,
             watcher=watcher,
+            modules=modules,
         )
     except TrainingStopped as stopped:
         say(console, str(stopped))
