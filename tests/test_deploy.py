@@ -544,6 +544,16 @@ def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
     assert bounces >= 10 and survived == pytest.approx(8.0)
 
 
+def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
+    """On plain MuJoCo; the defaults of the example."""
+    (bounces, survived), (lost_bounces, lost_at) = (
+        EXAMPLE["simulate"](load_policy(name), EXAMPLE["Camera"](120.0, 0.002, 0.020), 8.0, 0.5)
+        for name in ("robust", "pretrained")
+    )
+    assert bounces >= 10 and survived == pytest.approx(8.0)
+    assert lost_bounces < 5 and lost_at < 4.0
+
+
 def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:
     source = CHECKOUT / "examples" / "deploy.py"
     assert len(source.read_text(encoding="utf-8").splitlines()) <= 80
