@@ -397,7 +397,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
     (model,) = episode_models(free_run.env, of_world)
-    converged(model, 20, 50)
+    converged(model, 20)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
     data.qpos[8] += shift
