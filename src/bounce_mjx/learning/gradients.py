@@ -14,8 +14,12 @@ class MinibatchGradients(NamedTuple):
     """Parameters of the two networks -> P; linear."""
     unpack: Callable[[Any], Any]
     """P -> parameters of the two networks; the inverse."""
-    shuffle: Callable[[Any, jax.Array, jax.Array, jax.Array], tuple[Any, Any]]
+    copy: Callable[[Any], Any]
+    """P -> copies that `gradient` needs as well, such as numbers of lower precision. The step that
+    changes the parameters makes them, because on a GPU they then cost no kernel of their own."""
+    shuffle: Callable[[Any, jax.Array, jax.Array, jax.Array], Any]
     """(samples of G groups, order [G, M, N / G] of M minibatches, mean [M] and standard deviation
-    [M] of their advantages) -> data of the epoch, data of each minibatch with M as first axis."""
-    gradient: Callable[[Any, Any, Any], tuple[Any, dict[str, jax.Array]]]
-    """(P, data of the epoch, data of one minibatch) -> gradient in the form P, metrics []."""
+    [M] of their advantages) -> data of the epoch."""
+    gradient: Callable[[Any, Any, Any, jax.Array], tuple[Any, dict[str, jax.Array]]]
+    """(P, its copies, data of the epoch, index of the minibatch [], int32) -> gradient in the form
+    P, metrics []."""

@@ -123,10 +123,10 @@ def kernel_gradients(
             action=gather(_pad_last(samples.action, NUM_OUTPUTS)),
             scalars=jnp.stack([log_prob, advantage, target], axis=1),
         )
-        return batch, jnp.arange(num_minibatches, dtype=jnp.int32)
+        return batch
 
-    def gradient(params: PackedParams, batch: Batch, index: jax.Array):
-        gradient, metrics = loss_gradient(config, num_actions, params, batch, index)
+    def gradient(params: PackedParams, low: PackedParams, batch: Batch, index: jax.Array):
+        gradient, metrics = loss_gradient(config, num_actions, params, low, batch, index)
         gradient = jax.tree.map(lambda x, known: jnp.where(known, x, 0.0), gradient, is_parameter)
         noise_row = params.output.shape[1] - _BIAS_ROWS + 1
         log_std = params.output[0, noise_row, :num_actions]
@@ -137,7 +137,12 @@ def kernel_gradients(
         metrics["policy/action_std"] = jnp.mean(jnp.exp(log_std))
         return gradient, metrics
 
-    return MinibatchGradients(pack, unpack, shuffle, gradient)
+    return MinibatchGradients(pack, unpack, low_precision, shuffle, gradient)
+
+
+def low_precision(params: PackedParams) -> PackedParams:
+    """The parameters in the type that the tensor cores take."""
+    return PackedParams(*(x.astype(jnp.bfloat16) for x in params))
 
 
 def parameter_mask(shapes: tuple[Any, Any]) -> PackedParams:
@@ -169,6 +174,7 @@ def loss_gradient(
     config: PPOConfig,
     num_actions: int,
     params: PackedParams,
+    low: PackedParams,
     batch: Batch,
     index: jax.Array,
     interpret: Any = None,
@@ -176,6 +182,7 @@ def loss_gradient(
     """Gradient of the loss of one minibatch without the entropy bonus, and its metrics.
 
     Args:
+      low: the same parameters as `low_precision` returns them.
       index: index of the minibatch [], int32.
       interpret: parameters of Pallas' interpreter for GPU kernels, for tests on a processor.
 
@@ -183,7 +190,6 @@ def loss_gradient(
       The gradient, undefined in the padding, and the means "loss/policy", "loss/value" and
       "policy/kl" [].
     """
-    low = PackedParams(*(x.astype(jnp.bfloat16) for x in params))
     hidden, output, metrics = _batched_call(config, num_actions, interpret)(
         *batch, *low, params.output, index.astype(jnp.int32)
     )

@@ -45,6 +45,15 @@ from bounce_mjx.task.state import Env
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
+_MINIBATCH_METRICS = (
+    "loss/policy",
+    "loss/value",
+    "loss/gradient_norm",
+    "policy/entropy",
+    "policy/kl",
+    "policy/action_std",
+)
+
 # Minimum number of groups in which samples are shuffled, and the maximum number of environments per
 # group if there are more groups.
 _MIN_GROUPS, _GROUP_ENVS = 64, 64
@@ -373,13 +382,16 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
             return samples, (jnp.moveaxis(order, 1, 0), mean, deviation)
 
-        def gradient(flat_params: jax.Array, samples: Samples, minibatch):
-            order, mean, deviation = minibatch
+        def gradient(flat_params: jax.Array, _, shuffled, index: jax.Array):
+            samples, minibatches = shuffled
+            order, mean, deviation = (x[index] for x in minibatches)
             batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
             batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
             return jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(flat_params)
 
-        return MinibatchGradients(lambda x: ravel_pytree(x)[0], unravel, shuffle, gradient)
+        return MinibatchGradients(
+            lambda x: ravel_pytree(x)[0], unravel, lambda _: (), shuffle, gradient
+        )
 
     def make_gradients(params: Params) -> MinibatchGradients:
         if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
@@ -401,11 +413,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
             axes = (0, *range(2, advantage.ndim))
             mean, deviation = jnp.mean(advantage, axis=axes), jnp.std(advantage, axis=axes)
-            shuffled, minibatches = gradients.shuffle(samples, order, mean, deviation)
+            shuffled = gradients.shuffle(samples, order, mean, deviation)
 
-            def step(carry, minibatch):
-                params, optimizer_state, learning_rate = carry
-                gradient, metrics = gradients.gradient(params, shuffled, minibatch)
+            def step(index, carry):
+                (params, copies, optimizer_state, learning_rate), all_metrics = carry
+                gradient, metrics = gradients.gradient(params, copies, shuffled, index)
                 direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
                 params = jax.tree.map(lambda x, d: x - learning_rate * d, params, direction)
                 learning_rate = adapt_learning_rate(
@@ -413,17 +425,23 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 )
                 squares = [jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradient)]
                 metrics["loss/gradient_norm"] = jnp.sqrt(sum(squares))
-                return (params, optimizer_state, learning_rate), pack(metrics)
+                row = jnp.stack([metrics[name] for name in _MINIBATCH_METRICS])
+                carry = params, gradients.copy(params), optimizer_state, learning_rate
+                return carry, all_metrics.at[index].set(row)
 
-            return jax.lax.scan(step, carry, minibatches)
+            # Not `scan`: on a GPU each slice of its inputs and each result costs a kernel.
+            shape = (config.num_minibatches, len(_MINIBATCH_METRICS))
+            all_metrics = jnp.zeros(shape, advantage.dtype)
+            return jax.lax.fori_loop(0, config.num_minibatches, step, (carry, all_metrics))
 
         # Between updates the optimizer's moments are one flat array, whichever implementation
         # computes the gradients.
         moments = jax.tree.map(
             lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
         )
-        carry = (gradients.pack(state.params), moments, state.learning_rate)
-        (params, moments, learning_rate), metrics = jax.lax.scan(
+        params = gradients.pack(state.params)
+        carry = (params, gradients.copy(params), moments, state.learning_rate)
+        (params, _, moments, learning_rate), all_metrics = jax.lax.scan(
             epoch, carry, jax.random.split(key, config.num_epochs)
         )
         optimizer_state = jax.tree.map(
@@ -431,12 +449,12 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             state.optimizer,
             moments,
         )
-        metrics = unpack(metrics)
+        metrics = dict(zip(_MINIBATCH_METRICS, jnp.moveaxis(all_metrics, -1, 0), strict=True))
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
         return (gradients.unpack(params), optimizer_state, learning_rate), means, metrics
 
-    def iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
+    def iteration(state: TrainingState) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
         collection, metrics = collect(state, collect_key)
         samples = prepare(state.params, collection)
@@ -458,7 +476,13 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         return state, metrics
 
     def run(state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
-        return jax.lax.scan(iteration, state, length=num_iterations)
+        def packed_iteration(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
+            state, metrics = iteration(state._replace(env=unpack(state.env)))
+            return state._replace(env=pack(state.env)), pack(metrics)
+
+        state = state._replace(env=pack(state.env))
+        state, metrics = jax.lax.scan(packed_iteration, state, length=num_iterations)
+        return state._replace(env=unpack(state.env)), unpack(metrics)
 
     return Trainer(init, run)
 
