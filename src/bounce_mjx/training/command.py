@@ -110,8 +110,12 @@ def run_command(
     make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
     watcher: "Watcher | None" = None,
+    stopped: Callable[[], None] = lambda: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
+
+    Args:
+      stopped: called at the end of a training that the user stopped, before the process ends.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -136,8 +140,9 @@ def run_command(
             wandb=command.wandb,
             watcher=watcher,
         )
-    except TrainingStopped as stopped:
-        say(console, str(stopped))
+    except TrainingStopped as stop:
+        say(console, str(stop))
+        stopped()
         # Does not wait for a compilation or an evaluation in another thread.
         leave(0)
     best = show(outcomes, console)
