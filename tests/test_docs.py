@@ -396,7 +396,7 @@ def test_new_term_of_the_rewards_page_is_a_term(monkeypatch: pytest.MonkeyPatch)
     assert terms.keys() == {*TERM_NAMES, "sideways_velocity"}
 
 
-@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md"])
+@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md", "jax.md"])
 def test_examples_on_jax_run(page: str, capsys) -> None:
     """Compiled functions are only traced, which takes a tenth of the time."""
 

@@ -27,12 +27,12 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.commands import play, view
+from bounce_mjx.commands import play, train, view
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
@@ -62,6 +62,7 @@ from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
+from tiny_runs import TINY
 
 GRAVITY = 9.81
 HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
@@ -726,6 +727,42 @@ def test_the_page_of_a_training_shows_its_newest_policy(
         lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
     )
     training.wait()
+
+
+def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
+    """The last line of a training names the command that shows its policy."""
+    told, shown = [], []
+
+    class Page:
+        def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
+            told.append(("served", host, port))
+
+        def block(self, steps: int, means: dict[str, float]) -> None:
+            told.append(("block", steps, means["speed/steps_per_second"] > 0.0))
+
+        def evaluation(self, steps: int, report: Report, policy) -> None:
+            told.append(("evaluation", steps, len(report.results)))
+            shown.append(policy)
+
+        def wait(self) -> None:
+            told.append(("ended",))
+
+    monkeypatch.setattr("bounce_mjx.viewers.watch.TrainingPage", Page)
+    # The process would end there.
+    monkeypatch.setattr(train, "leave", lambda status: None)
+    flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]
+    train.main([*TINY, *flags, "--watch", "--watch-port", "8123"])
+    assert told == [
+        ("served", "127.0.0.1", 8123),
+        ("block", 64, True),
+        ("block", 128, True),
+        ("evaluation", 128, 5),
+        ("ended",),
+    ]
+    (folder,) = tmp_path.iterdir()
+    saved = load_policy(latest_checkpoint(folder), load_run_config(folder))
+    jax.tree.map(np.testing.assert_array_equal, *shown, saved)
+    assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
 
 
 def test_the_legend_names_the_keys(page) -> None:
