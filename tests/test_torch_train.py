@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -176,19 +177,22 @@ def test_resumed_run_is_the_same_as_an_uninterrupted_one(run, library, tmp_path)
 
 
 def test_stopped_run_has_the_model_of_its_checkpoint(tmp_path, monkeypatch):
-    """Also after it was resumed; another run in the same folder gets no model."""
+    """It stops after an iteration, also when it was resumed; another run in the same folder gets no
+    model."""
     (other := tmp_path / "2000-01-01").mkdir()
     (other / "config.yaml").touch()
     run_block = TorchTrainer.run
 
-    def stop(trainer: TorchTrainer, *args):
+    def stop(trainer: TorchTrainer, iterations, stopping):
         os.kill(os.getpid(), signal.SIGTERM)
-        return run_block(trainer, *args)
+        while not stopping():
+            time.sleep(0.01)
+        return run_block(trainer, iterations, stopping)
 
     monkeypatch.setattr(TorchTrainer, "run", stop)
     # The process would end there.
     monkeypatch.setattr(training_command, "leave", sys.exit)
-    flags = [*TINY, "--log-dir", str(tmp_path)]
+    flags = [*TINY, "--block-steps", "128", "--log-dir", str(tmp_path)]
     for steps in (64, 128):
         with pytest.raises(SystemExit) as exit_info:
             torch_train.main(flags)
