@@ -27,24 +27,8 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 
 PHASES = ("setup", "compile", "train", "evaluate", "save")
 
-# Runs the command line, and writes the moments of JAX's own events: (name, end, duration).
-WATCHED = """
-import json, sys, time
-import jax
-from bounce_mjx.commands.main import main
-out, events = sys.argv[1], []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, seconds, **_: events.append((event, time.time(), seconds))
-)
-jax.monitoring.register_event_listener(
-    lambda event, **_: events.append((event, time.time(), 0.0))
-)
-try:
-    main(["train", *sys.argv[2:]])
-finally:
-    with open(out, "w") as file:
-        json.dump(events, file)
-"""
+# A program of its own, because a training keeps its programs only for such a process.
+TIMED = Path(__file__).with_name("timed_train.py")
 TRACE = "/jax/core/compile/jaxpr_trace_duration"
 LOWER = "/jax/core/compile/jaxpr_to_mlir_module_duration"
 COMPILE = "/jax/core/compile/backend_compile_duration"
@@ -88,8 +72,13 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
         flags = ["--seed", str(seed), "--stop-when-solved", "--log-dir", str(folder / "runs")]
         started = time.time()
         process = subprocess.Popen(
-            [sys.executable, "-u", "-c", WATCHED, str(folder / "events.json"), *flags, *extra],
-            env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "PYTHONUNBUFFERED": "1"},
+            [sys.executable, "-u", TIMED, *flags, *extra],
+            env=os.environ
+            | {
+                "JAX_COMPILATION_CACHE_DIR": str(cache),
+                "PYTHONUNBUFFERED": "1",
+                "TIMED_TRAIN_EVENTS": str(folder / "events.json"),
+            },
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

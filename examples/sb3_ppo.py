@@ -20,7 +20,8 @@ parser.add_argument("--steps", type=int, default=8_000_000)
 parser.add_argument("--judged-steps", type=int, default=2000)
 arguments = parser.parse_args()
 
-envs = VecNormalize(Sb3VecEnv(arguments.num_envs), gamma=0.98)
+# Most failures come in the first second; short episodes have more first seconds to learn from.
+envs = VecNormalize(Sb3VecEnv(arguments.num_envs, max_episode_steps=400), gamma=0.98)
 envs.seed(0)
 model = PPO(
     "MlpPolicy",

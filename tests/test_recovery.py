@@ -16,13 +16,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
@@ -54,6 +55,8 @@ from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer
+from bounce_mjx.training.programs import Programs, kept_programs
+from bounce_mjx.training.setup import imported_modules
 from bounce_mjx.training.signals import StopRequest
 from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
@@ -61,29 +64,29 @@ from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keeps compiled programs: in this process by config, and for other processes in a cache."""
-    compile_training, compile_evaluator, kept = PPOTrainer.compile, Evaluators._compile, {}
+    kept = {}
 
-    def key(config: TrainConfig, **varied: object) -> str:
-        varied |= {"total_steps": 0, "eval_every": 0, "log_dir": None}
-        return repr(config.model_copy(update=varied))
+    def get_once(
+        programs: Programs,
+        name: str,
+        mesh: Mesh,
+        lower: Callable[[], jax.stages.Lowered],
+        at_once: bool = False,
+    ) -> concurrent.futures.Future:
+        varied = {"total_steps": 0, "eval_every": 0, "log_dir": None}
+        if name != "evaluate":
+            varied["screening_episodes"] = 0
+        key = name, repr(lower.__self__._config.model_copy(update=varied))
 
-    def compile_training_once(trainer: PPOTrainer, pool: concurrent.futures.Executor):
-        name = key(trainer._config, screening_episodes=0)
-        if name not in kept:
-            compile_training(trainer, pool).result()
-            kept[name] = trainer._run, trainer._init
-        trainer._run, trainer._init = kept[name]
-        return trainer._run
+        def program() -> jax.stages.Compiled:
+            if key not in kept:
+                kept[key] = lower().compile()
+            return kept[key]
 
-    def compile_evaluator_once(evaluators: Evaluators):
-        name = "evaluator", key(evaluators._config)
-        if name not in kept:
-            kept[name] = compile_evaluator(evaluators)
-        return kept[name]
+        return programs._pool.submit(program)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PPOTrainer, "compile", compile_training_once)
-        patch.setattr(Evaluators, "_compile", compile_evaluator_once)
+        patch.setattr(Programs, "get", get_once)
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
@@ -503,29 +506,80 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
 
 
 COUNTED = """
-import sys
 import jax
 from bounce_mjx.commands.train import main
-events = []
+events, traced = [], []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
-main(sys.argv[1:])
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, fun_name="", **__: traced.append(fun_name) if "jaxpr_trace" in event else None
+)
+main()
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
+print("traced:", *sorted({"train_block", "evaluate"} & set(traced)))
 """
 
 
-def test_a_second_start_compiles_nothing(tmp_path: Path) -> None:
-    """Every program of the second start is read from the cache."""
-    counts = []
-    for start in ("first", "second"):
-        flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir", tmp_path / start]
-        with job(tmp_path / f"{start}.log", *flags, code=COUNTED) as process:
+def test_a_second_start_compiles_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every program of a second start is read from the cache. The training's own programs are not
+    even traced, and train as before; without their files, JAX's cache has them."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    script = tmp_path / "counted.py"
+    script.write_text(COUNTED)
+    programs = tmp_path / "cache" / "programs"
+
+    def start(name: str) -> tuple[int, int, list[str], dict[str, np.ndarray]]:
+        flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir", tmp_path / name]
+        with job(tmp_path / f"{name}.log", *flags, script=script) as process:
             assert process.wait() == 0, process.said
-        (line,) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
-        counts.append(tuple(map(int, line)))
-    requests, hits = counts[1]
-    assert requests == hits >= 3
-    assert counts[0][0] == requests
+        (counts,) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
+        (traced,) = re.findall(r"^traced:(.*)$", process.said, re.MULTILINE)
+        (run,) = (tmp_path / name).iterdir()
+        return *map(int, counts), traced.split(), arrays(latest_checkpoint(run))
+
+    requests, _, traced, trained = start("first")
+    assert traced == ["evaluate", "train_block"]
+    (folder,) = programs.iterdir()
+    assert {path.name for path in folder.iterdir()} == {"train", "init", "evaluate"}
+
+    again, hits, traced, trained_again = start("second")
+    assert again == hits == requests - 3 and traced == []
+    np.testing.assert_equal(trained_again, trained)
+
+    # A damaged file and a lost one: JAX has both programs in its own cache.
+    (folder / "train").write_bytes(b"damaged")
+    (folder / "evaluate").unlink()
+    again, hits, traced, trained_again = start("third")
+    assert again == hits == requests - 1 and traced == ["evaluate", "train_block"]
+    np.testing.assert_equal(trained_again, trained)
+
+
+def test_programs_are_kept_for_equal_trainings_alone(
+    straight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load_run_config(straight)
+    env, mesh = BounceBall(config.env), make_mesh(1, config.ppo)
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", "train_jax.py", raising=False)
+    monkeypatch.setattr(sys, "argv", ["train_jax.py", "--seed", "1"])
+    modules = imported_modules(["--seed", "1"])
+
+    def folder(config: TrainConfig, modules: Sequence[str] | None = modules) -> Path | None:
+        return kept_programs(config, env.mj_model, mesh, modules)
+
+    same = folder(config)
+    assert same == folder(config.model_copy(update={"seed": 7, "total_steps": 10**6}))
+    larger = config.ppo.model_copy(update={"hidden_layers": (17,)})
+    others = [
+        folder(config.model_copy(update={"ppo": larger})),
+        folder(config.model_copy(update={"block_steps": 128})),
+        # A user's module, which may add a reward term.
+        folder(config, (*modules, "reward.py 120 1")),
+    ]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    others.append(folder(config))
+    assert len({same, *others}) == 5
+    # In a notebook or another program, code in memory may differ from its files.
+    assert imported_modules(["--seed", "2"]) is None and folder(config, None) is None
 
 
 def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
@@ -535,7 +589,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     env, policy = BounceBall(config.env), load_policy(best_checkpoint(straight), config)
     with concurrent.futures.ThreadPoolExecutor() as pool:
         chunked, whole = (
-            Evaluators(each, env, make_mesh(1, config.ppo), pool)
+            Evaluators(each, env, make_mesh(1, config.ppo), Programs(pool))
             for each in (config, config.model_copy(update={"screening_episodes": 0}))
         )
     (expected,) = whole.final(policy)

@@ -74,10 +74,12 @@ class Job:
 
 
 @contextlib.contextmanager
-def job(log: Path, *args: object, code: str | None = None) -> Iterator[Job]:
-    """Starts `train_jax.py args`, or Python code with these arguments, and ends the process after
-    the test."""
-    program = [str(TRAIN_SCRIPT)] if code is None else ["-c", code]
+def job(
+    log: Path, *args: object, code: str | None = None, script: Path = TRAIN_SCRIPT
+) -> Iterator[Job]:
+    """Starts `train_jax.py args`, or another script or Python code with these arguments, and ends
+    the process after the test."""
+    program = [str(script)] if code is None else ["-c", code]
     started = Job(log, [str(arg) for arg in args], program)
     try:
         yield started

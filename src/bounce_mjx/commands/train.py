@@ -59,9 +59,10 @@ def main(args: Sequence[str] | None = None) -> None:
         # A process of several hosts also aborts when another one is lost.
         join_loops(early_flag(args, "--physics"))
     with interruptible_imports():
-        from bounce_mjx.training.setup import find_devices, set_up_jax
+        from bounce_mjx.training.setup import find_devices, imported_modules, set_up_jax
 
         set_up_jax()
+        modules = imported_modules(args)
         if several_hosts is None:
             # CUDA starts beside the imports.
             find_devices()
@@ -74,13 +75,13 @@ def main(args: Sequence[str] | None = None) -> None:
             hosts.join(*several_hosts)
         command = read_command(args)
         if not command.watch or not hosts.is_leader():
-            run_command(command, PPOTrainer, PROG)
+            run_command(command, PPOTrainer, PROG, modules=modules)
             return
         # Only a training that is watched pays for this import.
         from bounce_mjx.viewers.watch import TrainingPage
 
         page = TrainingPage(config_of(command), command.watch_host, command.watch_port, Console())
-        run_command(command, PPOTrainer, PROG, page)
+        run_command(command, PPOTrainer, PROG, page, modules=modules)
         page.wait()
         # A thread that simulates cannot be stopped.
         leave(0)

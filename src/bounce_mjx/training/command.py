@@ -110,9 +110,12 @@ def run_command(
     make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
     watcher: "Watcher | None" = None,
+    modules: Sequence[str] | None = None,
     stopped: Callable[[], None] = lambda: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
+
+    The other arguments after `prog`, and the errors, are those of `train`.
 
     Args:
       stopped: called at the end of a training that the user stopped, before the process ends.
@@ -139,6 +142,7 @@ def run_command(
             report=command.report,
             wandb=command.wandb,
             watcher=watcher,
+            modules=modules,
         )
     except TrainingStopped as stop:
         say(console, str(stop))

@@ -1,9 +1,8 @@
 """The compiled evaluations of a training's policies."""
 
-import concurrent.futures
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
+from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.setup import compiler_options
 
 Tree = TypeVar("Tree")
@@ -42,7 +42,7 @@ class Evaluators:
         config: TrainConfig,
         env: BounceBall,
         mesh: Mesh,
-        pool: concurrent.futures.Executor,
+        programs: Programs,
     ):
         """Starts the compilation."""
         self._config, self._env = config, env
@@ -50,7 +50,7 @@ class Evaluators:
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
-        self._program = pool.submit(self._compile)
+        self._program = programs.get("evaluate", mesh, self._lower)
 
     def wait(self) -> None:
         """Waits until the program is compiled."""
@@ -69,7 +69,7 @@ class Evaluators:
         """A full report of each policy, on resets that no selection has seen."""
         return self._measure(policy, self._config.eval_seed + _FINAL)
 
-    def _compile(self) -> Callable[[Policy, np.uint32, np.int32], Any]:
+    def _lower(self) -> jax.stages.Lowered:
         """The program (policy, seed, index of the first episode) -> statistics and recording of a
         chunk of episodes. The episodes of a screening follow the episodes of a full evaluation."""
         config, env = self._config, self._env
@@ -102,7 +102,7 @@ class Evaluators:
             out_shardings=self._replicated,
             compiler_options=compiler_options(),
         )
-        return program.lower(policy_shapes(config, env), np.uint32(0), np.int32(0)).compile()
+        return program.lower(policy_shapes(config, env), np.uint32(0), np.int32(0))
 
     def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
         config, program = self._config, self._program.result()

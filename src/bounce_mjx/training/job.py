@@ -42,6 +42,7 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import Logs, WandbLog, open_log
+from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.signals import StopRequest
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
 
@@ -90,6 +91,7 @@ def train(
     report: bool = True,
     wandb: str | None = None,
     watcher: Watcher | None = None,
+    modules: Sequence[str] | None = None,
 ) -> list[Outcome]:
     """Trains with a config, and returns an outcome for each seed.
 
@@ -100,6 +102,8 @@ def train(
       report: whether to import the modules of the report during the compilation.
       wandb: project of Weights & Biases to log to, beside TensorBoard.
       watcher: receives the progress of the first seed.
+      modules: the modules that were imported before the training's (`setup.imported_modules`), with
+        which equal trainings in later processes find their compiled programs; None to trace anew.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -112,7 +116,7 @@ def train(
         pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         job = _Job(config, console, make_trainer, command, resume, stop, pool, stack)
-        job.wandb, job.watcher = wandb, watcher
+        job.wandb, job.watcher, job.modules = wandb, watcher, modules
         job.compile(report)
         job.train()
         job.finish()
@@ -163,6 +167,7 @@ class _Job:
         self.run: Path | None = resume
         self.wandb: str | None = None
         self.watcher: Watcher | None = None
+        self.modules: Sequence[str] | None = None
         self.clock = Clock()
         hosts.connect(self._advice)
         self.env = BounceBall(config.env)
@@ -297,8 +302,10 @@ class _Job:
     def _compile(self, report: bool) -> concurrent.futures.Future:
         """Returns once the training can start, with the future of its logs. The longest program is
         traced first: Python traces one program at a time while XLA compiles others."""
-        compiling = self.trainer.compile(self.pool)
-        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
+        kept = kept_programs(self.config, self.env.mj_model, self.trainer.mesh, self.modules)
+        programs = Programs(self.pool, kept)
+        compiling = self.trainer.compile(programs)
+        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, programs)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
         self.pool.submit(importlib.import_module, "orbax.checkpoint")
         if report:

@@ -2,8 +2,9 @@
 
 import contextlib
 import hashlib
+import sys
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bounce_mjx.config.files import dump_config
@@ -27,10 +28,9 @@ def open_log(
       suffix: suffix of the file's name; two logs opened in the same second need different suffixes.
       config: the run's config, to be logged as text.
     """
-    # Imported here because tensorboardX imports PyTorch if it is installed; that takes seconds,
-    # which overlap with the compilation.
-    from tensorboardX import SummaryWriter
-    from tensorboardX.record_writer import register_writer_factory
+    with _not_importable("torch"):
+        from tensorboardX import SummaryWriter
+        from tensorboardX.record_writer import register_writer_factory
 
     register_writer_factory(_LOG_PREFIX, _LogFiles())
     purge_step = None if first_step is None else first_step + 1
@@ -108,6 +108,21 @@ class Logs:
     def close(self) -> None:
         for log in self._logs:
             log.close()
+
+
+@contextlib.contextmanager
+def _not_importable(module: str) -> Iterator[None]:
+    """Hides an installed module that is not imported yet. TensorBoardX imports PyTorch, for seconds
+    in which a short training would wait for its log, only to recognise tensors."""
+    if module in sys.modules:
+        yield
+        return
+    # Python's own mark of a module that cannot be imported.
+    sys.modules[module] = None
+    try:
+        yield
+    finally:
+        del sys.modules[module]
 
 
 _LOG_PREFIX = "bounce_mjx"

@@ -12,6 +12,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
+from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.setup import compiler_options
 from bounce_mjx.training.trainer import JAX, Metrics, Snapshot, iterations_per_block
 
@@ -48,19 +49,27 @@ class PPOTrainer:
     def state_template(self) -> TrainingState:
         return self._shapes
 
-    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+    def compile(self, programs: Programs) -> concurrent.futures.Future:
+        self._run = programs.get("train", self.mesh, self._lower_run, at_once=True)
+        self._init = programs.get("init", self.mesh, self._lower_init, at_once=True)
+        return self._run
+
+    def _lower_run(self) -> jax.stages.Lowered:
+        def train_block(state: TrainingState):
+            return self._trainer.run(state, self._compiled_iterations)
+
         sharding = self._sharding
         run = jax.jit(
-            lambda state: self._trainer.run(state, self._compiled_iterations),
+            train_block,
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,
             compiler_options=compiler_options(),
         )
-        init = jax.jit(self._initial_state, out_shardings=sharding)
-        self._run = pool.submit(run.lower(self._shapes).compile)
-        self._init = pool.submit(init.lower(self._seeds).compile)
-        return self._run
+        return run.lower(self._shapes)
+
+    def _lower_init(self) -> jax.stages.Lowered:
+        return jax.jit(self._initial_state, out_shardings=self._sharding).lower(self._seeds)
 
     def start(self, state: TrainingState | None = None) -> None:
         if state is None:

@@ -2,7 +2,9 @@
 
 import contextlib
 import os
+import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -23,6 +25,29 @@ def cache_compilations() -> None:
     if jax.config.jax_compilation_cache_dir is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
+
+
+def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
+    """The modules imported so far, with the sizes and times of their files: a user's module that
+    adds a reward term, for example, makes other programs.
+
+    Args:
+      args: the command's arguments.
+
+    Returns:
+      None if the process is not this command alone, such as a notebook or a test, whose own code
+      may have changed the package in memory.
+    """
+    main = getattr(sys.modules["__main__"], "__file__", None)
+    if main is None or sys.argv[1:] not in ([*args], ["train", *args]):
+        return None
+    files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
+    described = []
+    for name in sorted(filter(None, files)):
+        with contextlib.suppress(OSError):
+            status = os.stat(name)
+            described.append(f"{name} {status.st_size} {status.st_mtime_ns}")
+    return tuple(described)
 
 
 def find_devices() -> None:

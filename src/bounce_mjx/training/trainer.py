@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.training.programs import Programs
 
 Metrics = dict[str, np.ndarray]
 
@@ -47,7 +48,7 @@ class Trainer(Protocol):
     def state_template(self) -> Any:
         """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
 
-    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+    def compile(self, programs: Programs) -> concurrent.futures.Future:
         """Starts the compilation; the future is done when training can start."""
 
     def start(self, state: Any | None = None) -> None:
