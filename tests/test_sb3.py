@@ -88,13 +88,17 @@ def test_attributes_and_methods_reach_single_environments(envs):
 
 
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
+REPLAY_SETTINGS = {"learning_starts": 30, "batch_size": 16}
 
 
 @pytest.mark.parametrize(
     "library, algorithm, settings",
     [
         ("stable_baselines3", "PPO", PPO_SETTINGS),
-        ("stable_baselines3", "SAC", {"learning_starts": 30, "batch_size": 16}),
+        ("stable_baselines3", "A2C", {"n_steps": 16}),
+        ("stable_baselines3", "SAC", REPLAY_SETTINGS),
+        ("stable_baselines3", "TD3", REPLAY_SETTINGS),
+        ("stable_baselines3", "DDPG", REPLAY_SETTINGS),
         ("sbx", "PPO", PPO_SETTINGS),
     ],
 )

@@ -1064,7 +1064,9 @@ def test_a_dead_display_is_not_used(monkeypatch) -> None:
     assert sys.platform != "linux" or not native.has_display()
 
 
-def test_policies_given_together_are_named_and_shown_together(monkeypatch) -> None:
+def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> None:
+    """Only the task of robust draws its worlds, unless the command draws them."""
+
     class Named:
         def __init__(self, env, controller, num_envs, seed, ranges):
             self.env, self.num_envs = env, num_envs
@@ -1074,8 +1076,12 @@ def test_policies_given_together_are_named_and_shown_together(monkeypatch) -> No
     monkeypatch.setattr(
         browser, "run_browser", lambda simulation, **given: shown.append((simulation, given))
     )
-    play.main("pretrained robust --viewer browser --num-envs 4".split())
-    ((both, given),) = shown
+    both_play = "pretrained robust --viewer browser --num-envs 4".split()
+    play.main(both_play)
+    play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
+    (both, given), (drawn, _) = shown
+    assert [one.world for one in both._simulations] == [{}, {}]
+    assert [one.world for one in drawn._simulations] == [None, None]
     assert given["names"] == ["A", "A", "B", "B"] and given["num_shown"] == both.num_envs == 4
     assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", given["title"])
     for simulation, name in zip(both._simulations, ("pretrained", "robust"), strict=True):
