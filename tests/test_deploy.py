@@ -109,10 +109,11 @@ def make_run(folder: Path, env: dict) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs for each of ENVS, and the run of the package's policy."""
+    """Runs for each of ENVS, and the runs of the package's policies."""
     folder = tmp_path_factory.mktemp("runs")
     made = {name: make_run(folder / name.replace(" ", "_"), env) for name, env in ENVS.items()}
-    return made | {"pretrained": resource_path("pretrained")}
+    shipped = {"pretrained": "pretrained", "robust": "pretrained/robust"}
+    return made | {name: resource_path(folder) for name, folder in shipped.items()}
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +149,7 @@ def observations(runs: dict[str, Path]):
     return draw
 
 
-@pytest.mark.parametrize("name", [*ENVS, "pretrained"])
+@pytest.mark.parametrize("name", [*ENVS, "pretrained", "robust"])
 def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
     expected, inputs = observations(name)
     model = export_onnx(find_checkpoint(runs[name]))
@@ -447,11 +448,11 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
         policy.servo_targets(np.zeros(6))
 
 
-def test_the_shipped_file_is_a_fresh_export() -> None:
-    shipped = onnx.load(resource_path("pretrained/pretrained.onnx"))
-    assert shipped == onnx.load_from_string(export_onnx(pretrained_checkpoint())), (
-        "pretrained/pretrained.onnx is stale; write it with "
-        "bounce-mjx export pretrained --onnx pretrained/pretrained.onnx"
+@pytest.mark.parametrize("name", ["pretrained", "robust"])
+def test_the_shipped_file_is_a_fresh_export(name: str, runs: dict[str, Path]) -> None:
+    file = runs[name] / f"{name}.onnx"
+    assert onnx.load(file) == onnx.load_from_string(export_onnx(find_checkpoint(runs[name]))), (
+        f"{file} is stale; write it with bounce-mjx export {name} --onnx {file}"
     )
 
 
@@ -541,6 +542,16 @@ def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
     perfect = EXAMPLE["Camera"](rate=1000.0, noise=0.0, delay=0.0)
     bounces, survived = EXAMPLE["simulate"](load_policy("pretrained"), perfect, 8.0, 0.5)
     assert bounces >= 10 and survived == pytest.approx(8.0)
+
+
+def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
+    """On plain MuJoCo; the defaults of the example."""
+    (bounces, survived), (lost_bounces, lost_at) = (
+        EXAMPLE["simulate"](load_policy(name), EXAMPLE["Camera"](120.0, 0.002, 0.020), 8.0, 0.5)
+        for name in ("robust", "pretrained")
+    )
+    assert bounces >= 10 and survived == pytest.approx(8.0)
+    assert lost_bounces < 5 and lost_at < 4.0
 
 
 def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:

@@ -163,6 +163,26 @@ def test_the_noslip_solver_is_refused_only_with_friction():
         assert "noslip_iterations" in fused.unsupported_feature(with_friction)
 
 
+@pytest.mark.parametrize("name", ["contact_friction", "frictionloss"])
+def test_the_noslip_solver_is_refused_with_given_friction(name):
+    """C changes the step by its noslip solver, which the fused engine lacks."""
+    model = frictionless()
+    model.opt.noslip_iterations = 3
+    friction = {"contact_friction": np.ones(6), "frictionloss": np.full((6, 6), 500.0)}
+    given = PhysicsParameters(**{name: friction[name]})
+    states = touching_states(model, 6, seed=3)
+    models = [edited_model(model, jax.tree.map(lambda x, i=i: x[i], given)) for i in range(6)]
+    with_noslip, _ = c_steps(models, states)
+    for m in models:
+        m.opt.noslip_iterations = 0
+    without, _ = c_steps(models, states)
+    assert np.abs(with_noslip.qvel - without.qvel).max() > 1e-3
+    engine = make_engine(model, "auto")
+    state = PhysicsState(jnp.asarray(states.qpos[0]), jnp.asarray(states.qvel[0]))
+    with pytest.raises(UserError, match=f'{name}.*noslip_iterations="3"; set it to 0'):
+        engine.step(jax.tree.map(lambda x: x[0], given), state, Control(states.ctrl[0]), 1)
+
+
 def test_mjx_refuses_given_dry_friction(mj_model):
     engine = make_engine(mj_model, "mjx")
     state = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
@@ -17,18 +18,25 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.metrics import PRIVILEGED
 from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.ppo import make_trainer
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import load_config
 from bounce_mjx.task import noise
 from bounce_mjx.task.actuation import delayed, start_actuation
+from bounce_mjx.task.observation import BOUNCE_QUANTITIES
 from bounce_mjx.task.randomization import (
     TERMS,
     RandomizationConfig,
     draw_world,
     physics_parameters,
 )
-from test_physics import difference
+from test_friction import converged
+from test_physics import XML, difference
+from test_ppo import TwoStates, two_state_config
 
 # Draws
 
@@ -88,6 +96,73 @@ def test_ranges_grow_from_the_nominal_values() -> None:
     assert ends(0.0)["camera_rate"] == ends(1.0)["camera_rate"] == [60.0, 120.0]
 
 
+def test_a_training_draws_from_the_grown_ranges() -> None:
+    """At each iteration, of a task whose whole state is the end of the range at its reset."""
+
+    class Growing(TwoStates):
+        warmup_steps = 320
+
+        def ranges(self, progress: jax.Array) -> jax.Array:
+            return progress
+
+        def reset(self, rng: jax.Array, ranges: jax.Array | float = 1.0):
+            return super().reset(rng).replace(pipeline_state=jnp.asarray(ranges, jnp.float32))
+
+        def step(self, state, action):
+            stepped = super().step(state, action)
+            return stepped.replace(pipeline_state=state.pipeline_state)
+
+    config = two_state_config(hidden_layers=(4,), num_minibatches=1, num_epochs=1)
+    trainer = make_trainer(config, Growing(1.0), episode_steps=2)
+    state, step = jax.jit(trainer.init)(jax.random.key(0)), jax.jit(lambda s: trainer.run(s, 1)[0])
+    np.testing.assert_array_equal(state.env.env.pipeline_state, np.zeros(16))
+    for iteration in range(12):  # of 32 steps each, in which all episodes are reset
+        state = step(state)
+        drawn_from = np.full(16, min(1.0, iteration / 10))
+        np.testing.assert_allclose(state.env.env.pipeline_state, drawn_from, rtol=1e-6)
+
+
+def test_a_share_of_the_terms_is_drawn() -> None:
+    """Each on its own; a term without a nominal value is always drawn."""
+    config = RandomizationConfig(**RANGES)
+    keys = jax.random.split(jax.random.PRNGKey(2), 2000)
+    draw = functools.partial(
+        draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6, share=0.3
+    )
+    worlds = jax.jit(jax.vmap(draw))(keys)
+    drawn = []
+    for name, values in worlds.items():
+        (low, high), nominal = RANGES[name], TERMS[name].nominal
+        entries = np.asarray(values, float).reshape(2000, -1)
+        inside = (entries >= low - 1e-6) & (entries <= high + 1e-6)
+        if nominal is None:
+            assert np.all(inside)
+            continue
+        is_nominal = np.abs(entries - nominal) < 1e-7
+        assert np.all(is_nominal | inside)
+        assert np.all(is_nominal.all(axis=1) == is_nominal.any(axis=1)), name
+        drawn.append(~is_nominal[:, 0])
+    shares = np.mean(drawn, axis=1)
+    assert np.abs(shares - 0.3).max() < 5 * np.sqrt(0.21 / 2000)
+    correlation = np.corrcoef(drawn) - np.eye(len(drawn))
+    assert np.abs(correlation).max() < 6 / np.sqrt(2000)
+
+
+@pytest.mark.parametrize("preset", ["robust", "robust_cpu", "transfer"])
+def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> None:
+    """They see only what a robot with encoders and a camera measures or remembers."""
+    config = load_config(resource_path(f"configs/{preset}.yaml")).env
+    seen = {part.name for part in config.layout.parts}
+    measured = {"joint_angles", "joint_velocities", "ball_position", "ball_age", "target_height"}
+    computed = {"paddle_position", "action"} | BOUNCE_QUANTITIES
+    if config.observation.velocity != "measured":
+        computed.add("ball_velocity")
+    assert seen <= measured | computed
+    assert {"ball_latency", "action_latency", "ball_position_noise"} <= set(
+        config.randomization.terms
+    )
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -145,6 +220,67 @@ def test_drops_bounce_as_asked(mj_model, restitution: float) -> None:
             assert np.dot(data.qpos[6:9] - home, normal) > gap, "it has left the paddle"
             measured.append(np.dot(data.qvel[6:9], normal) / speed)
     assert np.mean(measured) == pytest.approx(restitution, abs=0.015)
+
+
+JOINTS = np.linspace(0.8, 1.3, 6)
+
+
+@pytest.fixture
+def drawn_model(float64):
+    """Function (values of terms) -> the model of C, and the undrawn model: both with damping of the
+    joints and a gravity along no axis."""
+    model = mujoco.MjModel.from_xml_string(
+        XML.replace("<joint armature", '<joint damping="3" armature')
+    )
+    model.opt.gravity[:] = [0.5, -1.0, -9.0]
+
+    def draw(**world) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+        arrays = {name: jnp.asarray(value, float) for name, value in world.items()}
+        return edited_model(model, physics_parameters(arrays, model)), model
+
+    return draw
+
+
+def test_terms_are_factors_sums_and_values_of_the_model(drawn_model) -> None:
+    drawn, model = drawn_model(
+        ball_mass=1.2, ball_radius=0.9, contact_friction=0.4, servo_gain=JOINTS,
+        servo_damping=JOINTS[::-1], torque_limit=10.0 * JOINTS, joint_damping=JOINTS,
+        joint_frictionloss=5.0 * JOINTS, armature=2.0 * JOINTS, link_mass=JOINTS,
+    )  # fmt: skip
+    ball, links = model.body("ball_link").id, [model.body(f"Link{i}").id for i in range(1, 7)]
+    for new, old in (
+        (drawn.body_mass[ball], 1.2 * model.body_mass[ball]),
+        (drawn.geom("ball").size[0], 0.9 * model.geom("ball").size[0]),
+        (drawn.body_inertia[ball], 1.2 * 0.9**2 * model.body_inertia[ball]),
+        (drawn.pair_friction[0, :2], [0.4, 0.4]),
+        (drawn.pair_dim, [3]),
+        (drawn.actuator_gainprm[:, 0], JOINTS * model.actuator_gainprm[:, 0]),
+        (drawn.actuator_biasprm[:, 1], JOINTS * model.actuator_biasprm[:, 1]),
+        (drawn.actuator_biasprm[:, 2], JOINTS[::-1] * model.actuator_biasprm[:, 2]),
+        (drawn.actuator_forcerange, np.outer(10.0 * JOINTS, [-1.0, 1.0])),
+        (drawn.dof_damping[:6].ravel(), 3.0 + JOINTS),
+        (drawn.dof_frictionloss[:6], 5.0 * JOINTS),
+        (drawn.dof_armature[:6], 2.0 * JOINTS * model.dof_armature[:6]),
+        (drawn.body_mass[links], JOINTS * model.body_mass[links]),
+    ):
+        np.testing.assert_allclose(new, old, rtol=1e-12)
+
+
+def test_paddle_and_gravity_are_moved_and_turned_as_described(drawn_model) -> None:
+    """The offset is along the axes of the last link; the tilts are about x, then about the new y:
+    of the paddle about its own axes, of gravity about the world's."""
+    offset, tilt, gravity_tilt = [0.01, -0.02, 0.03], [0.2, -0.1], [0.3, 0.15]
+    drawn, model = drawn_model(paddle_offset=offset, paddle_tilt=tilt, gravity_tilt=gravity_tilt)
+    new, old = (mujoco.MjData(m) for m in (drawn, model))
+    for m, data in ((drawn, new), (model, old)):
+        data.qpos[:6] = [0.1, 0.7, 1.9, 0.3, -1.0, 0.2]
+        mujoco.mj_kinematics(m, data)
+    last_link, paddle = old.body("Link6").xmat.reshape(3, 3), old.geom("blocker")
+    np.testing.assert_allclose(new.geom("blocker").xpos, paddle.xpos + last_link @ offset)
+    turned = paddle.xmat.reshape(3, 3) @ Rotation.from_euler("XY", tilt).as_matrix()
+    np.testing.assert_allclose(new.geom("blocker").xmat.reshape(3, 3), turned, atol=1e-12)
+    gravity = Rotation.from_euler("XY", gravity_tilt).apply(model.opt.gravity)
+    np.testing.assert_allclose(drawn.opt.gravity, gravity, rtol=1e-12)
 
 
 # Actions
@@ -220,7 +356,7 @@ def free_run() -> Run:
         "restitution": (0.7, 0.95), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
         "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
         "servo_lag": (0.0, 0.02), "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
-        "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3),
+        "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3), "torque_limit": (20.0, 100.0),
         "paddle_offset": (-0.01, 0.01), "paddle_tilt": (-0.02, 0.02),
         "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035), "push_speed": (0.02, 0.05),
         "push_interval": (0.3, 0.6), "target_height": (0.3, 0.8), "target_interval": (0.4, 0.7),
@@ -261,7 +397,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
     (model,) = episode_models(free_run.env, of_world)
-    model.opt.tolerance = 1e-15
+    converged(model, 20)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
     data.qpos[8] += shift
@@ -308,6 +444,15 @@ def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property
     assert errors[0].max() < 1e-9
     assert np.all((errors < 1e-9) | (errors < apart))
     assert np.mean(errors[2] < 1e-9) > 0.85
+
+
+def test_starts_are_displaced(free_run: Run) -> None:
+    start = free_run.starts.pipeline_state
+    config, qpos = free_run.env.config, np.asarray(start.physics.qpos)
+    displaced = qpos[:6] - np.array(config.default_joint_angles)[:, None]
+    np.testing.assert_allclose(displaced, start.world["joint_start"], atol=1e-9)
+    ball = qpos[6:9] - np.array(config.ball_init_pos)[:, None] - start.world["ball_start"]
+    assert 0.9 * config.ball_position_noise < np.abs(ball).max() <= config.ball_position_noise
 
 
 def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
@@ -395,6 +540,10 @@ class Watch(NamedTuple):
     parts: dict
     """Values of each part [N, T, n, size], the newest first."""
     actions: np.ndarray
+    targets: np.ndarray
+    """Servo targets [N, T, 6]."""
+    privileged: dict
+    """Metrics for the critic alone [N, T]."""
 
 
 @functools.cache
@@ -418,13 +567,14 @@ def watching(camera: bool, velocity: str):
 
             def step(state, inputs):
                 action, physics = inputs
-                state, _ = env.begin_step(state, action)
+                state, control = env.begin_step(state, action)
                 state = env.finish_step(state, action, physics)
-                return state, state.obs
+                metrics = {n: x for n, x in state.metrics.items() if n.startswith(PRIVILEGED)}
+                return state, (state.obs, control.ctrl, metrics)
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
-            _, obs = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
-            return start.pipeline_state.world, memory.phases[0], obs
+            _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
+            return start.pipeline_state.world, memory.phases[0], *seen
 
         return jax.vmap(of_one)(keys, ranges)
 
@@ -432,14 +582,14 @@ def watching(camera: bool, velocity: str):
         ranges = {name: PERFECT[name] for name in sensors} | changed
         ranges = {n: tuple(jnp.full(EPISODES, e) for e in r) for n, r in ranges.items()}
         keys = jax.random.split(jax.random.PRNGKey(0), EPISODES)
-        world, phase, obs = jax.device_get(watch(ranges, keys))
+        world, phase, obs, targets, privileged = jax.device_get(watch(ranges, keys))
         parts = {
             part.name: obs[..., env.layout[part.name]].reshape(
                 EPISODES, STEPS, PARTS[part.name], -1
             )
             for part in env.layout.parts
         }
-        return Watch(world, phase, parts, actions)
+        return Watch(world, phase, parts, actions, targets, privileged)
 
     return run
 
@@ -549,6 +699,43 @@ def test_biases_are_constant_in_an_episode(watch) -> None:
         expected = np.broadcast_to(seen.world[bias][:, None], error.shape)
         np.testing.assert_allclose(error, expected, atol=1e-9)
         assert np.unique(expected[:, 0].round(9)).size == expected[:, 0].size
+
+
+def test_servo_targets_start_from_the_measured_angles(watch) -> None:
+    """With the noise that the policy saw. The servo shares the error of its encoder's zero, which
+    therefore has no effect on the true target."""
+    seen = watch(joint_angle_noise=(0.01, 0.01), encoder_bias=(-0.05, 0.05))
+    measured = seen.parts["joint_angles"][:, :-1, 0] - seen.world["encoder_bias"][:, None]
+    np.testing.assert_allclose(seen.targets[:, 1:], measured + 0.02 * seen.actions[1:], atol=1e-7)
+    assert np.abs(measured - trajectory()[0][1:-1, :6]).max() > 0.03
+
+
+def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
+    seen = watch(**{name: (0.5, 1.0) for name in SENSORS if name.endswith(("noise", "bias"))})
+    qpos, qvel = (x[1:] for x in trajectory())
+    data, paddle = mujoco.MjData(mj_model), []
+    for data.qpos[:] in qpos:
+        mujoco.mj_kinematics(mj_model, data)
+        paddle.append(data.geom("blocker").xpos.copy())
+    hidden = {
+        "joint_angles": qpos[:, :6], "ball_position": qpos[:, 6:9],
+        "joint_velocities": qvel[:, :6], "ball_velocity": qvel[:, 6:9],
+        "ball_angular_velocity": qvel[:, 9:], "paddle_position": np.array(paddle),
+    }  # fmt: skip
+    expected = {f"world/{name}": x[:, None] for name, x in seen.world.items() if x.ndim == 1}
+    arrays = {f"world/{n}": x[:, None] for n, x in seen.world.items() if x.ndim == 2}
+    arrays |= {f"true/{n}": x[None] for n, x in hidden.items()}
+    for name, array in arrays.items():
+        expected |= {f"{name}_{i}": array[..., i] for i in range(array.shape[-1])}
+    assert seen.privileged.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(
+            seen.privileged[name],
+            np.broadcast_to(values, (EPISODES, STEPS)),
+            atol=1e-12,
+            err_msg=name,
+        )
+    assert np.abs(seen.parts["ball_position"][:, :, 0] - hidden["ball_position"]).max() > 1.0
 
 
 def test_histories_have_the_newest_first(watch) -> None:

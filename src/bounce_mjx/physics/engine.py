@@ -68,14 +68,7 @@ def _engine(
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
         check_shapes(parameters, num_joints)
-        if name == "mjx" and parameters.frictionloss is not None:
-            # After one step from 2 of 24 states with a slow arm, MJX differed from C by up to 0.02
-            # rad/s, whatever the solver's tolerance.
-            raise UserError(
-                "the mjx physics does not compute dry friction that differs between environments "
-                "(frictionloss), as MJX's solver does not always converge with it; use --physics "
-                "fused or mujoco"
-            )
+        _check_supported_parameters(name, mj_model, parameters)
         return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(
@@ -85,6 +78,33 @@ def _engine(
         paddle_position=functools.partial(implementation.paddle_position, constants),
         warnings=warnings,
     )
+
+
+def _check_supported_parameters(
+    engine: str, mj_model: mujoco.MjModel, parameters: PhysicsParameters
+) -> None:
+    """Checks that an engine which supports the model also supports the given parameters.
+
+    Raises:
+      UserError: the engine does not compute a given kind of friction.
+    """
+    if engine == "mjx" and parameters.frictionloss is not None:
+        # After one step from 2 of 24 states with a slow arm, MJX differed from C by up to 0.02
+        # rad/s, whatever the solver's tolerance.
+        raise UserError(
+            "the mjx physics does not compute dry friction that differs between environments "
+            "(frictionloss), as MJX's solver does not always converge with it; use --physics "
+            "fused or mujoco"
+        )
+    if engine == "fused" and mj_model.opt.noslip_iterations:
+        for name in ("contact_friction", "frictionloss"):
+            if getattr(parameters, name) is not None:
+                raise UserError(
+                    f"the fused physics does not compute friction that differs between "
+                    f"environments ({name}) with the noslip solver, and the MJCF has "
+                    f'noslip_iterations="{mj_model.opt.noslip_iterations}"; set it to 0 or leave '
+                    "this friction out"
+                )
 
 
 def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:

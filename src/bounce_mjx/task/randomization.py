@@ -233,7 +233,7 @@ def draw_world(
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.fused.scalars import quaternion_product
+    from bounce_mjx.physics.fused.scalars import matvec, quaternion_matrix, quaternion_product
     from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
     from bounce_mjx.robot.model import find_addresses
 
@@ -274,15 +274,8 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         own = _array(m.geom_quat[paddle], tilt)
         given["paddle_rotation"] = jnp.stack(quaternion_product(tuple(own), _rotation_xy(tilt)))
     if "gravity_tilt" in world:
-        about_x, about_y = world["gravity_tilt"]
-        strength = float(np.linalg.norm(m.opt.gravity))
-        given["gravity"] = -strength * jnp.stack(
-            [
-                jnp.sin(about_y),
-                -jnp.sin(about_x) * jnp.cos(about_y),
-                jnp.cos(about_x) * jnp.cos(about_y),
-            ]
-        )
+        rotation = quaternion_matrix(_rotation_xy(world["gravity_tilt"]))
+        given["gravity"] = jnp.stack(matvec(rotation, tuple(m.opt.gravity.tolist())))
     return PhysicsParameters(**given)
 
 
