@@ -271,6 +271,16 @@ def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
 PACKAGE = Path(bounce_mjx.__file__).parent
 
 
+def test_physics_page_names_the_commands_that_join_loops() -> None:
+    (listed,) = re.findall(r"commands that simulate \((.+?)\)", content("physics.md"), re.DOTALL)
+    joining = {
+        name
+        for name in console_script.COMMANDS
+        if " join_loops(" in (PACKAGE / f"commands/{name.replace('-', '_')}.py").read_text()
+    }
+    assert set(re.findall(r"`(.+?)`", listed)) == joining
+
+
 def test_map_has_every_folder_of_the_package() -> None:
     """README's map: one row for each folder, and every path in it exists."""
     section = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("## Where things are\n")[1]
@@ -386,7 +396,7 @@ def test_new_term_of_the_rewards_page_is_a_term(monkeypatch: pytest.MonkeyPatch)
     assert terms.keys() == {*TERM_NAMES, "sideways_velocity"}
 
 
-@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md"])
+@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md", "jax.md"])
 def test_examples_on_jax_run(page: str, capsys) -> None:
     """Compiled functions are only traced, which takes a tenth of the time."""
 

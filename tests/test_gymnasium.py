@@ -2,6 +2,7 @@
 ones."""
 
 import copy
+import os
 import pickle
 import subprocess
 import sys
@@ -365,10 +366,14 @@ def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
         env.reset()
 
 
-def test_async_environments_run_after_jax_ran_in_the_parent():
-    """Gymnasium's processes start from a server by default; a fork would hang."""
+def test_async_environments_run_after_jax_ran_in_the_parent(tmp_path):
+    """Gymnasium's processes start from a server by default; a fork would hang. The compiled
+    programs are cached where the commands cache them."""
+    (tmp_path / "bounce_mjx").mkdir()
+    (tmp_path / "bounce_mjx/jax").symlink_to(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     script = f"""
-import gymnasium, numpy as np, bounce_mjx
+import gymnasium, jax, numpy as np, bounce_mjx
 if __name__ == "__main__":
     single = gymnasium.make({ENV_ID!r})
     expected, _ = single.reset(seed=3)
@@ -377,9 +382,10 @@ if __name__ == "__main__":
     np.testing.assert_array_equal(observation[0], expected)
     envs.step(np.zeros((1, 6), np.float32))
     envs.close()
-    print("ran")
+    print(jax.config.jax_compilation_cache_dir)
 """
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
-    )
-    assert "ran" in done.stdout, done.stderr
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300,
+        env=environment | {"XDG_CACHE_HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert done.stdout == f"{tmp_path}/bounce_mjx/jax\n", done.stderr

@@ -4,7 +4,6 @@ algorithms train on it."""
 import gymnasium
 import numpy as np
 import pytest
-import stable_baselines3
 import torch
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
@@ -88,19 +87,30 @@ def test_attributes_and_methods_reach_single_environments(envs):
         Sb3VecEnv(2, frameskip=2)
 
 
+PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
+REPLAY_SETTINGS = {"learning_starts": 30, "batch_size": 16}
+
+
 @pytest.mark.parametrize(
-    "algorithm, settings",
+    "library, algorithm, settings",
     [
-        ("PPO", {"n_steps": 16, "batch_size": 24, "n_epochs": 1}),
-        ("SAC", {"learning_starts": 30, "batch_size": 16}),
+        ("stable_baselines3", "PPO", PPO_SETTINGS),
+        ("stable_baselines3", "A2C", {"n_steps": 16}),
+        ("stable_baselines3", "SAC", REPLAY_SETTINGS),
+        ("stable_baselines3", "TD3", REPLAY_SETTINGS),
+        ("stable_baselines3", "DDPG", REPLAY_SETTINGS),
+        ("sbx", "PPO", PPO_SETTINGS),
     ],
 )
-def test_algorithm_trains_and_loads(envs, algorithm, settings, tmp_path):
-    make = getattr(stable_baselines3, algorithm)
+def test_algorithm_trains_and_loads(envs, library, algorithm, settings, need, tmp_path):
+    make = getattr(need(library), algorithm)
     settings = settings | {"policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
     model = make("MlpPolicy", VecNormalize(envs), **settings)
+    start = envs.reset()
+    untrained, _ = model.predict(start, deterministic=True)
     model.learn(48 * NUM_ENVS)
     assert model.num_timesteps == 48 * NUM_ENVS
+    assert not np.array_equal(model.predict(start, deterministic=True)[0], untrained)
     # The statistics of the episodes, as Monitor gives them.
     assert len(model.ep_info_buffer) == NUM_ENVS
     model.save(tmp_path / "model")

@@ -1,9 +1,12 @@
 """train_torch.py: its files, which the rest of the package can use."""
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,13 +29,14 @@ from bounce_mjx.runs.config import load_config
 from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint, latest_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.env import BounceBall
+from bounce_mjx.training import command as training_command
 from tiny_runs import arrays
 
 SCRIPT = Path(__file__).parent.parent / "train_torch.py"
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
     "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
-    "--no-stop-when-solved --episode-seconds 0.2 --total-steps 256"
+    "--no-stop-when-solved --episode-seconds 0.2 --total-steps 256 --target-height-range .3 .8"
 ).split()
 
 
@@ -67,8 +71,7 @@ def compiled_once(tmp_path_factory) -> Iterator[None]:
 def train(log_dir: Path, library: str, *flags: str) -> Path:
     """The folder of a new run."""
     torch.set_num_threads(1)
-    height = ["--target-height-range", ".3", ".8"]
-    torch_train.main([*TINY, "--library", library, *height, "--log-dir", str(log_dir), *flags])
+    torch_train.main([*TINY, "--library", library, "--log-dir", str(log_dir), *flags])
     (folder,) = log_dir.iterdir()
     return folder
 
@@ -171,6 +174,39 @@ def test_resumed_run_is_the_same_as_an_uninterrupted_one(run, library, tmp_path)
     both = [json.loads((folder / "results.json").read_text()) for folder in (half, run)]
     assert both[0]["evaluations"] == both[1]["evaluations"]
     assert both[0]["results"] == both[1]["results"]
+
+
+def test_stopped_run_has_the_model_of_its_checkpoint(tmp_path, monkeypatch):
+    """It stops after an iteration, also when it was resumed; another run in the same folder gets no
+    model."""
+    (other := tmp_path / "2000-01-01").mkdir()
+    (other / "config.yaml").touch()
+    run_block = TorchTrainer.run
+
+    def stop(trainer: TorchTrainer, iterations, stopping):
+        os.kill(os.getpid(), signal.SIGTERM)
+        while not stopping():
+            time.sleep(0.01)
+        return run_block(trainer, iterations, stopping)
+
+    monkeypatch.setattr(TorchTrainer, "run", stop)
+    # The process would end there.
+    monkeypatch.setattr(training_command, "leave", sys.exit)
+    flags = [*TINY, "--block-steps", "128", "--log-dir", str(tmp_path)]
+    for steps in (64, 128):
+        with pytest.raises(SystemExit) as exit_info:
+            torch_train.main(flags)
+        assert exit_info.value.code == 0
+        (run,) = set(tmp_path.iterdir()) - {other}
+        model, state = torch.load(run / "model.pt"), arrays(latest_checkpoint(run))
+        assert latest_checkpoint(run).steps == steps and model["iter"] == steps // 64
+        weights = [name for name in state if re.match(r"modules\..*weight$", name)]
+        assert len(weights) == 4
+        for name in weights:
+            _, module, key = name.split(".", 2)
+            np.testing.assert_array_equal(model[f"{module}_state_dict"][key], state[name])
+        flags = ["--resume", str(run)]
+    assert [path.name for path in other.iterdir()] == ["config.yaml"]
 
 
 def test_a_seed_trains_as_if_alone_and_stays_diverged(run, library, tmp_path, monkeypatch, capfd):

@@ -117,6 +117,7 @@ def test_replay_page_moves_and_makes_no_requests(
     own = (tmp_path / "replay[lr].html").as_uri()
     watched = watch(own)
     watched.wait_for_motion(watched.wait_for_arm())
+    assert watched.page.title() == "bounce_mjx"
     assert own in watched.requests
     strangers = [url for url in watched.requests if url != own and not url.startswith("blob:null")]
     assert not strangers
@@ -172,6 +173,7 @@ def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
     watched = watch(address)
     page = watched.page
     watched.wait_for_motion(watched.wait_for_arm())
+    assert page.title().startswith("bounce_mjx: pretrained, ")
 
     # The panel shows the reward terms, and they change.
     terms = page.get_by_text("consecutive bounces").locator("xpath=..")

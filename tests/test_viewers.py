@@ -27,16 +27,16 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.commands import play, view
+from bounce_mjx.commands import play, train, view
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
-from bounce_mjx.viewers import native, offscreen, pace
+from bounce_mjx.viewers import browser, native, offscreen, pace, show
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
     Controller,
@@ -62,6 +62,7 @@ from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
+from tiny_runs import TINY
 
 GRAVITY = 9.81
 HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
@@ -352,6 +353,9 @@ def projected(points: np.ndarray, reward, aspect: float, on_phone: bool, offsets
     return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
 
 
+PICTURES = [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
+"""Width / height, whether a phone shows it, and the lowest part above the controls."""
+
 HOMES = {
     "default": (0.58856, 0.0, 0.05),
     "raised": (0.67, 0.0, 0.4),
@@ -362,9 +366,7 @@ HOMES = {
 
 @pytest.mark.parametrize("home", HOMES.values(), ids=HOMES)
 @pytest.mark.parametrize("number", [1, 2, 4, 16])
-@pytest.mark.parametrize(
-    ("aspect", "on_phone", "lowest"), [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
-)
+@pytest.mark.parametrize(("aspect", "on_phone", "lowest"), PICTURES)
 def test_the_camera_sees_every_robot(number: int, home, aspect, on_phone, lowest) -> None:
     """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
     x, y, z = home
@@ -375,6 +377,34 @@ def test_the_camera_sees_every_robot(number: int, home, aspect, on_phone, lowest
     points = (offsets[:, None] + parts).reshape(-1, 3)
     across, up = projected(points, reward, aspect, on_phone, offsets).T
     assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
+
+
+@pytest.mark.parametrize("number", [1, 2, 16])
+def test_labels_are_above_the_highest_target_and_in_the_picture(
+    env: BounceBall, recording: Frame, number: int
+) -> None:
+    frame = Frame(*(np.resize(values[0], (number, *values.shape[2:])) for values in recording))
+    names = ["A", "B"] if number == 2 else None
+    with open_server("127.0.0.1", 0) as server:
+        scene = Scene(server, env, number, names)
+        scene.update([frame._replace(target_height=np.full(number, 0.8))])
+        labels = np.array([label.position for label in scene._labels])
+        targets = scene._markers[TARGET_SITE].batched_positions
+        texts = [label.text for label in scene._labels]
+    np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
+    for aspect, on_phone, lowest in PICTURES:
+        offsets = scene_grid(number)
+        across, up = projected(labels, env.config.reward, aspect, on_phone, offsets).T
+        # Room for the text of a label.
+        assert np.all(np.abs(across) < 0.9) and np.all((lowest < up) & (up < 0.93))
+    assert (
+        texts[-1]
+        == {
+            1: "bounces 0   target 0.80 m",
+            2: "B:  bounces 0   target 0.80 m",
+            16: "16:  0",
+        }[number]
+    )
 
 
 # The clock
@@ -414,11 +444,14 @@ class Client:
         self._controls: dict[str, str] = {}
         self._labels: list[str] = []
         self.texts: list[str] = []
+        self.keys: list[str] = []
+        self.camera: dict[str, list[float]] = {}
+        self.download = b""
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
         while label not in self._controls:
-            self._receive()
+            self.receive()
         return self._controls[label]
 
     def press(self, label: str) -> None:
@@ -427,10 +460,11 @@ class Client:
 
     def labels(self) -> list[str]:
         """All texts of labels in the scene so far."""
-        self._receive()
+        self.receive()
         return self._labels
 
-    def _receive(self) -> None:
+    def receive(self) -> None:
+        """Reads the next messages of the server."""
         window = self._socket.recv(timeout=PATIENCE)
         length = int.from_bytes(window[8:16], "little")
         text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
@@ -438,6 +472,12 @@ class Client:
             props = message.get("props", {})
             if "label" in props:
                 self._controls[props["label"]] = message["uuid"]
+            if "hotkey" in props:
+                self.keys.append(props["hotkey"])
+            if message["type"].startswith("SetCamera"):
+                self.camera |= message
+            if message["type"] == "FileTransferPart":
+                self.download += message["content"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
             if "text" in updates:
@@ -529,6 +569,13 @@ def wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+def stands_still(did: dict[str, list]) -> bool:
+    """Whether the page makes no steps."""
+    before = len(did["target"])
+    time.sleep(0.3)
+    return len(did["target"]) == before
+
+
 HOSTILE = {
     "robots": (0, 40, HUGE, -HUGE, NAN, "many", [1], None),
     "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", {}),
@@ -568,7 +615,57 @@ def test_keys_act_as_in_the_window(page) -> None:
     wait_until(lambda: did["push"])
     np.testing.assert_allclose(did["push"][-1], (0.0, 0.0, 0.2))
     client.press("pause")
-    wait_until(lambda: len(did["target"]) == (time.sleep(0.3), len(did["target"]))[1])
+    wait_until(lambda: stands_still(did))
+    client.press("pause")
+
+
+def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
+    page, scripted: Simulation
+) -> None:
+    client, did = page
+    up = np.array([0.0, 0.0, 1.0])
+    position, gaze = camera_pose(np.zeros((1, 3)), scripted.env.config.reward)
+    for forward in (gaze - position, np.array([-1.0, 0.0, 0.0])):
+        pushes = len(did["push"])
+        client.set(client.control("towards"), "left")
+        wait_until(lambda pushes=pushes: len(did["push"]) > pushes)
+        left = np.cross(up, forward)
+        np.testing.assert_allclose(did["push"][-1], 0.2 * left / np.linalg.norm(left), atol=1e-6)
+        client.look(position=[1.0, 0.0, 0.0])
+    client.press("pause")
+    client.set(client.control("follow the ball"), True)
+
+    def has_arrived() -> bool:
+        client.receive()
+        return np.allclose(client.camera.get("look_at"), scripted.frame.ball[0], atol=1e-3)
+
+    wait_until(has_arrived)
+    forward = np.subtract(client.camera["look_at"], client.camera["position"])
+    np.testing.assert_allclose(forward, (-1.0, 0.0, 0.0), atol=1e-6)
+    client.press("pause")
+
+
+def test_the_last_seconds_are_saved_as_they_were_seen(
+    page, scripted: Simulation, monkeypatch
+) -> None:
+    client, did = page
+    saved = []
+
+    def replay(env: BounceBall, recording: Frame, names) -> str:
+        saved.append(recording)
+        return "<html>"
+
+    monkeypatch.setattr(browser, "replay", replay)
+    wait_until(lambda: len(did["target"]) > 20)
+    client.press("pause")
+    wait_until(lambda: stands_still(did))
+    client.set(client.control("save the last 10 s"), True)
+    while not client.download:
+        client.receive()
+    assert client.download == b"<html>"
+    (recording,) = saved
+    assert len(recording.ball) == len(did["target"]) and recording.ball.shape[1:] == (1, 3)
+    np.testing.assert_array_equal(recording.ball[-1, 0], scripted.frame.ball[0])
     client.press("pause")
 
 
@@ -622,7 +719,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
     wait_until(lambda: exchangeable.policy == 0.5)
     while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
-        client._receive()
+        client.receive()
     assert any("1 of 2 results met" in text for text in client.texts)
     # A page that fails leaves the training alone.
     stop.set()
@@ -630,6 +727,50 @@ def test_the_page_of_a_training_shows_its_newest_policy(
         lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
     )
     training.wait()
+
+
+def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
+    """The last line of a training names the command that shows its policy."""
+    told, shown = [], []
+
+    class Page:
+        def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
+            told.append(("served", host, port))
+
+        def block(self, steps: int, means: dict[str, float]) -> None:
+            told.append(("block", steps, means["speed/steps_per_second"] > 0.0))
+
+        def evaluation(self, steps: int, report: Report, policy) -> None:
+            told.append(("evaluation", steps, len(report.results)))
+            shown.append(policy)
+
+        def wait(self) -> None:
+            told.append(("ended",))
+
+    monkeypatch.setattr("bounce_mjx.viewers.watch.TrainingPage", Page)
+    # The process would end there.
+    monkeypatch.setattr(train, "leave", lambda status: None)
+    flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]
+    train.main([*TINY, *flags, "--watch", "--watch-port", "8123"])
+    assert told == [
+        ("served", "127.0.0.1", 8123),
+        ("block", 64, True),
+        ("block", 128, True),
+        ("evaluation", 128, 5),
+        ("ended",),
+    ]
+    (folder,) = tmp_path.iterdir()
+    saved = load_policy(latest_checkpoint(folder), load_run_config(folder))
+    jax.tree.map(np.testing.assert_array_equal, *shown, saved)
+    assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
+
+
+def test_the_legend_names_the_keys(page) -> None:
+    client, _ = page
+    client.control("push the ball right")
+    (legend,) = {text for text in client.texts if "green disc" in text}
+    named = "".join(re.findall(r"<b>(\w[ \w]*)</b>", legend)).replace(" ", "")
+    assert named == "spaceRTGMNIKJL" == "".join(client.keys)
 
 
 def test_a_title_is_not_markup(page) -> None:
@@ -921,6 +1062,31 @@ def test_a_dead_display_is_not_used(monkeypatch) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":987")
     assert sys.platform != "linux" or not native.has_display()
+
+
+def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> None:
+    """Only the task of robust draws its worlds, unless the command draws them."""
+
+    class Named:
+        def __init__(self, env, controller, num_envs, seed, ranges):
+            self.env, self.num_envs = env, num_envs
+
+    shown = []
+    monkeypatch.setattr(show, "Simulation", Named)
+    monkeypatch.setattr(
+        browser, "run_browser", lambda simulation, **given: shown.append((simulation, given))
+    )
+    both_play = "pretrained robust --viewer browser --num-envs 4".split()
+    play.main(both_play)
+    play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
+    (both, given), (drawn, _) = shown
+    assert [one.world for one in both._simulations] == [{}, {}]
+    assert [one.world for one in drawn._simulations] == [None, None]
+    assert given["names"] == ["A", "A", "B", "B"] and given["num_shown"] == both.num_envs == 4
+    assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", given["title"])
+    for simulation, name in zip(both._simulations, ("pretrained", "robust"), strict=True):
+        observation = load_run_config(pretrained_checkpoint(name).run).env.observation
+        assert simulation.env.config.observation == observation
 
 
 def test_a_video_shows_one_policy(fails, monkeypatch) -> None:

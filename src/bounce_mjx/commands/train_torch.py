@@ -1,24 +1,28 @@
 """Trains a policy with the PPO of a PyTorch library and writes a run's folder
 (`bounce-mjx train-torch`).
 
-At its end it writes the networks and the optimizer as `model.pt`, in the format of rsl_rl's runner.
+At its end, or when it is stopped, it writes the networks and the optimizer as `model.pt`, in the
+format of rsl_rl's runner.
 """
 
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
+    early_flag,
     path_flag,
     read_command,
     run_command,
 )
+from bounce_mjx.training.loop_fusion import join_loops
 
 if TYPE_CHECKING:
     from bounce_mjx.task.env import BounceBall
@@ -42,6 +46,7 @@ def main(args: Sequence[str] | None = None) -> None:
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
         if not asks_for_help(args):
+            join_loops(early_flag(args, "--physics"))
             with interruptible_imports():
                 from bounce_mjx.training import job  # noqa: F401
                 from bounce_mjx.training.setup import set_up_jax
@@ -64,14 +69,27 @@ def main(args: Sequence[str] | None = None) -> None:
             trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         except ImportError as error:
             raise UserError(str(error)) from error
-        made = []
+        made, others = [], set()
 
         def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":
             made.append(trainer.TorchTrainer(command.library, config, env))
+            # The job makes the run's folder next.
+            others.update(_runs(config.log_dir))
             return made[0]
 
-        outcomes = run_command(command, make_trainer, PROG)
+        def save_stopped() -> None:
+            from bounce_mjx.runs.folders import runs_of_seeds
+
+            if made[0].has_trained:
+                run = command.resume or min(_runs(command.log_dir) - others)
+                made[0].save_models(runs_of_seeds(run))
+
+        outcomes = run_command(command, make_trainer, PROG, stopped=save_stopped)
         made[0].save_models([outcome.run for outcome in outcomes])
+
+
+def _runs(log_dir: Path) -> set[Path]:
+    return {path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}")}
 
 
 if __name__ == "__main__":

@@ -111,10 +111,14 @@ def run_command(
     prog: str,
     watcher: "Watcher | None" = None,
     modules: Sequence[str] | None = None,
+    stopped: Callable[[], None] = lambda: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
 
-    The arguments after `prog`, and the errors, are those of `train`.
+    The other arguments after `prog`, and the errors, are those of `train`.
+
+    Args:
+      stopped: called at the end of a training that the user stopped, before the process ends.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -140,8 +144,9 @@ def run_command(
             watcher=watcher,
             modules=modules,
         )
-    except TrainingStopped as stopped:
-        say(console, str(stopped))
+    except TrainingStopped as stop:
+        say(console, str(stop))
+        stopped()
         # Does not wait for a compilation or an evaluation in another thread.
         leave(0)
     best = show(outcomes, console)

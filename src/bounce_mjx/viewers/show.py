@@ -77,6 +77,8 @@ def show(
 
     on_page = not recorded and viewer == "browser"
     title, names = shown[0].title, None
+    # Policies side by side are compared in one world.
+    is_drawn = all(one.config.randomization.terms for one in shown)
     if several:
         each = max(1, options.num_envs // len(shown))
         letters = string.ascii_uppercase[: len(shown)]
@@ -96,7 +98,7 @@ def show(
             Simulation, env, one.make_controller(env), num_envs, options.seed, ranges
         )
         simulation.target_height = target_height
-        simulation.world = None if config.randomization.terms else {}
+        simulation.world = None if is_drawn else {}
         return simulation
 
     with console.status("compiling"):

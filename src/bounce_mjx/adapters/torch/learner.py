@@ -13,6 +13,7 @@ from torch import nn
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.runs.files import PARTIAL
 
 State = dict[str, Any]
 
@@ -118,7 +119,8 @@ class Learner(abc.ABC):
 
     def save_model(self, path: Path) -> None:
         """Writes networks, optimizer and iteration in the format of rsl_rl's runner, whose `load`
-        reads the file of an rsl_rl learner."""
+        reads the file of an rsl_rl learner; a complete file replaces an older one."""
+        partial = path.with_name(path.name + PARTIAL)
         names = {f"{name}_state_dict": m.state_dict() for name, m in self._modules().items()}
         torch.save(
             names
@@ -127,8 +129,9 @@ class Learner(abc.ABC):
                 "iter": self.iteration,
                 "infos": None,
             },
-            path,
+            partial,
         )
+        partial.rename(path)
 
     @abc.abstractmethod
     def policy(self) -> Policy:

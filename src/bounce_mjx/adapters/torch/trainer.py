@@ -26,7 +26,8 @@ _LEARNERS = {"rsl_rl": "RslRlLearner", "skrl": "SkrlLearner"}
 
 
 class TorchTrainer:
-    """A library's PPO, which trains the seeds one after another; see `training.trainer.Trainer`."""
+    """A library's PPO, which trains the seeds in turn, an iteration each; see
+    `training.trainer.Trainer`."""
 
     checked = CHECKED
 
@@ -74,7 +75,12 @@ class TorchTrainer:
             learner.restore(one)
 
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
-        blocks = [summarize(learner.learn(iterations)) for learner in self.learners]
+        parts = []
+        for _ in range(iterations):
+            parts.append([learner.learn(1) for learner in self.learners])
+            if stopping():
+                break
+        blocks = [summarize(_joined(metrics)) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
@@ -85,6 +91,11 @@ class TorchTrainer:
         if len(snapshots) == 1:
             return snapshots[0]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
+
+    @property
+    def has_trained(self) -> bool:
+        """Whether the networks differ from the initial ones."""
+        return any(learner.iteration > 0 for learner in self.learners)
 
     def save_models(self, runs: Sequence[Path]) -> None:
         """Writes the last networks of each seed as `model.pt` into its run."""
@@ -120,6 +131,11 @@ def summarize(metrics: Metrics) -> Metrics:
     return own | {
         name: np.asarray(value) for name, value in jax.vmap(rollout_metrics)(steps).items()
     }
+
+
+def _joined(parts: Sequence[Metrics]) -> Metrics:
+    """The metrics of a learner's calls, one after another."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _learner_class(library: str) -> type[Learner]:
