@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
@@ -69,27 +69,17 @@ def main(args: Sequence[str] | None = None) -> None:
             trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         except ImportError as error:
             raise UserError(str(error)) from error
-        made, others = [], set()
+        made = []
 
         def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":
             made.append(trainer.TorchTrainer(command.library, config, env))
-            # The job makes the run's folder next.
-            others.update(_runs(config.log_dir))
             return made[0]
 
-        def save_stopped() -> None:
-            from bounce_mjx.runs.folders import runs_of_seeds
+        def save_models(runs: Sequence[Path]) -> None:
+            made[0].save_models(runs)
 
-            if made[0].has_trained:
-                run = command.resume or min(_runs(command.log_dir) - others)
-                made[0].save_models(runs_of_seeds(run))
-
-        outcomes = run_command(command, make_trainer, PROG, stopped=save_stopped)
-        made[0].save_models([outcome.run for outcome in outcomes])
-
-
-def _runs(log_dir: Path) -> set[Path]:
-    return {path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}")}
+        outcomes = run_command(command, make_trainer, PROG, stopped=save_models)
+        save_models([outcome.run for outcome in outcomes])
 
 
 if __name__ == "__main__":

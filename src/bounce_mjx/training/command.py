@@ -111,14 +111,15 @@ def run_command(
     prog: str,
     watcher: "Watcher | None" = None,
     modules: Sequence[str] | None = None,
-    stopped: Callable[[], None] = lambda: None,
+    stopped: Callable[[Sequence[Path]], None] = lambda runs: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
 
     The other arguments after `prog`, and the errors, are those of `train`.
 
     Args:
-      stopped: called at the end of a training that the user stopped, before the process ends.
+      stopped: called with the folders of the seeds of a training that the user stopped, before the
+        process ends; not if nothing was trained.
 
     Raises:
       UserError: see `train`; or a package that the command asks for is missing.
@@ -146,7 +147,8 @@ def run_command(
         )
     except TrainingStopped as stop:
         say(console, str(stop))
-        stopped()
+        if stop.runs:
+            stopped(stop.runs)
         # Does not wait for a compilation or an evaluation in another thread.
         leave(0)
     best = show(outcomes, console)

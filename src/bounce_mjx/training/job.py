@@ -80,6 +80,11 @@ class Outcome(NamedTuple):
 class TrainingStopped(Exception):
     """The user stopped the training; the text says how to continue."""
 
+    def __init__(self, text: str, runs: Sequence[Path] = ()):
+        super().__init__(text)
+        self.runs = runs
+        """Folders of the seeds; none if nothing was trained."""
+
 
 def train(
     config: TrainConfig,
@@ -357,9 +362,12 @@ class _Job:
         self.clock.lap("save")
         if stopping:
             hosts.disconnect()
-            raise TrainingStopped(f"stopped after {self.steps:,} steps; {self._go_on}")
+            raise self._stopped(f"stopped after {self.steps:,} steps; {self._go_on}")
         self._evaluate_best()
         hosts.disconnect()
+
+    def _stopped(self, text: str) -> TrainingStopped:
+        return TrainingStopped(text, [member.run for member in self.members])
 
     def outcomes(self) -> list[Outcome]:
         """The outcome of each seed."""
@@ -435,7 +443,7 @@ class _Job:
         reports = self._wait_for_reports(self.evaluators.final, policy)
         if reports is None:
             hosts.disconnect()
-            raise TrainingStopped(
+            raise self._stopped(
                 f"stopped after {self.steps:,} steps, before the final evaluation; {self._go_on}"
             )
         for member, report in zip(self.members, reports, strict=True):

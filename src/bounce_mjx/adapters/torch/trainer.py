@@ -92,11 +92,6 @@ class TorchTrainer:
             return snapshots[0]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
 
-    @property
-    def has_trained(self) -> bool:
-        """Whether the networks differ from the initial ones."""
-        return any(learner.iteration > 0 for learner in self.learners)
-
     def save_models(self, runs: Sequence[Path]) -> None:
         """Writes the last networks of each seed as `model.pt` into its run."""
         for learner, run in zip(self.learners, runs, strict=True):
