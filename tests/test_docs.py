@@ -420,16 +420,28 @@ def table_after(text: str, heading: str) -> list[list[str]]:
     return cells(re.search(r"(?:^\|.*\n)+", text.split(heading, 1)[1], re.MULTILINE)[0])
 
 
+START_KINDS = ("cold", "second")
+
+
+def in_seconds(times: list[float]) -> str:
+    """The range of some times, rounded."""
+    low, high = round(min(times)), round(max(times))
+    return f"{low} s" if low == high else f"{low} to {high} s"
+
+
 def test_figures_are_those_of_the_measurements() -> None:
     """Figures that several pages repeat, from the newest table of RESULTS.md."""
     results = (CHECKOUT / "benchmarks/RESULTS.md").read_text(encoding="utf-8")
     readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     starts = table_after(results, "measures cold and second starts by phase")
-    cold, second = (f"{float(row[6]):.0f} s" for row in starts)
+    cold, second = (
+        in_seconds([float(row[7]) for row in starts if row[1] == kind])
+        for kind in ("cold", "second")
+    )
     totals = [float(row[-1]) for row in table_after(results, "### 2-core CPU, 512 environments")]
     joined = table_after(results, "the two runs with joined loops had one full evaluation more")
     totals += [float(row[1]) for row in joined if row[0] == "cold, joined loops"]
-    on_cpu = f"{min(totals):.0f} to {max(totals):.0f} s"
+    on_cpu = in_seconds(totals)
     assert f"| {cold}, second start {second} | {on_cpu} |" in readme
     assert f"takes {on_cpu} on 2 cores" in content("quick-start.md")
     assert f"({cold} on an H200, {second} from the second start on)" in content("quick-start.md")

@@ -483,6 +483,22 @@ def test_gymnasium_records_the_statistics_of_the_vector_env(env):
     np.testing.assert_allclose(envs.length_queue, [length for _, length in expected])
 
 
+def test_the_ranges_of_the_randomisation_grow_over_the_warm_up():
+    """Episodes of five steps, a warm-up of ten: the drag of the third episodes is drawn from the
+    whole range."""
+    ranges = {"air_drag": (0.1, 0.2), "warmup_steps": 10 * NUM_ENVS}
+    task = BounceBall(EnvConfig(episode_seconds=0.05, randomization=ranges))
+    env = TorchVectorEnv(task, NUM_ENVS, critic_metrics=("world/air_drag",))
+    drag = [env.reset()[1]]
+    for _ in range(2):
+        for _ in range(5):
+            result = env.step(torch.zeros(NUM_ENVS, 6))
+        drag.append(result.critic_metrics)
+    for share, drawn in zip((0.0, 0.5, 1.0), drag, strict=True):
+        assert drawn.min() >= 0.1 * share - 1e-6 and drawn.max() <= 0.2 * share + 1e-6
+    assert len(drag[2].unique()) == NUM_ENVS
+
+
 # Networks
 
 
