@@ -546,9 +546,10 @@ def test_a_second_start_compiles_nothing(tmp_path: Path, monkeypatch: pytest.Mon
     assert again == hits == requests - 3 and traced == []
     np.testing.assert_equal(trained_again, trained)
 
-    # A damaged file and a lost one: JAX has both programs in its own cache.
+    # A damaged file, and one that another user may have written, are not read. JAX has both
+    # programs in its own cache.
     (folder / "train").write_bytes(b"damaged")
-    (folder / "evaluate").unlink()
+    (folder / "evaluate").chmod(0o666)
     again, hits, traced, trained_again = start("third")
     assert again == hits == requests - 1 and traced == ["evaluate", "train_block"]
     np.testing.assert_equal(trained_again, trained)

@@ -3,6 +3,9 @@
 JAX's compilation cache saves XLA's work, but each process still traces and lowers a program to find
 its entry there. The key here needs no tracing: it is a hash of everything that the programs of a
 training are made of.
+
+A compiled program is code. Like the files of JAX's own cache, these files therefore stay in the
+user's cache, and only files that no other user can write are read.
 """
 
 import concurrent.futures
@@ -96,6 +99,7 @@ class Programs:
             content = pickle.dumps((modules, serialize_executable.serialize(compiled)))
             self._folder.mkdir(parents=True, exist_ok=True)
             partial = self._folder / f"{name}.{os.getpid()}.partial"
+            partial.touch(mode=0o600)
             partial.write_bytes(hashlib.sha256(content).digest() + content)
             partial.rename(self._folder / name)
             _remove_oldest(self._folder.parent)
@@ -141,7 +145,11 @@ def kept_programs(
 
 
 def _load(path: Path, mesh: Mesh) -> jax.stages.Compiled:
-    content = path.read_bytes()
+    with path.open("rb") as file:
+        status = os.fstat(file.fileno())
+        if status.st_uid != os.getuid() or status.st_mode & 0o022:
+            raise ValueError("another user may have written the file")
+        content = file.read()
     digest, content = content[:_HASH_BYTES], content[_HASH_BYTES:]
     if hashlib.sha256(content).digest() != digest:
         raise ValueError("the file is damaged")
