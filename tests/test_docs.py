@@ -420,9 +420,6 @@ def table_after(text: str, heading: str) -> list[list[str]]:
     return cells(re.search(r"(?:^\|.*\n)+", text.split(heading, 1)[1], re.MULTILINE)[0])
 
 
-START_KINDS = ("cold", "second")
-
-
 def in_seconds(times: list[float]) -> str:
     """The range of some times, rounded."""
     low, high = round(min(times)), round(max(times))

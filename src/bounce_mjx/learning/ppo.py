@@ -222,19 +222,13 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         columns = [metrics[name][:, None] for name in critic_metrics]
         return jnp.concatenate([observation, *columns], axis=-1)
 
-    def ranges_at(iteration: jax.Array) -> Any:
-        """Ranges of the randomisation, which grow over its warm-up; None without one."""
-        warmup_steps = getattr(env, "warmup_steps", 0)
-        if not warmup_steps:
-            return None
-        return env.ranges(jnp.minimum(1.0, iteration * (config.batch_steps / warmup_steps)))
-
     def init(key: jax.Array) -> TrainingState:
         key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
         params = Params(
             networks.policy_network.init(policy_key), networks.value_network.init(value_key)
         )
-        env_state = vector.reset(env, env_key, config.num_envs, ranges_at(jnp.int32(0)))
+        ranges = vector.ranges_after(env, jnp.int32(0), config.batch_steps)
+        env_state = vector.reset(env, env_key, config.num_envs, ranges)
         # With equal clocks, all episodes would time out together.
         clock = jax.random.randint(clock_key, (config.num_envs,), 0, episode_steps)
         return TrainingState(
@@ -286,7 +280,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         # All numbers are drawn at once, because on a GPU each draw costs a kernel or two.
         shape = (config.rollout_length, config.num_envs, env.action_size)
         noise = jax.random.normal(noise_key, shape)
-        ranges = ranges_at(state.iteration)
+        ranges = vector.ranges_after(env, state.iteration, config.batch_steps)
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
         )

@@ -73,13 +73,27 @@ def first_states(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) ->
     )
 
 
+def ranges_after(env: Env, count: jax.Array | None, steps_each: int) -> Any:
+    """Ranges of the randomisation after `count` [] times `steps_each` environment steps, which grow
+    over its warm-up; None, the environment's own, without one."""
+    warmup_steps = getattr(env, "warmup_steps", 0)
+    if not warmup_steps:
+        return None
+    return env.ranges(jnp.minimum(1.0, count * (steps_each / warmup_steps)))
+
+
 def observe(state: VectorState) -> jax.Array:
     """Observations [B, N]."""
     return state.env.obs.T
 
 
 def step(
-    env: Env, state: VectorState, action: jax.Array, key: jax.Array, episode_steps: int
+    env: Env,
+    state: VectorState,
+    action: jax.Array,
+    key: jax.Array,
+    episode_steps: int,
+    ranges: Any = None,
 ) -> tuple[VectorState, StepResult]:
     """Advances every environment, and resets every ended episode with a new draw.
 
@@ -87,8 +101,9 @@ def step(
       action: [B, A].
       key: consumed by the resets.
       episode_steps: time limit of an episode in steps.
+      ranges: ranges of the randomisation; None for the environment's own.
     """
-    fresh = first_states(env, key, state.clock.shape[0])
+    fresh = first_states(env, key, state.clock.shape[0], ranges)
     return step_with(env, state, action, fresh, episode_steps)
 
 

@@ -30,6 +30,7 @@ from jax.sharding import Mesh
 
 import bounce_mjx
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.files import PARTIAL
 
 _NOT_COMPILED = ("seed", "eval_seed", "total_steps", "eval_every", "stop_when_solved", "log_dir")
 _VARIABLES = ("BOUNCE_MJX_", "CUDA_", "JAX_", "NVIDIA_", "XLA_")
@@ -84,11 +85,11 @@ class Programs:
 
     def _compile(self, name: str, lower: Callable[[], jax.stages.Lowered]) -> jax.stages.Compiled:
         lowered = lower()
-        hits = _cache_hits()
+        hits = _hits.count
         compiled = lowered.compile()
         # A program that JAX has read from its own cache cannot be written again: the copy lacks
         # functions on a CPU.
-        if self._folder is not None and _cache_hits() == hits:
+        if self._folder is not None and _hits.count == hits:
             self._pool.submit(self._keep, name, compiled)
         return compiled
 
@@ -98,7 +99,7 @@ class Programs:
             modules = [module for module in list(sys.modules) if module.startswith("jax")]
             content = pickle.dumps((modules, serialize_executable.serialize(compiled)))
             self._folder.mkdir(parents=True, exist_ok=True)
-            partial = self._folder / f"{name}.{os.getpid()}.partial"
+            partial = self._folder / f"{name}.{os.getpid()}{PARTIAL}"
             partial.touch(mode=0o600)
             partial.write_bytes(hashlib.sha256(content).digest() + content)
             partial.rename(self._folder / name)
@@ -189,10 +190,6 @@ class _Hits(threading.local):
 
 _hits = _Hits()
 jax.monitoring.register_event_listener(_hits.listen)
-
-
-def _cache_hits() -> int:
-    return _hits.count
 
 
 def _cpu_features() -> str:

@@ -210,7 +210,8 @@ class TorchVectorEnv:
     def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
         steps = jnp.int32(0) if self.env.warmup_steps else None
-        state = vector.reset(self.env, reset_key, self.num_envs, self._ranges(steps))
+        ranges = vector.ranges_after(self.env, steps, self.num_envs)
+        state = vector.reset(self.env, reset_key, self.num_envs, ranges)
         return (
             _Carried(_slim(state), key, steps),
             vector.observe(state),
@@ -234,8 +235,8 @@ class TorchVectorEnv:
         key, reset_key = jax.random.split(carried.key)
         state = _whole(carried.vector, self._template)
         steps = None if carried.steps is None else carried.steps + 1
-        fresh = vector.first_states(self.env, reset_key, self.num_envs, self._ranges(steps))
-        state, result = vector.step_with(self.env, state, action, fresh, self.episode_steps)
+        ranges = vector.ranges_after(self.env, steps, self.num_envs)
+        state, result = vector.step(self.env, state, action, reset_key, self.episode_steps, ranges)
         arrays = _StepArrays(
             observation=result.observation,
             critic_metrics=self._critic_metrics(state.env.metrics),
@@ -247,13 +248,6 @@ class TorchVectorEnv:
             done=result.terminated | result.truncated,
         )
         return _Carried(_slim(state), key, steps), arrays, step_metrics(result, groups=1)
-
-    def _ranges(self, steps: jax.Array | None) -> Any:
-        """Ranges of the randomisation after so many steps, which grow over its warm-up; None for
-        the environment's own."""
-        if steps is None:
-            return None
-        return self.env.ranges(jnp.minimum(1.0, steps * (self.num_envs / self.env.warmup_steps)))
 
     def _critic_metrics(self, metrics: dict[str, jax.Array]) -> jax.Array:
         """The critic metrics [B, K]."""
