@@ -8,9 +8,13 @@ import os
 import time
 from pathlib import Path
 
-import jax
-
 from bounce_mjx.commands.train import main
+from bounce_mjx.training.loop_fusion import join_loops
+
+# Before JAX is imported, as the command itself does it.
+join_loops()
+
+import jax  # noqa: E402
 
 events: list[tuple[str, float, float]] = []
 jax.monitoring.register_event_duration_secs_listener(

@@ -436,8 +436,6 @@ def test_figures_are_those_of_the_measurements() -> None:
         for kind in ("cold", "second")
     )
     totals = [float(row[-1]) for row in table_after(results, "### 2-core CPU, 512 environments")]
-    joined = table_after(results, "the two runs with joined loops had one full evaluation more")
-    totals += [float(row[1]) for row in joined if row[0].startswith("cold, joined loops")]
     on_cpu = in_seconds(totals)
     assert f"| {cold}, second start {second} | {on_cpu} |" in readme
     assert f"takes {on_cpu} on 2 cores" in content("quick-start.md")

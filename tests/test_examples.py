@@ -48,12 +48,15 @@ TRAINED = """
 import json, sys
 from tensorboardX import SummaryWriter
 from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.command import TrainingCommand, config_of, read_command
 
 config = config_of(read_command(TrainingCommand, sys.argv[1:], prog="train", description=""))
+layers = {"hidden_layers": load_run_config(pretrained_checkpoint().run).ppo.hidden_layers}
+config = config.model_copy(update={"ppo": config.ppo.model_copy(update=layers)})
 run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())
 writer = CheckpointWriter(run, config)
 writer.save(("best",), 64, load_policy(pretrained_checkpoint(), config), results=results)

@@ -1,6 +1,9 @@
 """The GPU kernel of a minibatch, in Pallas' interpreter, against autodiff of PPO's loss."""
 
 import math
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +11,10 @@ import numpy as np
 import pytest
 from jax.experimental.pallas import mosaic_gpu as plgpu
 
+from bounce_mjx.gpu.block_sums import block_sums, num_chunks
 from bounce_mjx.learning import minibatch_kernel
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.minibatch_kernel import Batch, PackedParams
+from bounce_mjx.learning.minibatch_kernel import Batch, PackedParams, Sizes
 from bounce_mjx.learning.policy import make_networks
 
 NUM_OBSERVATIONS, NUM_CRITIC_INPUTS, NUM_ACTIONS = 29, 30, 6
@@ -23,6 +27,7 @@ CONFIG = PPOConfig(
     value_cost=0.7,
     entropy_cost=0.01,
 )
+SIZES = Sizes(NUM_OBSERVATIONS, NUM_ACTIONS)
 NUM_SAMPLES = CONFIG.batch_steps // CONFIG.num_minibatches
 
 
@@ -90,7 +95,7 @@ def expected_loss(params, networks, samples: dict[str, jax.Array]):
 
 def test_packing_is_undone_and_pads_with_zeros():
     _, params = random_params(jax.random.PRNGKey(0))
-    gradients = minibatch_kernel.kernel_gradients(CONFIG, NUM_ACTIONS, params)
+    gradients = minibatch_kernel.kernel_gradients(CONFIG, SIZES, params)
     packed = gradients.pack(params)
     for ours, theirs in zip(
         jax.tree.leaves(gradients.unpack(packed)), jax.tree.leaves(params), strict=True
@@ -98,12 +103,13 @@ def test_packing_is_undone_and_pads_with_zeros():
         np.testing.assert_array_equal(ours, theirs)
     squares = [sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(t)) for t in (packed, params)]
     assert squares[0] == pytest.approx(squares[1], rel=1e-6)
-    ones = minibatch_kernel.pack(jax.tree.map(jnp.ones_like, params))
-    for mask, one in zip(minibatch_kernel.parameter_mask(params), ones, strict=True):
-        np.testing.assert_array_equal(mask, one > 0.0)
 
 
-def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch):
+@pytest.mark.parametrize("multiprocessors", [4, 2])
+def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch, multiprocessors):
+    """With two multiprocessors, each network has one block, which takes two tiles."""
+    monkeypatch.setattr(minibatch_kernel, "_MULTIPROCESSORS", multiprocessors)
+    minibatch_kernel._batched_call.cache_clear()
     networks, params = random_params(jax.random.PRNGKey(0))
     samples = random_samples(jax.random.PRNGKey(1), networks, params)
     monkeypatch.setattr(
@@ -111,7 +117,7 @@ def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch)
         "loss_gradient",
         lambda *args, plain=minibatch_kernel.loss_gradient: plain(*args, interpret=interpret),
     )
-    gradients = minibatch_kernel.kernel_gradients(CONFIG, NUM_ACTIONS, params)
+    gradients = minibatch_kernel.kernel_gradients(CONFIG, SIZES, params)
     ones = jnp.ones((*samples["inputs"].shape[:2], 1))
     padding = jnp.zeros((*samples["inputs"].shape[:2], 63 - NUM_CRITIC_INPUTS))
     batch = Batch(
@@ -131,6 +137,8 @@ def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch)
         # limit.
         error = float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b))
         assert error < 0.05, jax.tree_util.keystr(path)
+    norm = math.sqrt(sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(theirs)))
+    expected |= {"loss/gradient_norm": norm}
     assert metrics.keys() == expected.keys()
     for name, value in expected.items():
         assert float(metrics[name]) == pytest.approx(float(value), rel=0.02, abs=1e-3), name
@@ -144,7 +152,7 @@ def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch)
 def test_shuffling_keeps_samples_together():
     """Each sample's numbers stay together, and the minibatches follow the order."""
     _, params = random_params(jax.random.PRNGKey(0))
-    gradients = minibatch_kernel.kernel_gradients(CONFIG, NUM_ACTIONS, params)
+    gradients = minibatch_kernel.kernel_gradients(CONFIG, SIZES, params)
     groups, size = 4, CONFIG.batch_steps // 4
     number = jnp.arange(groups * size, dtype=jnp.float32).reshape(groups, size)
 
@@ -188,7 +196,8 @@ def test_the_kernel_supports_these_trainings(changes, supported):
 
 
 def test_the_kernel_is_lowered_for_a_gpu():
-    """This needs no GPU: the program has one kernel per minibatch, for one seed and for several."""
+    """This needs no GPU: the program has two kernels per minibatch, for one seed and for
+    several: the gradients of its parts, and their sum."""
     _, params = random_params(jax.random.PRNGKey(0))
     packed = minibatch_kernel.pack(params)
     shape = (CONFIG.num_minibatches, NUM_SAMPLES)
@@ -198,7 +207,7 @@ def test_the_kernel_is_lowered_for_a_gpu():
 
     def gradient(packed: PackedParams, batch: Batch, index: jax.Array):
         low = minibatch_kernel.low_precision(packed)
-        return minibatch_kernel.loss_gradient(CONFIG, NUM_ACTIONS, packed, low, batch, index)
+        return minibatch_kernel.loss_gradient(CONFIG, SIZES, packed, low, batch, index)
 
     two = jax.tree.map(lambda x: jnp.stack([x, x]), (packed, batch, jnp.int32(0)))
     for program, args in (
@@ -206,4 +215,60 @@ def test_the_kernel_is_lowered_for_a_gpu():
         (jax.vmap(gradient), two),
     ):
         lowered = jax.jit(program).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
-        assert lowered.count("custom_call @mosaic_gpu") == 1
+        assert lowered.count("custom_call @mosaic_gpu") == 2
+
+
+def test_parts_and_squares_are_summed(interpret):
+    """Numbers of blocks that are and are not a multiple of those read ahead, and both chunks."""
+    random = np.random.default_rng(0)
+    arrays = [
+        random.normal(size=(2, blocks, size)).astype(np.float32)
+        for blocks, size in ((16, 1024), (6, 384), (11, 128))
+    ]
+    sums, squares = block_sums([jnp.asarray(x) for x in arrays], interpret)
+    expected = [x.astype(np.float64).sum(axis=1) for x in arrays]
+    for ours, theirs in zip(sums, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)
+    chunks = [num_chunks(x.shape[2]) for x in arrays]
+    assert squares.shape == (2, sum(chunks))
+    for part, total in zip(np.split(squares, np.cumsum(chunks)[:-1], 1), expected, strict=True):
+        np.testing.assert_allclose(part.sum(axis=1), (total**2).sum(axis=1), rtol=1e-5)
+
+
+_TWO_DEVICES = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
+from bounce_mjx.learning import minibatch_kernel
+from bounce_mjx.learning.config import PPOConfig
+
+config = PPOConfig(
+    num_envs=64, num_minibatches=2, hidden_layers=(64, 64), compute_dtype="bfloat16"
+)
+mesh = Mesh(np.array(jax.devices()), ("devices",))
+
+def shape(*sizes, dtype=jnp.float32, spec=P()):
+    return jax.ShapeDtypeStruct(sizes, dtype, sharding=NamedSharding(mesh, spec))
+
+batch = minibatch_kernel.Batch(
+    shape(2, 1024, 64, dtype=jnp.bfloat16, spec=P(None, "devices")),
+    shape(2, 1024, 16, spec=P(None, "devices")),
+    shape(2, 3, 1024, spec=P(None, None, "devices")),
+)
+params = minibatch_kernel.PackedParams(shape(2, 136, 64), shape(2, 72, 16))
+low = minibatch_kernel.PackedParams(*(shape(*x.shape, dtype=jnp.bfloat16) for x in params))
+gradient = jax.jit(
+    lambda *args: minibatch_kernel.loss_gradient(config, minibatch_kernel.Sizes(29, 6), *args)
+)
+index = shape(dtype=jnp.int32)
+lowered = gradient.trace(params, low, batch, index).lower(lowering_platforms=("cuda",)).as_text()
+assert lowered.count("@CustomSPMDPartitioning") == 1, lowered
+"""
+
+
+def test_the_kernel_is_lowered_for_two_gpus():
+    """The compiler accepts the rule by which two devices share the samples of a minibatch."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", _TWO_DEVICES], env=os.environ | flags, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -442,6 +442,15 @@ def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
         np.testing.assert_allclose(chosen_metrics["reward"], metrics["reward"], rtol=1e-3)
 
 
+def test_the_weights_of_several_seeds_are_not_factorised_in_one_batch(trainer):
+    """With two threads, two batched QR factorisations of jaxlib can wait for each other forever."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    program = jax.jit(ppo.population(trainer).init).lower(keys).as_text()
+    factorisations = [line for line in program.splitlines() if "geqrf" in line]
+    assert factorisations
+    assert all('num_batch_dims = "0"' in line for line in factorisations)
+
+
 class FaultyBall(BounceBall):
     """An environment whose physics fails in about half of the instances as soon as the ball
     falls."""

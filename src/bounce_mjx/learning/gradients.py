@@ -22,4 +22,4 @@ class MinibatchGradients(NamedTuple):
     [M] of their advantages) -> data of the epoch."""
     gradient: Callable[[Any, Any, Any, jax.Array], tuple[Any, dict[str, jax.Array]]]
     """(P, its copies, data of the epoch, index of the minibatch [], int32) -> gradient in the form
-    P, metrics []."""
+    P, metrics [] with the norm of the gradient, "loss/gradient_norm"."""

@@ -184,9 +184,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     num_inputs = env.observation_size + len(critic_metrics)
     networks = make_networks(config, env.observation_size, env.action_size, len(critic_metrics))
     groups = num_groups(config)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
-    )
+    optimizer = optax.chain(_clip_by_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
 
     casts = config.compute_dtype != "float32"
 
@@ -222,11 +220,17 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         columns = [metrics[name][:, None] for name in critic_metrics]
         return jnp.concatenate([observation, *columns], axis=-1)
 
-    def init(key: jax.Array) -> TrainingState:
-        key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
-        params = Params(
+    # Not batched over seeds: jaxlib's batched QR factorisation, from which orthogonal weights come,
+    # may wait for ever on a CPU, because its parts wait for threads that wait for other parts.
+    @jax.custom_batching.sequential_vmap
+    def first_params(policy_key: jax.Array, value_key: jax.Array) -> Params:
+        return Params(
             networks.policy_network.init(policy_key), networks.value_network.init(value_key)
         )
+
+    def init(key: jax.Array) -> TrainingState:
+        key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
+        params = first_params(policy_key, value_key)
         ranges = vector.ranges_after(env, jnp.int32(0), config.batch_steps)
         env_state = vector.reset(env, env_key, config.num_envs, ranges)
         # With equal clocks, all episodes would time out together.
@@ -381,7 +385,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             order, mean, deviation = (x[index] for x in minibatches)
             batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
             batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
-            return jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(flat_params)
+            gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
+                flat_params
+            )
+            return gradient, metrics | {"loss/gradient_norm": optax.tree.norm(gradient)}
 
         return MinibatchGradients(
             lambda x: ravel_pytree(x)[0], unravel, lambda _: (), shuffle, gradient
@@ -389,7 +396,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def make_gradients(params: Params) -> MinibatchGradients:
         if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
-            return minibatch_kernel.kernel_gradients(config, env.action_size, params)
+            sizes = minibatch_kernel.Sizes(env.observation_size, env.action_size)
+            return minibatch_kernel.kernel_gradients(config, sizes, params)
         return xla_gradients(ravel_pytree(params)[1])
 
     def update(state: TrainingState, samples: Samples, key: jax.Array):
@@ -412,13 +420,13 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             def step(index, carry):
                 (params, copies, optimizer_state, learning_rate), all_metrics = carry
                 gradient, metrics = gradients.gradient(params, copies, shuffled, index)
-                direction, optimizer_state = optimizer.update(gradient, optimizer_state, params)
+                direction, optimizer_state = optimizer.update(
+                    gradient, optimizer_state, params, norm=metrics["loss/gradient_norm"]
+                )
                 params = jax.tree.map(lambda x, d: x - learning_rate * d, params, direction)
                 learning_rate = adapt_learning_rate(
                     config, learning_rate, metrics["policy/kl"], limit
                 )
-                squares = [jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradient)]
-                metrics["loss/gradient_norm"] = jnp.sqrt(sum(squares))
                 row = jnp.stack([metrics[name] for name in _MINIBATCH_METRICS])
                 carry = params, gradients.copy(params), optimizer_state, learning_rate
                 return carry, all_metrics.at[index].set(row)
@@ -517,6 +525,19 @@ def group_sequences(x: jax.Array, groups: int) -> jax.Array:
     """Deals the steps [T, B, ...] of environments into groups of sequences [G, B / G, T, ...]."""
     length, batch, *rest = x.shape
     return jnp.moveaxis(x, 0, 1).reshape((groups, batch // groups, length, *rest))
+
+
+def _clip_by_norm(max_norm: float) -> optax.GradientTransformationExtraArgs:
+    """`optax.clip_by_global_norm` for a norm that is already known, with the same state."""
+
+    def update(gradient: Any, state: Any, params: Any = None, *, norm: jax.Array):
+        del params
+        clipped = jax.tree.map(
+            lambda x: jnp.where(norm < max_norm, x, x / norm * max_norm), gradient
+        )
+        return clipped, state
+
+    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
 
 
 def _transposed(memory: Memory) -> Memory:

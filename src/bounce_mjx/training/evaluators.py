@@ -1,6 +1,9 @@
 """The compiled evaluations of a training's policies."""
 
+import concurrent.futures
 import dataclasses
+import functools
+import os
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -50,6 +53,7 @@ class Evaluators:
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
+        self._mesh = mesh
         self._program = programs.get("evaluate", mesh, self._lower)
 
     def wait(self) -> None:
@@ -104,15 +108,29 @@ class Evaluators:
         )
         return program.lower(policy_shapes(config, env), np.uint32(0), np.int32(0))
 
+    @functools.cached_property
+    def _threads(self) -> int:
+        """Number of chunks that run at the same time. On a CPU a chunk uses one core, and XLA runs
+        the programs that one thread starts one after another."""
+        if self._mesh.size > 1 or self._mesh.devices.flat[0].platform != "cpu":
+            return 1
+        # In jaxlib, two batched calls of LAPACK may wait for each other for ever.
+        return 1 if "lapack" in self._program.result().as_text() else os.cpu_count() or 1
+
     def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
         config, program = self._config, self._program.result()
         first = config.eval_episodes if screening else 0
         episodes = config.screening_episodes if screening else config.eval_episodes
         on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
-        chunks = [
-            program(on_devices, np.uint32(seed), np.int32(first + start))
-            for start in range(0, episodes, self._chunk)
-        ]
+
+        def evaluate(start: int):
+            chunk = program(on_devices, np.uint32(seed), np.int32(first + start))
+            # Otherwise one thread would start all of them at once.
+            return jax.block_until_ready(chunk)
+
+        starts = range(0, episodes, self._chunk)
+        with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
+            chunks = list(pool.map(evaluate, starts))
         statistics = _joined([statistics for statistics, _ in chunks], episodes)
         if config.num_seeds == 1:
             recorded = min(RECORDED_EPISODES, episodes)
