@@ -1,6 +1,8 @@
 """Networks, distribution and normalisation: against brax's implementations, and property by
 property."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from brax.training.distribution import NormalDistribution
 
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.networks import orthogonal
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import (
     MAX_NORMALIZED,
@@ -115,14 +118,25 @@ def brax_networks(config):
     )
 
 
+@pytest.mark.parametrize("shape", [(29, 64), (64, 6), (48, 48), (256, 255)])
+def test_orthogonal_weights_are_those_of_a_qr_factorisation(shape):
+    key = jax.random.PRNGKey(4)
+    weights = jax.jit(orthogonal(1.5), static_argnums=1)(key, shape)
+    expected = jax.nn.initializers.orthogonal(1.5)(key, shape)
+    np.testing.assert_allclose(weights, expected, atol=2e-4)
+    gram = weights.T @ weights if shape[0] >= shape[1] else weights @ weights.T
+    np.testing.assert_allclose(gram, 1.5**2 * np.eye(min(shape)), atol=1e-5)
+
+
 @pytest.mark.parametrize("which", ["policy_network", "value_network"])
 def test_networks_equal_brax(which, config, brax_networks, seen):
-    """The same key gives the same parameters, by name and value, and the same outputs."""
+    """The same key gives the same parameters, by name and value, and the same outputs; brax takes
+    its weights from a QR factorisation."""
     ours, theirs = getattr(make_networks(config, N, 6, 2), which), getattr(brax_networks, which)
     key = jax.random.PRNGKey(3)
     params, expected = ours.init(key), theirs.init(key)
     assert jax.tree.structure(params) == jax.tree.structure(expected)
-    jax.tree.map(np.testing.assert_array_equal, params, expected)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=2e-6), params, expected)
     # Different parameters from the initial ones, whose biases are 0.
     params = jax.tree.map(lambda x: x + 0.1, params)
     inputs = seen[:50] if which == "policy_network" else np.tile(seen[:50, :1], N + 2)

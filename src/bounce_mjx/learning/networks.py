@@ -6,6 +6,8 @@ change.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,33 @@ from bounce_mjx.learning.gaussian import Gaussian
 _GAIN = math.sqrt(2.0)
 # A small gain, so that the first mean actions are near 0.
 _MEAN_GAIN = 0.01
+
+
+def orthogonal(gain: float) -> Callable[..., jax.Array]:
+    """An initialiser (key, shape [N, M], type) -> weights [N, M] with orthogonal columns (rows if
+    M > N), all of the norm `gain` (Saxe et al. 2014).
+
+    The weights are those of `jax.nn.initializers.orthogonal` up to rounding, but come from Gram and
+    Schmidt's method, applied twice (Giraud et al. 2005), instead of LAPACK or cuSOLVER: these
+    libraries take longer to load than the weights to compute, and batched calls of jaxlib's LAPACK
+    may wait for each other for ever.
+    """
+
+    def init(key: jax.Array, shape: tuple[int, int], dtype: Any = jnp.float32) -> jax.Array:
+        size = max(shape), min(shape)
+        numbers = jax.random.normal(key, size, dtype)
+
+        def add_column(index: jax.Array, columns: jax.Array) -> jax.Array:
+            column = numbers[:, index]
+            for _ in range(2):
+                parts = jnp.sum(columns * column[:, None], axis=0)
+                column = column - jnp.sum(columns * parts, axis=1)
+            return columns.at[:, index].set(column / jnp.linalg.norm(column))
+
+        columns = jax.lax.fori_loop(0, size[1], add_column, jnp.zeros(size, dtype))
+        return gain * (columns if shape == size else columns.T)
+
+    return init
 
 
 class MLP(nn.Module):
@@ -30,10 +59,7 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs [..., widths[-1]] for inputs [..., N]."""
         for i, width in enumerate(self.widths):
-            dense = nn.Dense(
-                width, kernel_init=nn.initializers.orthogonal(_GAIN), name=f"hidden_{i}"
-            )
-            x = dense(x)
+            x = nn.Dense(width, kernel_init=orthogonal(_GAIN), name=f"hidden_{i}")(x)
             if self.activate_final or i + 1 < len(self.widths):
                 x = nn.silu(x)
         return x
@@ -64,7 +90,7 @@ class PolicyNetwork(nn.Module):
     def __call__(self, observation: jax.Array) -> Gaussian:
         """Distribution of the action [..., A] for normalised observations [..., N]."""
         hidden = MLP(self.hidden_layers, activate_final=True)(observation)
-        mean_init = nn.initializers.orthogonal(_MEAN_GAIN)
+        mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
         return Gaussian(mean, jnp.broadcast_to(std, mean.shape))
@@ -83,8 +109,10 @@ class RecurrentPolicyNetwork(nn.Module):
         """Distribution of the action [..., A] and the next memory [..., H], for normalised
         observations [..., N] and the memory [..., H] of the observations before."""
         hidden = MLP(self.hidden_layers, activate_final=True)(observation)
-        memory, output = nn.GRUCell(self.gru_size, name="gru")(memory, hidden)
-        mean_init = nn.initializers.orthogonal(_MEAN_GAIN)
+        memory, output = nn.GRUCell(
+            self.gru_size, recurrent_kernel_init=orthogonal(1.0), name="gru"
+        )(memory, hidden)
+        mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(output)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
         return Gaussian(mean, jnp.broadcast_to(std, mean.shape)), memory

@@ -220,17 +220,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         columns = [metrics[name][:, None] for name in critic_metrics]
         return jnp.concatenate([observation, *columns], axis=-1)
 
-    # Not batched over seeds: jaxlib's batched QR factorisation, from which orthogonal weights come,
-    # may wait for ever on a CPU, because its parts wait for threads that wait for other parts.
-    @jax.custom_batching.sequential_vmap
-    def first_params(policy_key: jax.Array, value_key: jax.Array) -> Params:
-        return Params(
-            networks.policy_network.init(policy_key), networks.value_network.init(value_key)
-        )
-
     def init(key: jax.Array) -> TrainingState:
         key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
-        params = first_params(policy_key, value_key)
+        params = Params(
+            networks.policy_network.init(policy_key), networks.value_network.init(value_key)
+        )
         ranges = vector.ranges_after(env, jnp.int32(0), config.batch_steps)
         env_state = vector.reset(env, env_key, config.num_envs, ranges)
         # With equal clocks, all episodes would time out together.
@@ -385,6 +379,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             order, mean, deviation = (x[index] for x in minibatches)
             batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
             batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
+            # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
+            batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
             gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
                 flat_params
             )
@@ -408,7 +404,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
             size = samples.log_prob.shape[1]
-            order = jax.vmap(lambda key: jax.random.permutation(key, size))(keys)
+            order = jax.vmap(lambda key: random_order(key, size))(keys)
             order = order.reshape((groups, config.num_minibatches, -1))
             # Mean and deviation of all minibatches at once: on several devices each reduction is a
             # message, and every minibatch already has one for its gradient.
@@ -512,6 +508,19 @@ def num_groups(config: PPOConfig) -> int:
     while config.num_envs % groups or (samples // groups) % config.num_minibatches:
         groups //= 2
     return groups
+
+
+def random_order(key: jax.Array, size: int) -> jax.Array:
+    """A random permutation of 0 ... `size` - 1 [size], int32; consumes the key.
+
+    `jax.random.permutation` sorts pairs of a random number and an index, which takes five times as
+    long on a CPU as one number with the index in its low bits. In the rare case of two equal random
+    numbers the smaller index comes first.
+    """
+    low_bits = (size - 1).bit_length()
+    numbers = jax.random.bits(key, (size,), jnp.uint32) >> low_bits << low_bits
+    ordered = jnp.sort(numbers | jnp.arange(size, dtype=jnp.uint32))
+    return (ordered & jnp.uint32((1 << low_bits) - 1)).astype(jnp.int32)
 
 
 def group(x: jax.Array, groups: int) -> jax.Array:

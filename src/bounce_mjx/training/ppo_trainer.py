@@ -69,7 +69,12 @@ class PPOTrainer:
         return run.lower(self._shapes)
 
     def _lower_init(self) -> jax.stages.Lowered:
-        return jax.jit(self._initial_state, out_shardings=self._sharding).lower(self._seeds)
+        init = jax.jit(
+            self._initial_state,
+            out_shardings=self._sharding,
+            compiler_options=compiler_options(runs_once=True),
+        )
+        return init.lower(self._seeds)
 
     def start(self, state: TrainingState | None = None) -> None:
         if state is None:
