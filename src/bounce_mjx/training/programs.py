@@ -90,15 +90,18 @@ class Programs:
         # A program that JAX has read from its own cache cannot be written again: the copy lacks
         # functions on a CPU.
         if self._folder is not None and _hits.count == hits:
-            self._pool.submit(self._keep, name, compiled)
+            with contextlib.suppress(Exception):
+                # Not later, because on a CPU XLA cannot serialise a program that has run a sort.
+                serialized = serialize_executable.serialize(compiled)
+                self._pool.submit(self._keep, name, compiled, serialized)
         return compiled
 
-    def _keep(self, name: str, compiled: jax.stages.Compiled) -> None:
+    def _keep(self, name: str, compiled: jax.stages.Compiled, serialized: tuple) -> None:
         # The training does not depend on a kept program: a full disk, for example, is no error.
         with contextlib.suppress(Exception):
             modules = [module for module in list(sys.modules) if module.startswith("jax")]
             lapack = "lapack" in compiled.as_text()
-            content = pickle.dumps((modules, lapack, serialize_executable.serialize(compiled)))
+            content = pickle.dumps((modules, lapack, serialized))
             self._folder.mkdir(parents=True, exist_ok=True)
             partial = self._folder / f"{name}.{os.getpid()}{PARTIAL}"
             partial.touch(mode=0o600)
