@@ -19,7 +19,7 @@ from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
-from bounce_mjx.training.programs import Programs
+from bounce_mjx.training.programs import Programs, calls_lapack
 from bounce_mjx.training.setup import compiler_options
 
 Tree = TypeVar("Tree")
@@ -53,7 +53,6 @@ class Evaluators:
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
-        self._mesh = mesh
         self._program = programs.get("evaluate", mesh, self._lower)
 
     def wait(self) -> None:
@@ -112,10 +111,11 @@ class Evaluators:
     def _threads(self) -> int:
         """Number of chunks that run at the same time. On a CPU a chunk uses one core, and XLA runs
         the programs that one thread starts one after another."""
-        if self._mesh.size > 1 or self._mesh.devices.flat[0].platform != "cpu":
+        mesh = self._replicated.mesh
+        if mesh.size > 1 or mesh.devices.flat[0].platform != "cpu":
             return 1
         # In jaxlib, two batched calls of LAPACK may wait for each other for ever.
-        return 1 if "lapack" in self._program.result().as_text() else os.cpu_count() or 1
+        return 1 if calls_lapack(self._program.result()) else os.cpu_count() or 1
 
     def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
         config, program = self._config, self._program.result()
