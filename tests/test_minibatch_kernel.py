@@ -108,7 +108,7 @@ def test_packing_is_undone_and_pads_with_zeros():
 @pytest.mark.parametrize("multiprocessors", [4, 2])
 def test_gradient_and_metrics_equal_autodiff_of_the_loss(interpret, monkeypatch, multiprocessors):
     """With two multiprocessors, each network has one block, which takes two tiles."""
-    monkeypatch.setattr(minibatch_kernel, "_MULTIPROCESSORS", multiprocessors)
+    monkeypatch.setattr(minibatch_kernel, "MULTIPROCESSORS", multiprocessors)
     minibatch_kernel._batched_call.cache_clear()
     networks, params = random_params(jax.random.PRNGKey(0))
     samples = random_samples(jax.random.PRNGKey(1), networks, params)

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn, TypeVar
 
+from bounce_mjx.garbage import no_garbage_collection
+
 Result = TypeVar("Result")
 
 INTERRUPTED = 130
@@ -52,15 +54,16 @@ def run_interruptible(function: Callable[..., Result], *arguments: Any, **keywor
 @contextlib.contextmanager
 def interruptible_imports() -> Iterator[None]:
     """Lets Ctrl-C end the process at once, without a KeyboardInterrupt: a library that is being
-    imported may turn it into another exception."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    imported may turn it into another exception. Python does not search for garbage meanwhile."""
+    with no_garbage_collection():
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield
+            return
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def leave(status: int = INTERRUPTED) -> NoReturn:

@@ -34,7 +34,7 @@ HIDDEN_WIDTHS = (64, 128)
 # memory need a multiple of 8.
 _EXTRA_ROWS = 8
 # Multiprocessors of NVIDIA's H100 and H200; one holds a block.
-_MULTIPROCESSORS = 132
+MULTIPROCESSORS = 132
 
 
 class PackedParams(NamedTuple):
@@ -128,9 +128,8 @@ def kernel_gradients(
         scalars = jnp.stack([samples.log_prob, samples.advantage, samples.value_target], axis=-1)
         log_prob, advantage, target = jnp.moveaxis(gather(scalars), -1, 0)
         advantage = (advantage - mean[:, None]) / (deviation[:, None] + 1e-8)
-        inputs = _pad_last(_pad_last(samples.inputs, NUM_INPUTS - 1), NUM_INPUTS, 1.0)
         batch = Batch(
-            inputs=gather(inputs.astype(jnp.bfloat16)),
+            inputs=gather(pad_inputs(samples.inputs).astype(jnp.bfloat16)),
             action=gather(_pad_last(samples.action, NUM_OUTPUTS)),
             scalars=jnp.stack([log_prob, advantage, target], axis=1),
         )
@@ -138,10 +137,9 @@ def kernel_gradients(
 
     def gradient(params: PackedParams, low: PackedParams, batch: Batch, index: jax.Array):
         gradient, metrics = loss_gradient(config, sizes, params, low, batch, index)
-        noise_row = params.output.shape[1] - _EXTRA_ROWS + 1
-        log_std = params.output[0, noise_row, : sizes.action]
-        metrics["policy/entropy"] = jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
-        metrics["policy/action_std"] = jnp.mean(jnp.exp(log_std))
+        log_noise = log_std(params, sizes)
+        metrics["policy/entropy"] = jnp.sum(log_noise + 0.5 * math.log(2.0 * math.pi * math.e))
+        metrics["policy/action_std"] = jnp.mean(jnp.exp(log_noise))
         return gradient, metrics
 
     return MinibatchGradients(pack, unpack, low_precision, shuffle, gradient)
@@ -150,6 +148,16 @@ def kernel_gradients(
 def low_precision(params: PackedParams) -> PackedParams:
     """The parameters in the type that the tensor cores take."""
     return PackedParams(*(x.astype(jnp.bfloat16) for x in params))
+
+
+def log_std(params: PackedParams, sizes: Sizes) -> jax.Array:
+    """Logarithm of the action noise [A]."""
+    return params.output[0, params.output.shape[1] - _EXTRA_ROWS + 1, : sizes.action]
+
+
+def pad_inputs(inputs: jax.Array) -> jax.Array:
+    """Inputs of both networks [..., N] -> [..., 64], with zeros, and 1 at the end."""
+    return _pad_last(_pad_last(inputs, NUM_INPUTS - 1), NUM_INPUTS, 1.0)
 
 
 def _pad_last(x: jax.Array, size: int, value: float = 0.0) -> jax.Array:
@@ -251,7 +259,7 @@ def _tiles_per_block(tiles: int, num_seeds: int) -> int:
     here = tiles // jax.device_count() or tiles
     blocks = 2 * tiles * num_seeds // jax.device_count()
     divisors = (n for n in range(1, here + 1) if here % n == 0)
-    return next((n for n in divisors if blocks // n <= _MULTIPROCESSORS), here)
+    return next((n for n in divisors if blocks // n <= MULTIPROCESSORS), here)
 
 
 def _run(

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.rows import pack, unpack
-from bounce_mjx.learning import minibatch_kernel, statistics
+from bounce_mjx.learning import forward_kernel, minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
@@ -31,6 +31,7 @@ from bounce_mjx.learning.metrics import (
 )
 from bounce_mjx.learning.policy import (
     Memory,
+    Outputs,
     Policy,
     cast_hidden_layers,
     forget,
@@ -186,6 +187,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     groups = num_groups(config)
     optimizer = optax.chain(_clip_by_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
 
+    kernel_sizes = minibatch_kernel.Sizes(env.observation_size, env.action_size)
     casts = config.compute_dtype != "float32"
 
     def cast_inputs(inputs: jax.Array) -> jax.Array:
@@ -215,6 +217,18 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     def value_apply(params: Params, inputs: jax.Array) -> jax.Array:
         return networks.value_network.apply(params.value, inputs)
 
+    def has_network_kernels() -> bool:
+        return has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size)
+
+    def outputs_of(params: Params) -> Outputs:
+        if has_network_kernels() and forward_kernel.supports(config.num_envs):
+            return forward_kernel.kernel_outputs(kernel_sizes, params)
+        params = cast_params(params)
+        return Outputs(
+            lambda inputs, memory: policy_apply(params, cast_inputs(inputs), memory),
+            lambda inputs: value_apply(params, cast_inputs(inputs)),
+        )
+
     def make_inputs(observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before normalisation [B, N + K]."""
         columns = [metrics[name][:, None] for name in critic_metrics]
@@ -242,7 +256,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
         """Runs the policy for T steps."""
-        params, normalizer = cast_params(state.params), state.statistics.normalizer
+        respond_to, normalizer = outputs_of(state.params).distribution, state.statistics.normalizer
 
         first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
 
@@ -250,9 +264,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             env_state, timeout_inputs, memory = unpack(carry)
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
-            distribution, memory = policy_apply(
-                params, cast_inputs(normalize(raw_inputs, normalizer)), _transposed(memory)
-            )
+            inputs = normalize(raw_inputs, normalizer)
+            distribution, memory = respond_to(inputs, _transposed(memory))
             action = distribution.mean + distribution.std * noise
             env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
             timeout_inputs = jnp.where(
@@ -310,9 +323,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def prepare(params: Params, collection: Collection) -> Samples:
         """Computes values and advantages of the rollout, and groups its samples."""
-        rollout, params = collection.rollout, cast_params(params)
+        rollout = collection.rollout
         ends = jnp.stack([collection.last_inputs, collection.timeout_inputs])
-        values = value_apply(params, cast_inputs(jnp.concatenate([rollout.inputs, ends])))
+        values = outputs_of(params).values(jnp.concatenate([rollout.inputs, ends]))
         values, timeout_values = values[:-1], values[-1]
         advantage = generalized_advantages(
             rollout.reward,
@@ -391,9 +404,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         )
 
     def make_gradients(params: Params) -> MinibatchGradients:
-        if has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size):
-            sizes = minibatch_kernel.Sizes(env.observation_size, env.action_size)
-            return minibatch_kernel.kernel_gradients(config, sizes, params)
+        if has_network_kernels():
+            return minibatch_kernel.kernel_gradients(config, kernel_sizes, params)
         return xla_gradients(ravel_pytree(params)[1])
 
     def update(state: TrainingState, samples: Samples, key: jax.Array):

@@ -20,6 +20,7 @@ from rich.console import Console
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
@@ -273,7 +274,7 @@ class _Job:
         """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
-        with self.console.status("compiling"):
+        with self.console.status("compiling"), no_garbage_collection():
             compiling = self.pool.submit(self._compile, report)
             if not self.stop.wait_for(compiling):
                 if self.resumed:
