@@ -13,7 +13,12 @@ import jax
 import jax.numpy as jnp
 import torch
 
-_TORCH_TYPES = {"float32": torch.float32, "int32": torch.int32, "bool": torch.bool}
+_TORCH_TYPES = {
+    "float32": torch.float32,
+    "int32": torch.int32,
+    "uint32": torch.uint32,
+    "bool": torch.bool,
+}
 
 
 class _Part(NamedTuple):
@@ -25,6 +30,23 @@ class _Part(NamedTuple):
     """First word."""
     stop: int
     """Word after the last."""
+
+
+class _View(NamedTuple):
+    """Position of one array in PyTorch's terms, made in advance because a step makes each view
+    anew."""
+
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    start: int
+    """First element, counted in elements of this type."""
+
+    @classmethod
+    def of(cls, part: _Part) -> "_View":
+        strides = torch.empty(part.shape, device="meta").stride()
+        start = 4 * part.start // part.dtype.itemsize
+        return cls(_TORCH_TYPES[part.dtype.name], part.shape, strides, start)
 
 
 class Layout:
@@ -41,9 +63,8 @@ class Layout:
             dtype = jnp.dtype(leaf.dtype)
             start, stop = stop, stop + -(-math.prod(leaf.shape) * dtype.itemsize // 4)
             self._parts.append(_Part(tuple(leaf.shape), dtype, start, stop))
-        names = getattr(shapes, "_fields", ())
-        is_flat = len(names) == len(self._parts)
-        self._named = dict(zip(names, self._parts, strict=True)) if is_flat else {}
+        self._views = [_View.of(part) for part in self._parts]
+        self._types = {view.dtype for view in self._views}
 
     def pack(self, arrays: Any) -> jax.Array:
         """The block [W] of a pytree of such arrays."""
@@ -54,16 +75,13 @@ class Layout:
         arrays = [_from_words(block[part.start : part.stop], part) for part in self._parts]
         return self._tree.unflatten(arrays)
 
-    def view(self, block: torch.Tensor, name: str) -> torch.Tensor:
-        """The array of a field as a view of the block; the pytree must be a flat named tuple."""
-        part = self._named[name]
-        values = block[part.start : part.stop].view(_TORCH_TYPES[part.dtype.name])
-        count = math.prod(part.shape)
-        return (values if len(values) == count else values[:count]).view(part.shape)
-
-    def offset(self, name: str) -> int:
-        """Bytes from the start of the block to a field."""
-        return 4 * self._named[name].start
+    def views(self, block: torch.Tensor) -> Any:
+        """The pytree of a block [W], as tensors that are views of it; the block must be a tensor
+        with memory of its own."""
+        typed = {dtype: block.view(dtype) for dtype in self._types}
+        return self._tree.unflatten(
+            [typed[x.dtype].as_strided(x.shape, x.strides, x.start) for x in self._views]
+        )
 
 
 def _to_words(x: jax.Array) -> jax.Array:

@@ -6,7 +6,6 @@ donated to the next step, so a step returns no view of it.
 """
 
 import copy
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -21,62 +20,30 @@ from bounce_mjx.task import vector
 from bounce_mjx.task.env import BounceBall
 
 
-class StepResult:
-    """Result of one step of B environments, as tensors that share memory with JAX's array.
+class StepResult(NamedTuple):
+    """Result of one step of B environments, as tensors that share one block of memory with JAX's
+    array."""
 
-    All tensors are views of one block of memory; each view is made when it is first used.
-    """
-
-    def __init__(self, block: jax.Array, layout: Layout):
-        self._array, self._layout = block, layout
-        self._block = torch.from_dlpack(block)
-
-    @functools.cached_property
-    def observation(self) -> torch.Tensor:
-        """Observation for the next action [B, N]; after the end of an episode, the first
-        observation of the new one."""
-        return self._layout.view(self._block, "observation")
-
-    @functools.cached_property
-    def critic_metrics(self) -> torch.Tensor:
-        """The value network's additional inputs at the same instant [B, K]."""
-        return self._layout.view(self._block, "critic_metrics")
-
-    @functools.cached_property
-    def final_observation(self) -> torch.Tensor:
-        """Observation after the step, before any reset [B, N]; at the end of an episode, its last
-        observation."""
-        return self._layout.view(self._block, "final_observation")
-
-    @functools.cached_property
-    def final_critic_metrics(self) -> torch.Tensor:
-        """The critic's metrics of `final_observation` [B, K]."""
-        return self._layout.view(self._block, "final_critic_metrics")
-
-    @functools.cached_property
-    def reward(self) -> torch.Tensor:
-        """Scaled reward [B]."""
-        return self._layout.view(self._block, "reward")
-
-    @functools.cached_property
-    def terminated(self) -> torch.Tensor:
-        """Whether the task ended the episode [B], bool."""
-        return self._layout.view(self._block, "terminated")
-
-    @functools.cached_property
-    def truncated(self) -> torch.Tensor:
-        """Whether only the time limit ended the episode [B], bool."""
-        return self._layout.view(self._block, "truncated")
-
-    @functools.cached_property
-    def done(self) -> torch.Tensor:
-        """Whether the episode ended [B], bool."""
-        return self._layout.view(self._block, "done")
-
-    @functools.cached_property
-    def metrics(self) -> torch.Tensor:
-        """Means and sums over the batch [M], named by `TorchVectorEnv.metric_names`."""
-        return self._layout.view(self._block, "metrics")
+    observation: torch.Tensor
+    """Observation for the next action [B, N]; after the end of an episode, the first observation of
+    the new one."""
+    critic_metrics: torch.Tensor
+    """The value network's additional inputs at the same instant [B, K]."""
+    final_observation: torch.Tensor
+    """Observation after the step, before any reset [B, N]; at the end of an episode, its last
+    observation."""
+    final_critic_metrics: torch.Tensor
+    """The critic's metrics of `final_observation` [B, K]."""
+    reward: torch.Tensor
+    """Scaled reward [B]."""
+    terminated: torch.Tensor
+    """Whether the task ended the episode [B], bool."""
+    truncated: torch.Tensor
+    """Whether only the time limit ended the episode [B], bool."""
+    done: torch.Tensor
+    """Whether the episode ended [B], bool."""
+    metrics: torch.Tensor
+    """Means and sums over the batch [M], named by `TorchVectorEnv.metric_names`."""
 
 
 class TorchVectorEnv:
@@ -111,6 +78,7 @@ class TorchVectorEnv:
         self.num_actions = self.env.action_size
         self.episode_steps = self.env.config.episode_steps
         self.device = _shared_device(None if device is None else torch.device(device))
+        self._dlpack_device = torch.empty(0, device=self.device).__dlpack_device__()
         self._reward_scale = reward_scale
         self._key = jax.random.PRNGKey(seed)
         self._template = jax.eval_shape(
@@ -119,11 +87,11 @@ class TorchVectorEnv:
         self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
-        _, arrays, metrics = jax.eval_shape(self._advance, carried, action)
-        self.metric_names = tuple(metrics)
-        metrics = jax.ShapeDtypeStruct((len(metrics),), jnp.float32)
+        _, result = jax.eval_shape(self._advance, carried, action)
+        self.metric_names = tuple(result.metrics)
+        metrics = jax.ShapeDtypeStruct((len(self.metric_names),), jnp.float32)
         self._carried_layout = Layout(carried)
-        self._result_layout = Layout(arrays._replace(metrics=metrics))
+        self._result_layout = Layout(result._replace(metrics=metrics))
         self._jit_start = jax.jit(self._packed_start)
         self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
         self._block: jax.Array | None = None
@@ -161,9 +129,11 @@ class TorchVectorEnv:
             )
         if self._block is None:
             raise UserError("step was called before reset; call reset first")
-        shared = jax.dlpack.from_dlpack(action.detach().contiguous())
+        shared = jax.dlpack.from_dlpack(
+            _Exported(action.detach().contiguous(), self._dlpack_device)
+        )
         self._block, result = self._jit_step(self._block, shared)
-        return StepResult(result, self._result_layout)
+        return self._result_layout.views(torch.from_dlpack(result))
 
     def sibling(self, seed: int) -> "TorchVectorEnv":
         """The same number of other environments, which share the compiled programs.
@@ -223,21 +193,19 @@ class TorchVectorEnv:
         return self._carried_layout.pack(carried), observation, critic_metrics
 
     def _packed_step(self, block: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        carried, arrays, metrics = self._advance(self._carried_layout.unpack(block), action)
-        arrays = arrays._replace(
-            metrics=jnp.concatenate([metrics[name] for name in self.metric_names])
-        )
-        return self._carried_layout.pack(carried), self._result_layout.pack(arrays)
+        carried, result = self._advance(self._carried_layout.unpack(block), action)
+        metrics = jnp.concatenate([result.metrics[name] for name in self.metric_names])
+        result = result._replace(metrics=metrics)
+        return self._carried_layout.pack(carried), self._result_layout.pack(result)
 
-    def _advance(
-        self, carried: "_Carried", action: jax.Array
-    ) -> tuple["_Carried", "_StepArrays", dict[str, jax.Array]]:
+    def _advance(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", StepResult]:
+        """The next inputs, and the result as JAX's arrays; its metrics are a dictionary."""
         key, reset_key = jax.random.split(carried.key)
         state = _whole(carried.vector, self._template)
         steps = None if carried.steps is None else carried.steps + 1
         ranges = vector.ranges_after(self.env, steps, self.num_envs)
         state, result = vector.step(self.env, state, action, reset_key, self.episode_steps, ranges)
-        arrays = _StepArrays(
+        arrays = StepResult(
             observation=result.observation,
             critic_metrics=self._critic_metrics(state.env.metrics),
             final_observation=result.final_observation,
@@ -246,13 +214,33 @@ class TorchVectorEnv:
             terminated=result.terminated,
             truncated=result.truncated,
             done=result.terminated | result.truncated,
+            metrics=step_metrics(result, groups=1),
         )
-        return _Carried(_slim(state), key, steps), arrays, step_metrics(result, groups=1)
+        return _Carried(_slim(state), key, steps), arrays
 
     def _critic_metrics(self, metrics: dict[str, jax.Array]) -> jax.Array:
         """The critic metrics [B, K]."""
         columns = [metrics[name] for name in self.critic_metrics]
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((self.num_envs, 0))
+
+
+class _Exported:
+    """A tensor for `jax.dlpack.from_dlpack`, without the checks and look-ups of a tensor's own
+    methods, 10 us of Python at each step."""
+
+    def __init__(self, tensor: torch.Tensor, dlpack_device: tuple[int, int]):
+        self._tensor, self._dlpack_device = tensor, dlpack_device
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self._dlpack_device
+
+    def __dlpack__(self, *, stream: int | None = None) -> Any:
+        # On CUDA, JAX's stream must wait for the one that computes the tensor.
+        if stream is not None:
+            device = self._tensor.device
+            reader = torch.cuda.ExternalStream(stream, device)
+            reader.wait_stream(torch.cuda.current_stream(device))
+        return torch.utils.dlpack.to_dlpack(self._tensor)
 
 
 class _Carried(NamedTuple):
@@ -262,20 +250,6 @@ class _Carried(NamedTuple):
     key: jax.Array
     steps: jax.Array | None
     """Steps since the last reset of all environments [], int32; None without a warm-up."""
-
-
-class _StepArrays(NamedTuple):
-    """The arrays behind a `StepResult`."""
-
-    observation: jax.Array
-    critic_metrics: jax.Array
-    final_observation: jax.Array
-    final_critic_metrics: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    done: jax.Array
-    metrics: jax.Array | None = None
 
 
 def _slim(state: vector.VectorState) -> vector.VectorState:
