@@ -10,6 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.gpu.kernel_calls import call_kernel
+
 # Threads of a block, and the numbers that a thread adds at a time.
 _THREADS, _VECTOR = 128, 4
 # Partial results that are read before the first of them is added.
@@ -68,7 +70,7 @@ def block_sums(
             inside = (chunk >= start) & (chunk < start + count)
             pl.when(inside)(lambda a=(source, target, start, count): add(*a))
 
-    *sums, squares = plgpu.kernel(
+    run = plgpu.kernel(
         kernel,
         out_type=[
             *(jax.ShapeDtypeStruct((rows, x.shape[2]), jnp.float32) for x in arrays),
@@ -78,7 +80,11 @@ def block_sums(
         grid_names=("chunk", "row"),
         compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
         interpret=interpret,
-    )(*arrays)
+    )
+    if interpret is not None:
+        *sums, squares = run(*arrays)
+    else:
+        *sums, squares = call_kernel(run, *arrays, key="block_sums")
     return sums, squares
 
 

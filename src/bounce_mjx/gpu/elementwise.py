@@ -22,6 +22,7 @@ from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.batches import batch_by, partition_by
+from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
@@ -211,4 +212,5 @@ def _run_packed(
             # warpgroup, the kernel takes ten times as long to compile and runs no faster.
             compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
         )
-    return run(jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size))))[:, :size]
+    padded = jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size)))
+    return (run(padded) if interpret else call_kernel(run, padded))[:, :size]

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.batches import batch_by, partition_by
+from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.minibatch_kernel import (
     MULTIPROCESSORS,
@@ -227,7 +228,8 @@ def _run(
         ),
         interpret=interpret,
     )
-    return run(inputs, hidden, output, exact_output)
+    args = inputs, hidden, output, exact_output
+    return run(*args) if interpret is not None else call_kernel(run, *args)
 
 
 def _tiles_per_block(tiles: int, num_seeds: int) -> int:

@@ -21,6 +21,7 @@ from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.batches import batch_by, partition_by
 from bounce_mjx.gpu.block_sums import block_sums, num_chunks
+from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gradients import MinibatchGradients
 
@@ -163,6 +164,27 @@ def pad_inputs(inputs: jax.Array) -> jax.Array:
 def _pad_last(x: jax.Array, size: int, value: float = 0.0) -> jax.Array:
     padding = [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]
     return jnp.pad(x, padding, constant_values=value)
+
+
+def compile_ahead(config: PPOConfig, sizes: Sizes, index: jax.Array) -> None:
+    """Starts to compile the kernels, which take the longest, before the trace comes to them.
+
+    Args:
+      index: any number [], int32; with a batch axis of seeds if the kernels will have one.
+    """
+    width = config.hidden_layers[0]
+    num_samples = config.batch_steps // config.num_minibatches
+    shape = (config.num_minibatches, num_samples)
+    params = PackedParams(
+        jnp.zeros((2, NUM_INPUTS + width + _EXTRA_ROWS, width)),
+        jnp.zeros((2, width + _EXTRA_ROWS, NUM_OUTPUTS)),
+    )
+    batch = Batch(
+        jnp.zeros((*shape, NUM_INPUTS), jnp.bfloat16),
+        jnp.zeros((*shape, NUM_OUTPUTS)),
+        jnp.zeros((config.num_minibatches, 3, num_samples)),
+    )
+    loss_gradient(config, sizes, params, low_precision(params), batch, index)
 
 
 def loss_gradient(
@@ -537,4 +559,8 @@ def _run(
         ),
         interpret=interpret,
     )
-    return tuple(run(inputs, action, scalars, hidden, output, exact_output, index))
+    args = inputs, action, scalars, hidden, output, exact_output, index
+    if interpret is not None:
+        return tuple(run(*args))
+    key = "minibatch", config, sizes, num_samples, tiles_per_block
+    return tuple(call_kernel(run, *args, key=key))

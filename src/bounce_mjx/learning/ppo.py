@@ -167,6 +167,8 @@ class Trainer(NamedTuple):
     run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
     """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is the
     result of `first_fault`."""
+    has_products: bool
+    """Whether XLA computes the networks' matrix products in `run`, and not the GPU kernels."""
 
 
 def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
@@ -217,11 +219,14 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     def value_apply(params: Params, inputs: jax.Array) -> jax.Array:
         return networks.value_network.apply(params.value, inputs)
 
-    def has_network_kernels() -> bool:
+    def has_gradient_kernel() -> bool:
         return has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size)
 
+    def has_output_kernel() -> bool:
+        return has_gradient_kernel() and forward_kernel.supports(config.num_envs)
+
     def outputs_of(params: Params) -> Outputs:
-        if has_network_kernels() and forward_kernel.supports(config.num_envs):
+        if has_output_kernel():
             return forward_kernel.kernel_outputs(kernel_sizes, params)
         params = cast_params(params)
         return Outputs(
@@ -404,7 +409,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         )
 
     def make_gradients(params: Params) -> MinibatchGradients:
-        if has_network_kernels():
+        if has_gradient_kernel():
             return minibatch_kernel.kernel_gradients(config, kernel_sizes, params)
         return xla_gradients(ravel_pytree(params)[1])
 
@@ -490,11 +495,13 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             state, metrics = iteration(state._replace(env=unpack(state.env)))
             return state._replace(env=pack(state.env)), pack(metrics)
 
+        if has_gradient_kernel():
+            minibatch_kernel.compile_ahead(config, kernel_sizes, state.iteration)
         state = state._replace(env=pack(state.env))
         state, metrics = jax.lax.scan(packed_iteration, state, length=num_iterations)
         return state._replace(env=unpack(state.env)), unpack(metrics)
 
-    return Trainer(init, run)
+    return Trainer(init, run, not has_output_kernel())
 
 
 def population(trainer: Trainer) -> Trainer:
@@ -505,6 +512,7 @@ def population(trainer: Trainer) -> Trainer:
         lambda states, num_iterations: jax.vmap(lambda state: trainer.run(state, num_iterations))(
             states
         ),
+        trainer.has_products,
     )
 
 

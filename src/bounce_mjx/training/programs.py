@@ -29,8 +29,6 @@ from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 
 import bounce_mjx
-from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.kernel_programs import kernel_programs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import PARTIAL
 
@@ -87,9 +85,6 @@ class Programs:
 
     def _compile(self, name: str, lower: Callable[[], jax.stages.Lowered]) -> jax.stages.Compiled:
         lowered = lower()
-        if has_kernels():
-            for program in kernel_programs(lowered):
-                self._pool.submit(program.compile)
         hits = _hits.count
         compiled = lowered.compile()
         # A program that JAX has read from its own cache cannot be written again: the copy lacks

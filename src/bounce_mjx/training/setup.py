@@ -74,11 +74,14 @@ def set_up_gpu() -> None:
         jax.config.update("jax_threefry_gpu_kernel_lowering", True)
 
 
-def compiler_options(runs_once: bool = False) -> dict[str, bool | int | str]:
+def compiler_options(
+    runs_once: bool = False, has_products: bool = True
+) -> dict[str, bool | int | str]:
     """Options of XLA for `jax.jit`.
 
     On a GPU, XLA times several kernels for each matrix product. The option skips its check that
-    their results agree, which doubles that time.
+    their results agree, which doubles that time; without matrix products XLA times nothing, as
+    other kernels gain nothing by it.
 
     On a CPU, XLA leaves matrix products and sums to YNNPACK, which takes one thread for products as
     small as those of a minibatch. One option leaves YNNPACK only convolutions, of which there are
@@ -88,9 +91,10 @@ def compiler_options(runs_once: bool = False) -> dict[str, bool | int | str]:
     Args:
       runs_once: whether the program runs only once, so that on a CPU, where LLVM takes most of the
         time to compile it, it is not worth optimising.
+      has_products: whether the program has matrix products.
     """
     if jax.default_backend() == "gpu":
-        return {"xla_gpu_autotune_level": 1}
+        return {"xla_gpu_autotune_level": int(has_products)}
     # XLA may drop these options, and refuses those that it does not know.
     if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 12):
         return {}
