@@ -254,3 +254,26 @@ def test_readme_example_runs(number, printed, request, capsys):
 
 def test_readme_has_no_other_examples():
     assert README.count("```python\n") == 4
+
+
+def test_imports_beside_a_compilation_leave_the_environment_alone() -> None:
+    """A new environment variable moves the environment in memory, and on a GPU a compilation
+    starts processes with it at any moment."""
+    script = """
+import importlib, os, sys
+from bounce_mjx.training.job import REPORT_MODULE
+from bounce_mjx.training.setup import set_up_jax
+set_up_jax()
+known = set(os.environ)
+def hook(event, args):
+    if event == "os.putenv" and os.fsdecode(args[0]) not in known:
+        print(args[0])
+sys.addaudithook(hook)
+for module in ("orbax.checkpoint", "tensorboardX", REPORT_MODULE):
+    importlib.import_module(module)
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "CRC32C_SW_MODE"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == ""

@@ -70,6 +70,10 @@ def set_up_gpu() -> None:
     (`JAX_THREEFRY_GPU_KERNEL_LOWERING=false` restores XLA's).
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    # TensorBoardX sets this variable when it is imported, which a thread does while XLA starts
+    # ptxas many times. A new variable moves the environment in memory, and a process that is being
+    # started with it fails.
+    os.environ.setdefault("CRC32C_SW_MODE", "auto")
     if "JAX_THREEFRY_GPU_KERNEL_LOWERING" not in os.environ:
         jax.config.update("jax_threefry_gpu_kernel_lowering", True)
 
