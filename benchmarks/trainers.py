@@ -61,7 +61,10 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     key = jax.random.PRNGKey(config.seed)
     init = jax.jit(trainer.init)
     run = jax.jit(
-        trainer.run, static_argnums=1, donate_argnums=0, compiler_options=compiler_options()
+        trainer.run,
+        static_argnums=1,
+        donate_argnums=0,
+        compiler_options=compiler_options(has_products=trainer.has_products),
     )
     with concurrent.futures.ThreadPoolExecutor() as pool:
         shapes = jax.eval_shape(init, key)

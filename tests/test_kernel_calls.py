@@ -73,8 +73,8 @@ def test_a_kernel_is_lowered_again_unless_its_key_is_known(lowered_kernels):
     for key, factor, count in ((None, 2.0, 1), (None, 2.0, 2), ("a", 3.0, 3), ("a", 3.0, 3)):
         lowered_text(lambda x, f=factor, k=key: call_kernel(doubling(f), x, key=k))
         assert len(lowered_kernels) == count
-    hashes = [kernel.attributes["kernel_hash"] for kernel in lowered_kernels]
-    assert hashes[0] == hashes[1] != hashes[2]
+    modules = [kernel.attributes["module"] for kernel in lowered_kernels]
+    assert modules[2] not in modules[:2]
 
 
 def test_a_training_on_a_gpu_starts_with_its_longest_kernel(lowered_kernels, monkeypatch):
@@ -91,9 +91,9 @@ def test_a_training_on_a_gpu_starts_with_its_longest_kernel(lowered_kernels, mon
     lowered_kernels.clear()
     program = jax.jit(lambda state: trainer.run(state, 1)).trace(state)
     text = program.lower(lowering_platforms=("cuda",)).as_text()
-    assert len(jax.tree.leaves(lowered_kernels[0].results)) == 3
-    hashes = [kernel.attributes["kernel_hash"] for kernel in lowered_kernels]
-    assert len(set(hashes)) == len(hashes)
+    num_results = [len(jax.tree.leaves(kernel.results)) for kernel in lowered_kernels]
+    assert num_results[0] == 3
+    assert num_results.count(3) == 1
     # First states, policy, control step, values, gradient, and sums.
     assert text.count("custom_call @mosaic_gpu") == 6
     assert "dot_general" not in text
