@@ -1,5 +1,9 @@
 """The GPU kernel of a network's outputs, in Pallas' interpreter, against the network itself."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,3 +89,32 @@ def test_the_kernel_is_lowered_for_a_gpu(width):
     traced = jax.jit(outputs).trace(params, random_inputs())
     lowered = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert lowered.count("custom_call @mosaic_gpu") == 2
+
+
+_TWO_DEVICES = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
+from bounce_mjx.learning import forward_kernel, minibatch_kernel
+
+mesh = Mesh(np.array(jax.devices()), ("devices",))
+
+def shape(*sizes, dtype=jnp.float32, spec=P()):
+    return jax.ShapeDtypeStruct(sizes, dtype, sharding=NamedSharding(mesh, spec))
+
+inputs = shape(3, 256, 30, spec=P(None, "devices"))
+params = minibatch_kernel.PackedParams(shape(2, 136, 64), shape(2, 72, 16))
+low = minibatch_kernel.PackedParams(*(shape(*x.shape, dtype=jnp.bfloat16) for x in params))
+means = jax.jit(lambda *args: forward_kernel.forward(*args[:2], 0, args[2], 6))
+lowered = means.trace(params, low, inputs).lower(lowering_platforms=("cuda",)).as_text()
+assert lowered.count("@CustomSPMDPartitioning") == 1, lowered
+assert forward_kernel.supports(128) and not forward_kernel.supports(192)
+"""
+
+
+def test_the_kernel_is_lowered_for_two_gpus():
+    """The compiler accepts the rule by which two devices share the environments."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", _TWO_DEVICES], env=os.environ | flags, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]

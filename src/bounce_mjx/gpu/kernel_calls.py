@@ -57,7 +57,7 @@ def _lower(kernel: Callable[..., Any], shapes: tuple[jax.ShapeDtypeStruct, ...])
     traced = jax.jit(kernel).trace(*shapes)
     if jax.default_backend() == "gpu":
         program = traced.lower()
-        threading.Thread(target=_compile, args=(program,), daemon=True).start()
+        threading.Thread(target=_compile, args=(program,)).start()
     else:
         program = traced.lower(lowering_platforms=("cuda",))
     (config,) = (

@@ -172,6 +172,9 @@ def compile_ahead(config: PPOConfig, sizes: Sizes, index: jax.Array) -> None:
     Args:
       index: any number [], int32; with a batch axis of seeds if the kernels will have one.
     """
+    # `call_kernel` leaves the kernels of several devices to XLA.
+    if jax.device_count() > 1:
+        return
     width = config.hidden_layers[0]
     num_samples = config.batch_steps // config.num_minibatches
     shape = (config.num_minibatches, num_samples)
