@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.pallas import mosaic_gpu as plgpu
 
 from bounce_mjx.learning import forward_kernel, minibatch_kernel
 from bounce_mjx.learning.config import PPOConfig
@@ -16,15 +15,6 @@ from bounce_mjx.learning.policy import make_networks
 
 NUM_OBSERVATIONS, NUM_CRITIC_INPUTS, NUM_ACTIONS = 29, 30, 6
 LENGTH, BATCH = 3, 128
-
-
-@pytest.fixture(scope="module")
-def interpret():
-    if hasattr(plgpu, "InterpretGPUParams"):
-        return plgpu.InterpretGPUParams()
-    from jax._src.pallas.mosaic_gpu.interpret.params import InterpretGPUParams
-
-    return InterpretGPUParams()
 
 
 def random_networks(width: int, seed: int = 0):

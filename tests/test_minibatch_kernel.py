@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.pallas import mosaic_gpu as plgpu
 
 from bounce_mjx.gpu.block_sums import block_sums, num_chunks
 from bounce_mjx.learning import minibatch_kernel
@@ -29,15 +28,6 @@ CONFIG = PPOConfig(
 )
 SIZES = Sizes(NUM_OBSERVATIONS, NUM_ACTIONS)
 NUM_SAMPLES = CONFIG.batch_steps // CONFIG.num_minibatches
-
-
-@pytest.fixture(scope="module")
-def interpret():
-    if hasattr(plgpu, "InterpretGPUParams"):
-        return plgpu.InterpretGPUParams()
-    from jax._src.pallas.mosaic_gpu.interpret.params import InterpretGPUParams
-
-    return InterpretGPUParams()
 
 
 def random_params(key: jax.Array):

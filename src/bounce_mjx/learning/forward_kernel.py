@@ -22,6 +22,7 @@ from bounce_mjx.learning.minibatch_kernel import (
     NUM_OUTPUTS,
     PackedParams,
     Sizes,
+    copy_weights,
     log_std,
     low_precision,
     pack,
@@ -129,7 +130,6 @@ def _run(
     num_seeds, length, _, batch = inputs.shape
     tiles, width = length * batch // TILE, hidden.shape[-1]
     tiles_per_block = _tiles_per_block(tiles, num_seeds)
-    first, second = pl.ds(0, NUM_INPUTS), pl.ds(NUM_INPUTS, width)
     hidden_bias, output_bias = NUM_INPUTS + width, width
     float32, bfloat16 = jnp.float32, jnp.bfloat16
     layout = plgpu.Layout.WGMMA
@@ -150,12 +150,7 @@ def _run(
             source = inputs_ref.at[seed, step, :, samples]
             plgpu.copy_gmem_to_smem(source, x.at[jax.lax.rem(number, 2)], inputs_ready)
 
-        for source, target in (
-            (hidden_ref.at[seed, network, first], w1),
-            (hidden_ref.at[seed, network, second], w2),
-            (output_ref.at[seed, network, pl.ds(0, width)], w3),
-        ):
-            plgpu.copy_gmem_to_smem(source, target, weights_ready)
+        copy_weights(hidden_ref, output_ref, (seed, network), (w1, w2, w3), weights_ready)
         fetch_inputs(jnp.int32(0))
 
         def product(a: Any, b: Any, flip_a: bool = False) -> jax.Array:

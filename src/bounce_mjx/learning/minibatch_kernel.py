@@ -156,6 +156,28 @@ def log_std(params: PackedParams, sizes: Sizes) -> jax.Array:
     return params.output[0, params.output.shape[1] - _EXTRA_ROWS + 1, : sizes.action]
 
 
+def copy_weights(
+    hidden_ref: Any, output_ref: Any, network: tuple, targets: Sequence[Any], ready: Any
+) -> None:
+    """In a kernel, starts to copy the weights of one network's three layers into shared memory;
+    each copy arrives at the barrier.
+
+    Args:
+      network: index of the network in the parameters [S, 2, ...].
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import mosaic_gpu as plgpu
+
+    width = hidden_ref.shape[-1]
+    sources = (
+        hidden_ref.at[*network, pl.ds(0, NUM_INPUTS)],
+        hidden_ref.at[*network, pl.ds(NUM_INPUTS, width)],
+        output_ref.at[*network, pl.ds(0, width)],
+    )
+    for source, target in zip(sources, targets, strict=True):
+        plgpu.copy_gmem_to_smem(source, target, ready)
+
+
 def pad_inputs(inputs: jax.Array) -> jax.Array:
     """Inputs of both networks [..., N] -> [..., 64], with zeros, and 1 at the end."""
     return _pad_last(_pad_last(inputs, NUM_INPUTS - 1), NUM_INPUTS, 1.0)
@@ -358,12 +380,7 @@ def _run(
 
         @pl.when(group == 0)
         def _():
-            for source, target in (
-                (hidden_ref.at[seed, network, first], w1),
-                (hidden_ref.at[seed, network, second], w2),
-                (output_ref.at[seed, network, pl.ds(0, width)], w3),
-            ):
-                plgpu.copy_gmem_to_smem(source, target, weights_ready)
+            copy_weights(hidden_ref, output_ref, (seed, network), (w1, w2, w3), weights_ready)
 
         fetch_inputs(jnp.int32(0))
 
