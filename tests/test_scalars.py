@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.gpu import elementwise
+from bounce_mjx.gpu import elementwise, rows
 from bounce_mjx.gpu.rows import Rows
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 from bounce_mjx.task import vector
@@ -80,6 +80,48 @@ def test_functions_without_a_scalar_form_are_unchanged():
     np.testing.assert_array_equal(program(x), jnp.sort(x))
 
 
+def test_entries_of_every_type_enter_a_kernel_and_leave_it_in_any_order():
+    """A batch of batches; the function leaves out entries of its arguments, and mixes and repeats
+    those of its results."""
+
+    def function(x, count, flag):
+        mixed = jnp.stack([x[1, 2], x[0, 0], x[0, 1], x[1, 2] * flag[1]])
+        return {
+            "mixed": mixed,
+            "count": count - 2**30,
+            "flag": ~flag,
+            "again": x[0],
+            "sum": x.sum(),
+        }
+
+    x_key, count_key, flag_key = jax.random.split(jax.random.PRNGKey(0), 3)
+    x = jax.random.normal(x_key, (4, 2, 3, BATCH))
+    count = jax.random.randint(count_key, (BATCH, 4), -(2**31), 2**31 - 1)
+    flag = jax.random.bernoulli(flag_key, shape=(3, BATCH))
+
+    def batched(function):
+        inner = jax.vmap(function, in_axes=(-1, 0, -1), out_axes=-1)
+        return jax.vmap(inner, in_axes=(0, 1, None), out_axes=0)
+
+    program = jax.jit(batched(elementwise.in_one_kernel(function, interpret=True)))
+    traced = program.trace(x, count, flag)
+    assert "pallas_call" in str(traced.jaxpr)
+    found, expected = traced.lower().compile()(x, count, flag), batched(function)(x, count, flag)
+    for name, array in expected.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_allclose(found[name], array, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def test_a_function_of_integers_has_a_gradient_in_a_kernel():
+    def function(x, count):
+        return x**2 * count, count + 1
+
+    in_kernel = elementwise.in_one_kernel(function, interpret=True)
+    x, count = jnp.linspace(0.5, 2.0, BATCH), jnp.arange(BATCH)
+    gradient = jax.grad(lambda x: jax.vmap(in_kernel)(x, count)[0].sum())(x)
+    np.testing.assert_allclose(gradient, 2.0 * x * count, rtol=1e-6)
+
+
 def test_rows_hold_every_type():
     tree = {
         "float": jax.random.normal(jax.random.PRNGKey(0), (2, 3, 5)),
@@ -96,6 +138,22 @@ def test_rows_hold_every_type():
     for name, expected in tree.items():
         assert twice[name].dtype == expected.dtype
         np.testing.assert_array_equal(twice[name][1], expected)
+
+
+def test_a_loop_unpacks_the_rows_of_its_steps(monkeypatch):
+    tree = {
+        "float": jax.random.normal(jax.random.PRNGKey(0), (3, 2, 5)),
+        "int": jnp.arange(15, dtype=jnp.int32).reshape(3, 5),
+        "bool": jnp.arange(15).reshape(3, 5) % 4 == 0,
+    }
+    assert rows.pack_steps(tree) is tree
+    monkeypatch.setattr(rows, "has_kernels", lambda: True)
+    packed = rows.pack_steps(tree)
+    assert packed.rows.shape == (3, 20)
+    _, steps = jax.lax.scan(lambda carry, step: (carry, rows.unpack(step)), 0, packed)
+    for name, expected in tree.items():
+        assert steps[name].dtype == expected.dtype
+        np.testing.assert_array_equal(steps[name], expected)
 
 
 def test_the_control_step_is_one_kernel(monkeypatch):

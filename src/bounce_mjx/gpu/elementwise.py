@@ -10,14 +10,16 @@ than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`. It also compiles derivatives
 """
 
 import functools
-import itertools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
 from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
@@ -45,29 +47,15 @@ def elementwise(
       interpret: runs the kernel in Pallas' interpreter on any device, for tests.
     """
 
-    def on_batch(*args: jax.Array) -> Arrays:
-        if args[0].ndim == 0:
-            return function(*args)
-        if interpret:
-            return in_kernel(function, num_results, args, interpret)
-        return jax.lax.platform_dependent(
-            *args, cuda=lambda *args: in_kernel(function, num_results, args), default=function
-        )
-
-    call = batch_by(on_batch, lambda *args: call(*args))
-
-    @jax.custom_jvp
-    def differentiable(*args: jax.Array) -> Arrays:
-        return tuple(call(*args))
-
-    @differentiable.defjvp
-    def derivative(args: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
-        # A kernel has no derivative, so XLA compiles the function and its derivative.
-        return jax.jvp(lambda *args: tuple(function(*args)), args, tangents)
-
     def chosen(*args: jax.Array) -> Arrays:
-        float32 = all(x.dtype == jnp.float32 for x in args)
-        return (differentiable if float32 and (interpret or has_kernels()) else function)(*args)
+        if not (interpret or has_kernels()) or any(x.dtype != jnp.float32 for x in args):
+            return function(*args)
+        layout = Layout(
+            used=(np.array(True),) * len(args),
+            results=tuple(np.arange(num_results)),
+            dtypes=(jnp.dtype(jnp.float32),) * num_results,
+        )
+        return _in_kernel_for_batches(function, function, layout, interpret)(*args)
 
     return chosen
 
@@ -103,37 +91,108 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
         if not set(scalar_function.dtypes) <= KERNEL_TYPES:
             return function(*args)
 
-        scalars = [x[index] for x in leaves for index in np.ndindex(*x.shape)]
-        used = list(itertools.compress(scalars, scalar_function.used))
-
         # Jitted inline, so that JAX traces it only once, whatever the batch size.
         call = jax.jit(scalar_function.call, inline=True)
+        scalar_types = [x.dtype for x in leaves for _ in range(x.size)]
 
         def on_floats(*floats: jax.Array) -> Arrays:
             given = iter(floats)
             every = [
-                from_float(next(given), x.dtype) if needed else jnp.zeros(floats[0].shape, x.dtype)
-                for x, needed in zip(scalars, scalar_function.used, strict=True)
+                from_float(next(given), dtype) if needed else jnp.zeros(floats[0].shape, dtype)
+                for dtype, needed in zip(scalar_types, scalar_function.used, strict=True)
             ]
             batched = call
             for _ in range(floats[0].ndim):
                 batched = jax.vmap(batched)
             return tuple(map(to_float, batched(*every)))
 
-        num_results = len(scalar_function.dtypes)
-        floats = elementwise(on_floats, num_results, interpret)(*map(to_float, used))
-        results = [
-            from_float(x, dtype) for x, dtype in zip(floats, scalar_function.dtypes, strict=True)
-        ]
-        arrays = [
-            jnp.stack([results[i] for i in positions.flat]).reshape(positions.shape)
-            if positions.ndim
-            else results[int(positions)]
-            for positions in scalar_function.positions
-        ]
-        return result_tree[-1].unflatten(arrays)
+        used, ends = np.array(scalar_function.used), np.cumsum([x.size for x in leaves])
+        layout = Layout(
+            used=tuple(
+                part.reshape(x.shape)
+                for part, x in zip(np.split(used, ends[:-1]), leaves, strict=True)
+            ),
+            results=tuple(scalar_function.positions),
+            dtypes=tuple(scalar_function.dtypes),
+        )
+        results = _in_kernel_for_batches(flat_function, on_floats, layout, interpret)(*leaves)
+        return result_tree[-1].unflatten(results)
 
     return wrapped
+
+
+class Layout(NamedTuple):
+    """How small arrays lie in the rows of a kernel, which are float32."""
+
+    used: tuple[np.ndarray, ...]
+    """For each argument, which of its entries are rows, bool."""
+    results: tuple[np.ndarray, ...]
+    """For each result, the rows of its entries, int."""
+    dtypes: tuple[jnp.dtype, ...]
+    """Type of each row of the results."""
+
+    def pack(self, args: Arrays) -> jax.Array:
+        """Arguments [..., *shape] -> rows [R, ...]."""
+        rows = []
+        for x, used in zip(args, self.used, strict=True):
+            x = _move_last(to_float(x), used.ndim)
+            x = x.reshape(used.size, *x.shape[used.ndim :])
+            rows += [x[start:stop] for start, stop in _runs(np.flatnonzero(used))]
+        return jnp.concatenate(rows)
+
+    def unpack(self, rows: jax.Array) -> Arrays:
+        """Rows [R, ...] -> results [..., *shape]."""
+        results = []
+        for positions in self.results:
+            parts = [rows[start:stop] for start, stop in _runs(positions.ravel())]
+            x = jnp.concatenate(parts) if len(parts) > 1 else parts[0]
+            x = _move_last(x.reshape(positions.shape + rows.shape[1:]), rows.ndim - 1)
+            results.append(from_float(x, self.dtypes[positions.flat[0]]))
+        return tuple(results)
+
+
+def _move_last(x: jax.Array, count: int) -> jax.Array:
+    """Moves all axes but the last `count` to the end: [..., *kept] -> [*kept, ...]."""
+    first = x.ndim - count
+    return x.transpose(*range(first, x.ndim), *range(first))
+
+
+def _runs(numbers: np.ndarray) -> list[tuple[int, int]]:
+    """Ranges (start, stop) that follow each other, for slices instead of single numbers: 3 4 5 9 ->
+    (3, 6), (9, 10)."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
+
+
+def _in_kernel_for_batches(
+    function: Callable[..., Sequence[jax.Array]],
+    on_rows: ElementwiseFunction,
+    layout: Layout,
+    interpret: bool,
+) -> Callable[..., Arrays]:
+    """`function` of small arrays, with a GPU kernel for its batches.
+
+    Args:
+      on_rows: computes it for rows: the used entries of the arguments -> the rows of the results.
+    """
+
+    def on_batch(*args: jax.Array) -> Arrays:
+        if args[0].ndim == layout.used[0].ndim:
+            return tuple(function(*args))
+        return layout.unpack(in_kernel(on_rows, len(layout.dtypes), layout.pack(args), interpret))
+
+    call = batch_by(on_batch, lambda *args: call(*args))
+
+    @jax.custom_jvp
+    def differentiable(*args: jax.Array) -> Arrays:
+        return tuple(call(*args))
+
+    @differentiable.defjvp
+    def derivative(args: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
+        # A kernel has no derivative, so XLA compiles the function and its derivative.
+        return jax.jvp(lambda *args: tuple(function(*args)), args, tangents)
+
+    return differentiable
 
 
 KERNEL_TYPES = {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32), jnp.dtype(jnp.bool_)}
@@ -155,27 +214,59 @@ def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
 
 
 def in_kernel(
-    function: ElementwiseFunction, num_results: int, args: Arrays, interpret: bool = False
-) -> Arrays:
-    """Runs `function` on arrays [...] in one kernel; with several devices, each computes its
-    shard."""
+    function: ElementwiseFunction, num_results: int, rows: jax.Array, interpret: bool = False
+) -> jax.Array:
+    """Runs `function` of rows [R, ...] in one kernel, and returns its results as rows; with several
+    devices, each computes its shard."""
 
-    def run(packed: jax.Array) -> jax.Array:
-        rows, *batch = packed.shape
-        flat = packed.reshape(rows, math.prod(batch))
-        return _run_packed(function, flat, num_results, interpret).reshape(num_results, *batch)
+    def run(rows: jax.Array) -> jax.Array:
+        if interpret:
+            return _run_packed(rows, function, num_results, interpret)
+        # `jax.jit`, because the primitive has no implementation outside compiled programs.
+        bind = functools.partial(_elementwise.bind, function=function, num_results=num_results)
+        return jax.jit(bind)(rows)
 
     def specs(packed: PartitionSpec) -> tuple[tuple[PartitionSpec], PartitionSpec]:
         kept = PartitionSpec(None, *packed[1:])
         return (kept,), kept
 
-    axes = " ".join(f"b{i}" for i in range(args[0].ndim))
+    axes = " ".join(f"b{i}" for i in range(rows.ndim - 1))
     rule = f"rows {axes} -> results {axes}"
-    results = partition_by(run, specs, rule, ("rows", "results"))(jnp.stack(args))
-    return tuple(results[i] for i in range(num_results))
+    return partition_by(run, specs, rule, ("rows", "results"))(rows)
+
+
+# `jax.lax.platform_dependent` would trace the kernel and the function at once, and again for each
+# `jax.vmap` around the batch, which takes half a second of a training's start. A primitive is
+# traced when a program that contains it is lowered, and only for the program's platform.
+_elementwise = Primitive("elementwise")
+
+
+@_elementwise.def_abstract_eval
+def _result_type(packed: ShapedArray, *, num_results: int, **_: object) -> ShapedArray:
+    return ShapedArray((num_results, *packed.shape[1:]), packed.dtype)
 
 
 def _run_packed(
+    packed: jax.Array, function: ElementwiseFunction, num_results: int, interpret: bool = False
+) -> jax.Array:
+    """Arguments [rows, ...] -> results [num_results, ...]."""
+    rows, *batch = packed.shape
+    flat = packed.reshape(rows, math.prod(batch))
+    return _run_flat(function, flat, num_results, interpret).reshape(num_results, *batch)
+
+
+def _run_by_xla(packed: jax.Array, function: ElementwiseFunction, num_results: int) -> jax.Array:
+    del num_results
+    return jnp.stack(function(*packed))
+
+
+mlir.register_lowering(_elementwise, mlir.lower_fun(_run_by_xla, multiple_results=False))
+mlir.register_lowering(
+    _elementwise, mlir.lower_fun(_run_packed, multiple_results=False), platform="cuda"
+)
+
+
+def _run_flat(
     function: ElementwiseFunction, packed: jax.Array, num_results: int, interpret: bool
 ) -> jax.Array:
     """Arguments [rows, N] -> results [num_results, N]."""
@@ -210,7 +301,10 @@ def _run_packed(
             grid_names=("block",),
             # Each thread computes environments of its own. With the other semantics, vectors of a
             # warpgroup, the kernel takes ten times as long to compile and runs no faster.
-            compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
+            # Otherwise all threads wait for each other before and after each result is stored.
+            compiler_params=plgpu.CompilerParams(
+                lowering_semantics=plgpu.LoweringSemantics.Lane, unsafe_no_auto_barriers=True
+            ),
         )
     padded = jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size)))
     return (run(padded) if interpret else call_kernel(run, padded))[:, :size]

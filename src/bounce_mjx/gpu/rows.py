@@ -14,7 +14,9 @@ from bounce_mjx.gpu.elementwise import KERNEL_TYPES, from_float, to_float
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["structure", "types"]
+    jax.tree_util.register_dataclass,
+    data_fields=["rows"],
+    meta_fields=["structure", "types", "flat"],
 )
 @dataclasses.dataclass(frozen=True)
 class Rows:
@@ -25,6 +27,8 @@ class Rows:
     structure: Any
     types: tuple[tuple[tuple[int, ...], jnp.dtype], ...]
     """Shape and type of each array of the pytree."""
+    flat: bool = False
+    """Whether the rows are one axis [R * B] (`pack_steps`)."""
 
     @classmethod
     def of(cls, tree: Any) -> "Rows":
@@ -38,10 +42,13 @@ class Rows:
 
     def tree(self) -> Any:
         """The pytree. Axes that a loop has added before the rows come first in each array."""
-        arrays, start = [], 0
+        arrays, start, rows = [], 0, self.rows
+        if self.flat:
+            first, _ = self.types[0]
+            rows = rows.reshape(*rows.shape[:-1], -1, first[-1])
         for shape, dtype in self.types:
             stop = start + math.prod(shape[:-1])
-            array = self.rows[..., start:stop, :].reshape(*self.rows.shape[:-2], *shape)
+            array = rows[..., start:stop, :].reshape(*rows.shape[:-2], *shape)
             arrays.append(from_float(array, dtype))
             start = stop
         return self.structure.unflatten(arrays)
@@ -50,6 +57,18 @@ class Rows:
 def pack(tree: Any) -> Any:
     """The pytree as `Rows` where the package's GPU kernels run; elsewhere unchanged."""
     return Rows.of(tree) if has_kernels() else tree
+
+
+def pack_steps(tree: Any) -> Any:
+    """Packs a pytree of arrays [T, ..., B], whose T parts a loop unpacks one after another.
+
+    The rows of a part are one axis: from [T, R, B], XLA would cut each row in the loop on its own,
+    instead of all of them at once.
+    """
+    if not has_kernels():
+        return tree
+    packed = jax.vmap(Rows.of)(tree)
+    return dataclasses.replace(packed, rows=packed.rows.reshape(len(packed.rows), -1), flat=True)
 
 
 def unpack(packed: Any) -> Any:

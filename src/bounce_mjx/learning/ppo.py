@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.rows import pack, unpack
+from bounce_mjx.gpu.rows import pack, pack_steps, unpack
 from bounce_mjx.learning import forward_kernel, minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
@@ -272,7 +272,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             inputs = normalize(raw_inputs, normalizer)
             distribution, memory = respond_to(inputs, _transposed(memory))
             action = distribution.mean + distribution.std * noise
-            env_state, result = vector.step_with(env, env_state, action, fresh, episode_steps)
+            env_state, result = vector.step_with(
+                env, env_state, action, unpack(fresh), episode_steps
+            )
             timeout_inputs = jnp.where(
                 result.truncated,
                 make_inputs(result.final_observation, result.metrics).T,
@@ -301,7 +303,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             jax.random.split(reset_key, config.rollout_length)
         )
         carry = pack((state.env, first_inputs.T, state.memory))
-        carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, fresh))
+        carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, pack_steps(fresh)))
         env_state, timeout_inputs, memory = unpack(carry)
         steps = unpack(steps)
         raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)

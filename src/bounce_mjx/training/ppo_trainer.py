@@ -38,6 +38,14 @@ class PPOTrainer:
         self.state: TrainingState | None = None
         """The current state, on the devices."""
 
+        def initial_state(seeds: jax.Array) -> TrainingState:
+            """The first training state of one seed [] or of S seeds [S]."""
+            key = jax.random.PRNGKey
+            return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
+
+        # One object, not a method, so that JAX traces it only once.
+        self._initial_state = initial_state
+
     @functools.cached_property
     def _shapes(self) -> TrainingState:
         return jax.eval_shape(self._initial_state, self._seeds)
@@ -50,8 +58,8 @@ class PPOTrainer:
         return self._shapes
 
     def compile(self, programs: Programs) -> concurrent.futures.Future:
-        self._run = programs.get("train", self.mesh, self._lower_run, at_once=True)
-        self._init = programs.get("init", self.mesh, self._lower_init, at_once=True)
+        self._run = programs.get("train", self.mesh, self._lower_run)
+        self._init = programs.get("init", self.mesh, self._lower_init)
         return self._run
 
     def _lower_run(self) -> jax.stages.Lowered:
@@ -95,11 +103,6 @@ class PPOTrainer:
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
         return Snapshot(policy_of(state, self._observation_size), state)
-
-    def _initial_state(self, seeds: jax.Array) -> TrainingState:
-        """The first training state of one seed [] or of S seeds [S]."""
-        key = jax.random.PRNGKey
-        return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
 
 
 def _iterations_at_once(config: TrainConfig, env: BounceBall) -> int:

@@ -52,39 +52,30 @@ class Programs:
         self._pool, self._folder = pool, folder
 
     def get(
-        self, name: str, mesh: Mesh, lower: Callable[[], jax.stages.Lowered], at_once: bool = False
+        self, name: str, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
     ) -> "concurrent.futures.Future[jax.stages.Compiled]":
-        """A program.
+        """A program. If no training has left it, it is lowered before this returns: Python traces
+        one program at a time, so the order of the calls counts.
 
         Args:
           name: of the program in this training.
           mesh: the devices that run it.
           lower: traces and lowers it.
-          at_once: whether to lower it before returning, if no training has left it. Python traces
-            one program at a time, so this sets the order.
         """
-        if at_once and not self._path(name):
-            lowered = lower()
-            return self._pool.submit(self._compile, name, lambda: lowered)
-        return self._pool.submit(self._load_or_compile, name, mesh, lower)
-
-    def _path(self, name: str) -> Path | None:
-        """File of a kept program; None if there is none."""
         path = None if self._folder is None else self._folder / name
-        return path if path is not None and path.is_file() else None
+        if path is not None and path.is_file():
+            return self._pool.submit(self._load_or_compile, path, mesh, lower)
+        return self._pool.submit(self._compile, name, lower())
 
     def _load_or_compile(
-        self, name: str, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
+        self, path: Path, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
     ) -> jax.stages.Compiled:
-        path = self._path(name)
-        if path is not None:
-            # Any file that this process cannot use is replaced.
-            with contextlib.suppress(Exception):
-                return _load(path, mesh)
-        return self._compile(name, lower)
+        # Any file that this process cannot use is replaced.
+        with contextlib.suppress(Exception):
+            return _load(path, mesh)
+        return self._compile(path.name, lower())
 
-    def _compile(self, name: str, lower: Callable[[], jax.stages.Lowered]) -> jax.stages.Compiled:
-        lowered = lower()
+    def _compile(self, name: str, lowered: jax.stages.Lowered) -> jax.stages.Compiled:
         hits = _hits.count
         compiled = lowered.compile()
         # A program that JAX has read from its own cache cannot be written again: the copy lacks
