@@ -249,11 +249,16 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 
 
 MESSAGES = """
-import jax, re
+import functools, jax, re, sys
 from bounce_mjx import BounceBall
+from bounce_mjx.gpu import elementwise, rows
+from bounce_mjx.task import vector
 from bounce_mjx.training import devices
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
+if sys.argv[1] == "kernel":
+    rows.has_kernels = lambda: True
+    vector.in_one_kernel = functools.partial(elementwise.in_one_kernel, interpret=True)
 config = PPOConfig(num_envs=64, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
 env = BounceBall()
 trainer = ppo.make_trainer(config, env, 100)
@@ -271,10 +276,13 @@ print(*re.findall(names, text))
 
 
 @pytest.mark.slow
-def test_devices_exchange_only_sums(monkeypatch: pytest.MonkeyPatch):
-    """No device sends samples or environments to another; each minibatch needs one message."""
+@pytest.mark.parametrize("control_step", ["kernel", "program"])
+def test_devices_exchange_only_sums(control_step: str, monkeypatch: pytest.MonkeyPatch):
+    """No device sends samples or environments to another; each minibatch needs one message. On a
+    GPU the control step is a kernel, here in Pallas' interpreter, and the loop carries rows."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
-    done = subprocess.run([sys.executable, "-c", MESSAGES], capture_output=True, text=True)
+    command = [sys.executable, "-c", MESSAGES, control_step]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     messages = done.stdout.split()
     assert set(messages) == {"all-reduce"}

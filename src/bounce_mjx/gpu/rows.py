@@ -63,9 +63,9 @@ def pack_steps(tree: Any) -> Any:
     """Packs a pytree of arrays [T, ..., B], whose T parts a loop unpacks one after another.
 
     The rows of a part are one axis: from [T, R, B], XLA would cut each row in the loop on its own,
-    instead of all of them at once.
+    instead of all of them at once. Several devices share the axis B, so they keep the arrays.
     """
-    if not has_kernels():
+    if not has_kernels() or jax.device_count() > 1:
         return tree
     packed = jax.vmap(Rows.of)(tree)
     return dataclasses.replace(packed, rows=packed.rows.reshape(len(packed.rows), -1), flat=True)
