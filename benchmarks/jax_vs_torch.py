@@ -14,8 +14,9 @@ the fused physics.
 - Training clock: time in the trainer, without evaluations and without compiling. The first two
   blocks of a trainer may compile, so each of them counts as at most the median of the later blocks.
 - From process start: the whole time, including the evaluations, whose program compiles while the
-trainer trains. - Each evaluation is written to jax_vs_torch.jsonl when it ends, so that an
-interrupted run keeps its evaluations. A new run of a method and seed replaces the earlier one.
+  trainer trains.
+- Each evaluation is written to jax_vs_torch.jsonl when it ends, so that an interrupted run keeps
+  its evaluations. A new run of a method and seed replaces the earlier one.
 """
 
 import json
@@ -281,7 +282,7 @@ def table(runs: dict[tuple[Method, int], list[Record]]) -> str:
                 _ratio(figures["solved_train"], ours and ours["solved_train"]),
                 _spread(figures["solved_process"]),
                 _ratio(figures["solved_process"], ours and ours["solved_process"]),
-                _spread(figures["return"]),
+                _spread(figures["return"], form=",.0f"),
                 f"{min(figures['steps']) / 1e6:.1f}",
             ]
         )
@@ -354,11 +355,11 @@ def _mean(values: list[float | None]) -> float:
     return statistics.mean(value for value in values if value is not None)
 
 
-def _spread(values: list[float | None], scale: float = 1.0) -> str:
+def _spread(values: list[float | None], scale: float = 1.0, form: str = ".4g") -> str:
     present = [scale * value for value in values if value is not None]
     if not present:
         return "-"
-    return f"{_mean(present):.4g} ({min(present):.4g} to {max(present):.4g})"
+    return f"{_mean(present):{form}} ({min(present):{form}} to {max(present):{form}})"
 
 
 def _ratio(values: list[float | None], ours: list[float | None] | None) -> str:
