@@ -236,7 +236,7 @@ def in_kernel(
 
 
 # `jax.lax.platform_dependent` would trace the kernel and the function at once, and again for each
-# `jax.vmap` around the batch, which takes half a second of a training's start. A primitive is
+# `jax.vmap` around the batch, which takes tenths of a second of a training's start. A primitive is
 # traced when a program that contains it is lowered, and only for the program's platform.
 _elementwise = Primitive("elementwise")
 
