@@ -273,8 +273,8 @@ run = jax.jit(
 text = run.lower(shapes).compile().as_text()
 names = r"(all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)(?:-start)?[(]"
 print(*re.findall(names, text))
-shapes = {tuple(map(int, shape.split(","))) for shape in re.findall(r"\\w\\[([0-9,]+)\\]", text)}
-print(*[shape for shape in shapes if any(n and n % config.num_envs == 0 for n in shape)])
+arrays = {tuple(map(int, shape.split(","))) for shape in re.findall(r"\\w\\[([0-9,]+)\\]", text)}
+print(*[shape for shape in arrays if any(n and n % config.num_envs == 0 for n in shape)])
 """
 
 

@@ -135,7 +135,7 @@ class Layout(NamedTuple):
         """Arguments [..., *shape] -> rows [R, ...]."""
         rows = []
         for x, used in zip(args, self.used, strict=True):
-            x = _move_last(to_float(x), used.ndim)
+            x = _last_axes_first(to_float(x), used.ndim)
             x = x.reshape(used.size, *x.shape[used.ndim :])
             rows += [x[start:stop] for start, stop in _runs(np.flatnonzero(used))]
         return jnp.concatenate(rows)
@@ -146,15 +146,15 @@ class Layout(NamedTuple):
         for positions in self.results:
             parts = [rows[start:stop] for start, stop in _runs(positions.ravel())]
             x = jnp.concatenate(parts) if len(parts) > 1 else parts[0]
-            x = _move_last(x.reshape(positions.shape + rows.shape[1:]), rows.ndim - 1)
+            x = _last_axes_first(x.reshape(positions.shape + rows.shape[1:]), rows.ndim - 1)
             results.append(from_float(x, self.dtypes[positions.flat[0]]))
         return tuple(results)
 
 
-def _move_last(x: jax.Array, count: int) -> jax.Array:
-    """Moves all axes but the last `count` to the end: [..., *kept] -> [*kept, ...]."""
-    first = x.ndim - count
-    return x.transpose(*range(first, x.ndim), *range(first))
+def _last_axes_first(x: jax.Array, count: int) -> jax.Array:
+    """[..., *last] -> [*last, ...]."""
+    others = x.ndim - count
+    return x.transpose(*range(others, x.ndim), *range(others))
 
 
 def _runs(numbers: np.ndarray) -> list[tuple[int, int]]:
@@ -221,7 +221,7 @@ def in_kernel(
 
     def run(rows: jax.Array) -> jax.Array:
         if interpret:
-            return _run_packed(rows, function, num_results, interpret)
+            return _run_in_kernel(rows, function, num_results, interpret)
         # `jax.jit`, because the primitive has no implementation outside compiled programs.
         bind = functools.partial(_elementwise.bind, function=function, num_results=num_results)
         return jax.jit(bind)(rows)
@@ -246,34 +246,20 @@ def _result_type(packed: ShapedArray, *, num_results: int, **_: object) -> Shape
     return ShapedArray((num_results, *packed.shape[1:]), packed.dtype)
 
 
-def _run_packed(
-    packed: jax.Array, function: ElementwiseFunction, num_results: int, interpret: bool = False
-) -> jax.Array:
-    """Arguments [rows, ...] -> results [num_results, ...]."""
-    rows, *batch = packed.shape
-    flat = packed.reshape(rows, math.prod(batch))
-    return _run_flat(function, flat, num_results, interpret).reshape(num_results, *batch)
-
-
 def _run_by_xla(packed: jax.Array, function: ElementwiseFunction, num_results: int) -> jax.Array:
     del num_results
     return jnp.stack(function(*packed))
 
 
-mlir.register_lowering(_elementwise, mlir.lower_fun(_run_by_xla, multiple_results=False))
-mlir.register_lowering(
-    _elementwise, mlir.lower_fun(_run_packed, multiple_results=False), platform="cuda"
-)
-
-
-def _run_flat(
-    function: ElementwiseFunction, packed: jax.Array, num_results: int, interpret: bool
+def _run_in_kernel(
+    packed: jax.Array, function: ElementwiseFunction, num_results: int, interpret: bool = False
 ) -> jax.Array:
-    """Arguments [rows, N] -> results [num_results, N]."""
+    """Arguments [rows, ...] -> results [num_results, ...]."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import mosaic_gpu as plgpu
 
-    num_rows, size = packed.shape
+    num_rows, *batch = packed.shape
+    size = math.prod(batch)
     num_blocks = -(-size // _BLOCK)
     out_type = jax.ShapeDtypeStruct((num_results, num_blocks * _BLOCK), packed.dtype)
 
@@ -300,11 +286,19 @@ def _run_flat(
             grid=(num_blocks,),
             grid_names=("block",),
             # Each thread computes environments of its own. With the other semantics, vectors of a
-            # warpgroup, the kernel takes ten times as long to compile and runs no faster.
-            # Otherwise all threads wait for each other before and after each result is stored.
+            # warpgroup, the kernel takes ten times as long to compile and runs no faster. No thread
+            # reads what another one stores, so none waits at a barrier around each store.
             compiler_params=plgpu.CompilerParams(
                 lowering_semantics=plgpu.LoweringSemantics.Lane, unsafe_no_auto_barriers=True
             ),
         )
-    padded = jnp.pad(packed, ((0, 0), (0, num_blocks * _BLOCK - size)))
-    return (run(padded) if interpret else call_kernel(run, padded))[:, :size]
+    flat = packed.reshape(num_rows, size)
+    padded = jnp.pad(flat, ((0, 0), (0, num_blocks * _BLOCK - size)))
+    results = run(padded) if interpret else call_kernel(run, padded)
+    return results[:, :size].reshape(num_results, *batch)
+
+
+mlir.register_lowering(_elementwise, mlir.lower_fun(_run_by_xla, multiple_results=False))
+mlir.register_lowering(
+    _elementwise, mlir.lower_fun(_run_in_kernel, multiple_results=False), platform="cuda"
+)

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 
 # Number of steps of the recursion that are unrolled into one kernel on a GPU. For each result XLA
-# writes out all steps before it, so the kernel's compilation takes four times as long for twice as
-# many.
+# writes out all steps before it, so the kernel's code grows with the square of this number.
 _UNROLL = 16
 
 
