@@ -91,6 +91,8 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
                 "JAX_COMPILATION_CACHE_DIR": str(cache),
                 "PYTHONUNBUFFERED": "1",
                 "TIMED_TRAIN_EVENTS": str(folder / "events.json"),
+                # The timed program only listens.
+                "BOUNCE_MJX_HELPERS": "on",
             },
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -5,22 +5,33 @@ The environment variable TIMED_TRAIN_EVENTS names the JSON file of the events: n
 
 import json
 import os
+import sys
 import time
 from pathlib import Path
 
 from bounce_mjx.commands.train import main
-from bounce_mjx.training.loop_fusion import join_loops
 
-# Before JAX is imported, as the command itself does it.
-join_loops()
-
-import jax  # noqa: E402
+# Imported by the command after JAX, which is not to be imported before the command starts.
+AFTER_JAX = "bounce_mjx.training.job"
 
 events: list[tuple[str, float, float]] = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, seconds, **_: events.append((event, time.time(), seconds))
-)
-jax.monitoring.register_event_listener(lambda event, **_: events.append((event, time.time(), 0.0)))
+
+
+def listen(event: str, arguments: tuple) -> None:
+    """Listens to JAX's events from one of Python's own events on."""
+    if event != "import" or arguments[0] != AFTER_JAX:
+        return
+    import jax
+
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **_: events.append((event, time.time(), seconds))
+    )
+    jax.monitoring.register_event_listener(
+        lambda event, **_: events.append((event, time.time(), 0.0))
+    )
+
+
+sys.addaudithook(listen)
 try:
     main()
 finally:

@@ -70,12 +70,13 @@ def block_sums(
             inside = (chunk >= start) & (chunk < start + count)
             pl.when(inside)(lambda a=(source, target, start, count): add(*a))
 
+    results = [
+        *(jax.ShapeDtypeStruct((rows, x.shape[2]), jnp.float32) for x in arrays),
+        jax.ShapeDtypeStruct((rows, sum(counts)), jnp.float32),
+    ]
     run = plgpu.kernel(
         kernel,
-        out_type=[
-            *(jax.ShapeDtypeStruct((rows, x.shape[2]), jnp.float32) for x in arrays),
-            jax.ShapeDtypeStruct((rows, sum(counts)), jnp.float32),
-        ],
+        out_type=results,
         grid=(sum(counts), rows),
         grid_names=("chunk", "row"),
         compiler_params=plgpu.CompilerParams(lowering_semantics=plgpu.LoweringSemantics.Lane),
@@ -84,7 +85,7 @@ def block_sums(
     if interpret is not None:
         *sums, squares = run(*arrays)
     else:
-        *sums, squares = call_kernel(run, *arrays, key="block_sums")
+        *sums, squares = call_kernel(run, results, *arrays, key=("sums",))
     return sums, squares
 
 

@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.batches import batch_by, partition_by
-from bounce_mjx.gpu.kernel_calls import call_kernel
+from bounce_mjx.gpu.kernel_calls import Key, call_kernel, lowers_for_another
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
@@ -115,7 +115,9 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
             results=tuple(scalar_function.positions),
             dtypes=tuple(scalar_function.dtypes),
         )
-        results = _in_kernel_for_batches(flat_function, on_floats, layout, interpret)(*leaves)
+        key = "elementwise", scalar_function.digest
+        run = _in_kernel_for_batches(flat_function, on_floats, layout, interpret, key)
+        results = run(*leaves)
         return result_tree[-1].unflatten(results)
 
     return wrapped
@@ -169,17 +171,20 @@ def _in_kernel_for_batches(
     on_rows: ElementwiseFunction,
     layout: Layout,
     interpret: bool,
+    key: Key | None = None,
 ) -> Callable[..., Arrays]:
     """`function` of small arrays, with a GPU kernel for its batches.
 
     Args:
       on_rows: computes it for rows: the used entries of the arguments -> the rows of the results.
+      key: see `call_kernel`.
     """
 
     def on_batch(*args: jax.Array) -> Arrays:
         if args[0].ndim == layout.used[0].ndim:
             return tuple(function(*args))
-        return layout.unpack(in_kernel(on_rows, len(layout.dtypes), layout.pack(args), interpret))
+        rows = layout.pack(args)
+        return layout.unpack(in_kernel(on_rows, len(layout.dtypes), rows, interpret, key))
 
     call = batch_by(on_batch, lambda *args: call(*args))
 
@@ -214,16 +219,26 @@ def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
 
 
 def in_kernel(
-    function: ElementwiseFunction, num_results: int, rows: jax.Array, interpret: bool = False
+    function: ElementwiseFunction,
+    num_results: int,
+    rows: jax.Array,
+    interpret: bool = False,
+    key: Key | None = None,
 ) -> jax.Array:
     """Runs `function` of rows [R, ...] in one kernel, and returns its results as rows; with several
-    devices, each computes its shard."""
+    devices, each computes its shard.
+
+    Args:
+      key: see `call_kernel`.
+    """
 
     def run(rows: jax.Array) -> jax.Array:
-        if interpret:
-            return _run_in_kernel(rows, function, num_results, interpret)
+        if interpret or lowers_for_another():
+            return _run_in_kernel(rows, function, num_results, key, interpret)
         # `jax.jit`, because the primitive has no implementation outside compiled programs.
-        bind = functools.partial(_elementwise.bind, function=function, num_results=num_results)
+        bind = functools.partial(
+            _elementwise.bind, function=function, num_results=num_results, key=key
+        )
         return jax.jit(bind)(rows)
 
     def specs(packed: PartitionSpec) -> tuple[tuple[PartitionSpec], PartitionSpec]:
@@ -246,13 +261,16 @@ def _result_type(packed: ShapedArray, *, num_results: int, **_: object) -> Shape
     return ShapedArray((num_results, *packed.shape[1:]), packed.dtype)
 
 
-def _run_by_xla(packed: jax.Array, function: ElementwiseFunction, num_results: int) -> jax.Array:
-    del num_results
+def _run_by_xla(packed: jax.Array, function: ElementwiseFunction, **_: object) -> jax.Array:
     return jnp.stack(function(*packed))
 
 
 def _run_in_kernel(
-    packed: jax.Array, function: ElementwiseFunction, num_results: int, interpret: bool = False
+    packed: jax.Array,
+    function: ElementwiseFunction,
+    num_results: int,
+    key: Key | None,
+    interpret: bool = False,
 ) -> jax.Array:
     """Arguments [rows, ...] -> results [num_results, ...]."""
     from jax.experimental import pallas as pl
@@ -294,7 +312,7 @@ def _run_in_kernel(
         )
     flat = packed.reshape(num_rows, size)
     padded = jnp.pad(flat, ((0, 0), (0, num_blocks * _BLOCK - size)))
-    results = run(padded) if interpret else call_kernel(run, padded)
+    results = run(padded) if interpret else call_kernel(run, out_type, padded, key=key)
     return results[:, :size].reshape(num_results, *batch)
 
 

@@ -8,6 +8,7 @@ scalars alone.
 """
 
 import functools
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -65,6 +66,8 @@ class ScalarFunction(NamedTuple):
     """Type of each of those scalars."""
     used: list[bool]
     """For each scalar of the arguments, whether it influences a result."""
+    digest: str
+    """The same for functions of the same operations, also in another process."""
 
 
 def as_scalars(
@@ -98,7 +101,38 @@ def as_scalars(
         positions=positions,
         dtypes=[v.aval.dtype for v in trace.jaxpr.outvars],
         used=[v in needed for v in trace.jaxpr.invars],
+        digest=_digest(trace),
     )
+
+
+def _digest(trace: ClosedJaxpr) -> str:
+    """A hash of all operations of a trace, and of their operands."""
+    text = hashlib.sha256()
+
+    def add(jaxpr: Jaxpr, consts: Sequence[Any]) -> None:
+        numbers: dict[Any, int] = {}
+
+        def of(v: Any) -> tuple:
+            if isinstance(v, Literal):
+                return v.aval.dtype.name, np.asarray(v.val).tobytes()
+            return numbers.setdefault(v, len(numbers)), v.aval.dtype.name, v.aval.shape
+
+        given = [np.asarray(c) for c in consts]
+        parts = [[of(v) for v in jaxpr.invars + jaxpr.constvars], [x.tobytes() for x in given]]
+        for equation in jaxpr.eqns:
+            plain = {}
+            for name, value in sorted(equation.params.items()):
+                if isinstance(value, Jaxpr | ClosedJaxpr):
+                    closed = isinstance(value, ClosedJaxpr)
+                    add(value.jaxpr if closed else value, value.consts if closed else ())
+                else:
+                    plain[name] = value
+            operands = [of(v) for v in equation.invars], [of(v) for v in equation.outvars]
+            parts.append((equation.primitive.name, plain, operands))
+        text.update(repr((parts, [of(v) for v in jaxpr.outvars])).encode())
+
+    add(trace.jaxpr, trace.consts)
+    return text.hexdigest()
 
 
 def _needed(jaxpr: Jaxpr) -> set:

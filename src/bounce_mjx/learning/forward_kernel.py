@@ -191,9 +191,13 @@ def _run(
             bias = each_row(exact_ref.at[seed, network, output_bias], NUM_OUTPUTS)
             result = product(values, w3) + bias
             step, samples = place(number)
-            for i in range(num_outputs):
+
+            def one_output(i: jax.Array, _: None) -> None:
                 chosen = jnp.where(column == i, result, jnp.zeros_like(result))
                 result_ref[seed, step, i, samples] = jnp.sum(chosen, axis=1)
+
+            # A loop, because Python lowers every store of an unrolled one.
+            jax.lax.fori_loop(0, num_outputs, one_output, None)
 
         jax.lax.fori_loop(0, tiles_per_block, one_tile, None)
 
@@ -204,9 +208,10 @@ def _run(
     def shared(*shape: int, transforms: tuple = wide) -> plgpu.SMEM:
         return plgpu.SMEM(shape, bfloat16, transforms=transforms)
 
+    results = jax.ShapeDtypeStruct((num_seeds, length, num_outputs, batch), float32)
     run = plgpu.kernel(
         kernel,
-        out_type=jax.ShapeDtypeStruct((num_seeds, length, num_outputs, batch), float32),
+        out_type=results,
         scratch_types=[
             shared(2, NUM_INPUTS, TILE),
             shared(NUM_INPUTS, width),
@@ -224,7 +229,9 @@ def _run(
         interpret=interpret,
     )
     args = inputs, hidden, output, exact_output
-    return run(*args) if interpret is not None else call_kernel(run, *args)
+    if interpret is not None:
+        return run(*args)
+    return call_kernel(run, results, *args, key=("outputs", network, num_outputs))
 
 
 def _tiles_per_block(tiles: int, num_seeds: int) -> int:

@@ -528,15 +528,23 @@ def _run(
             hidden_result[hidden_bias, own_columns] = jnp.sum(bias_sum, axis=0)
             output_result[output_bias] = jnp.sum(last_bias, axis=0)
             output_result[noise_row] = jnp.sum(noise_sum, axis=0)
-            for unused in range(hidden_bias + 1, hidden_bias + _EXTRA_ROWS):
-                hidden_result[unused, own_columns] = zeros((columns,), layout.reduce(0))
-            for unused in range(noise_row + 1, output_bias + _EXTRA_ROWS):
-                output_result[unused] = zeros((NUM_OUTPUTS,), layout.reduce(0))
+
+        def clear_hidden(unused: jax.Array, _: None) -> None:
+            hidden_result[unused, own_columns] = zeros((columns,), layout.reduce(0))
+
+        def clear_output(unused: jax.Array, _: None) -> None:
+            output_result[unused] = zeros((NUM_OUTPUTS,), layout.reduce(0))
+
+        # Loops, because Python lowers every store of an unrolled one.
+        jax.lax.fori_loop(hidden_bias + 1, hidden_bias + _EXTRA_ROWS, clear_hidden, None)
+        jax.lax.fori_loop(noise_row + 1, output_bias + _EXTRA_ROWS, clear_output, None)
+
+        def one_group(number: jax.Array, _: None) -> None:
+            pl.when(group == number)(add_rows)
+            wait_for_both()
 
         # One after the other, because Mosaic GPU has one place in shared memory for sums over rows.
-        pl.when(group == 0)(add_rows)
-        wait_for_both()
-        pl.when(group == 1)(add_rows)
+        jax.lax.fori_loop(0, 2, one_group, None)
 
     # Operands of one product need the same swizzle, which their narrowest dimension bounds.
     wide = (plgpu.TilingTransform((8, columns)), plgpu.SwizzleTransform(2 * columns))
@@ -548,13 +556,14 @@ def _run(
     def sums(count: int, *shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((num_seeds, 2, count, *shape), float32)
 
+    results = [
+        sums(blocks, *hidden.shape[2:]),
+        sums(2 * blocks, *output.shape[2:]),
+        sums(2 * blocks, 2, _ROWS),
+    ]
     run = plgpu.kernel(
         kernel,
-        out_type=[
-            sums(blocks, *hidden.shape[2:]),
-            sums(2 * blocks, *output.shape[2:]),
-            sums(2 * blocks, 2, _ROWS),
-        ],
+        out_type=results,
         scratch_types=[
             shared(2, 2, _ROWS, NUM_INPUTS),
             shared(NUM_INPUTS, width),
@@ -583,4 +592,4 @@ def _run(
     if interpret is not None:
         return tuple(run(*args))
     key = "minibatch", config, sizes, num_samples, tiles_per_block
-    return tuple(call_kernel(run, *args, key=key))
+    return tuple(call_kernel(run, results, *args, key=key))

@@ -20,6 +20,7 @@ from bounce_mjx.task.config import EnvConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.training.helpers import Helpers
     from bounce_mjx.training.job import Outcome
     from bounce_mjx.training.trainer import Trainer, Watcher
 
@@ -111,6 +112,7 @@ def run_command(
     prog: str,
     watcher: "Watcher | None" = None,
     modules: Sequence[str] | None = None,
+    helpers: "Helpers | None" = None,
     stopped: Callable[[Sequence[Path]], None] = lambda runs: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
@@ -144,6 +146,7 @@ def run_command(
             wandb=command.wandb,
             watcher=watcher,
             modules=modules,
+            helpers=helpers,
         )
     except TrainingStopped as stop:
         say(console, str(stop))

@@ -19,7 +19,7 @@ from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
-from bounce_mjx.training.programs import Programs, calls_lapack
+from bounce_mjx.training.programs import EVALUATE, Programs, calls_lapack
 from bounce_mjx.training.setup import compiler_options
 
 Tree = TypeVar("Tree")
@@ -53,7 +53,7 @@ class Evaluators:
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
-        self._program = programs.get("evaluate", mesh, self._lower)
+        self._program = programs.get(EVALUATE, mesh, self._lower)
 
     def wait(self) -> None:
         """Waits until the program is compiled."""

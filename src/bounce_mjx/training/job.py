@@ -21,6 +21,7 @@ from rich.console import Console
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.gpu.kernel_calls import lower_elsewhere
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
@@ -42,6 +43,7 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.helpers import Helpers
 from bounce_mjx.training.log import Logs, WandbLog, open_log
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.signals import StopRequest
@@ -98,6 +100,7 @@ def train(
     wandb: str | None = None,
     watcher: Watcher | None = None,
     modules: Sequence[str] | None = None,
+    helpers: Helpers | None = None,
 ) -> list[Outcome]:
     """Trains with a config, and returns an outcome for each seed.
 
@@ -110,6 +113,7 @@ def train(
       watcher: receives the progress of the first seed.
       modules: the modules that were imported before the training's (`setup.imported_modules`), with
         which equal trainings in later processes find their compiled programs; None to trace anew.
+      helpers: processes that prepare this training, too.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -123,6 +127,11 @@ def train(
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         job = _Job(config, console, make_trainer, command, resume, stop, pool, stack)
         job.wandb, job.watcher, job.modules = wandb, watcher, modules
+        if helpers is not None:
+            job.helpers = helpers
+            stack.callback(helpers.close)
+            lower_elsewhere(helpers)
+            stack.callback(lower_elsewhere, None)
         job.compile(report)
         job.train()
         job.finish()
@@ -174,6 +183,7 @@ class _Job:
         self.wandb: str | None = None
         self.watcher: Watcher | None = None
         self.modules: Sequence[str] | None = None
+        self.helpers: Helpers | None = None
         self.clock = Clock()
         hosts.connect(self._advice)
         self.env = BounceBall(config.env)
@@ -309,7 +319,7 @@ class _Job:
         """Returns once the training can start, with the future of its logs. The longest program is
         traced first: Python traces one program at a time while XLA compiles others."""
         kept = kept_programs(self.config, self.env.mj_model, self.trainer.mesh, self.modules)
-        programs = Programs(self.pool, kept)
+        programs = Programs(self.pool, kept, self.helpers)
         compiling = self.trainer.compile(programs)
         self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, programs)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)

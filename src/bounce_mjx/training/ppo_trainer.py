@@ -62,6 +62,12 @@ class PPOTrainer:
         self._init = programs.get("init", self.mesh, self._lower_init)
         return self._run
 
+    def trace(self) -> None:
+        """Traces the training's program."""
+        jax.make_jaxpr(lambda state: self._trainer.run(state, self._compiled_iterations))(
+            self._shapes
+        )
+
     def _lower_run(self) -> jax.stages.Lowered:
         def train_block(state: TrainingState):
             return self._trainer.run(state, self._compiled_iterations)

@@ -31,25 +31,43 @@ from jax.sharding import Mesh
 import bounce_mjx
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import PARTIAL
+from bounce_mjx.training.helpers import NOT_COMPILED, Helpers
 
-_NOT_COMPILED = ("seed", "eval_seed", "total_steps", "eval_every", "stop_when_solved", "log_dir")
 _VARIABLES = ("BOUNCE_MJX_", "CUDA_", "JAX_", "NVIDIA_", "XLA_")
 # A training has three programs, of a few MB each.
 _MOST_FILES = 60
 _HASH_BYTES = 32
+
+EVALUATE = "evaluate"
+"""Name of the evaluation's program, which helpers compile."""
 
 
 class Programs:
     """Compiles the programs of a training in the background, or loads the programs that an equal
     training left behind."""
 
-    def __init__(self, pool: concurrent.futures.Executor, folder: Path | None = None):
+    def __init__(
+        self,
+        pool: concurrent.futures.Executor,
+        folder: Path | None = None,
+        helpers: Helpers | None = None,
+    ):
         """
         Args:
           pool: threads for the work.
           folder: of the kept programs of equal trainings (`kept_programs`); None keeps none.
+          helpers: processes that prepare the training, too; needless if the programs are kept.
         """
-        self._pool, self._folder = pool, folder
+        self._pool, self._folder, self._helpers = pool, folder, helpers
+        if helpers is None:
+            return
+        if folder is None or folder.is_dir():
+            if folder is not None:
+                helpers.remember()
+            helpers.close()
+            self._helpers = None
+        else:
+            helpers.keep_in(folder)
 
     def get(
         self, name: str, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
@@ -65,7 +83,15 @@ class Programs:
         path = None if self._folder is None else self._folder / name
         if path is not None and path.is_file():
             return self._pool.submit(self._load_or_compile, path, mesh, lower)
+        if self._helpers is not None and name == EVALUATE:
+            return self._pool.submit(self._load_from_helper, path, mesh, lower)
         return self._pool.submit(self._compile, name, lower())
+
+    def _load_from_helper(
+        self, path: Path, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
+    ) -> jax.stages.Compiled:
+        self._helpers.wait_for_evaluation()
+        return self._load_or_compile(path, mesh, lower)
 
     def _load_or_compile(
         self, path: Path, mesh: Mesh, lower: Callable[[], jax.stages.Lowered]
@@ -98,6 +124,8 @@ class Programs:
             partial.write_bytes(hashlib.sha256(content).digest() + content)
             partial.rename(self._folder / name)
             _remove_oldest(self._folder.parent)
+            if self._helpers is not None:
+                self._helpers.remember()
 
 
 def calls_lapack(program: jax.stages.Compiled) -> bool:
@@ -126,7 +154,7 @@ def kept_programs(
     sources = sorted(Path(bounce_mjx.__file__).parent.rglob("*.py"))
     device = mesh.devices.flat[0]
     parts = (
-        config.model_dump_json(exclude=set(_NOT_COMPILED)),
+        config.model_dump_json(exclude=set(NOT_COMPILED)),
         model.tobytes(),
         *(path.read_bytes() for path in sources),
         modules,

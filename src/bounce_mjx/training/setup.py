@@ -5,9 +5,10 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
+
+from bounce_mjx.training.helpers import cache_folder
 
 
 def set_up_jax() -> None:
@@ -23,8 +24,7 @@ def cache_compilations() -> None:
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
 
 
 def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
