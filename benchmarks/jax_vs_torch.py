@@ -42,6 +42,7 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.gpu.kernel_calls import lower_elsewhere
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
@@ -49,7 +50,8 @@ from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.command import path_flag
-from bounce_mjx.training.setup import compiler_options, set_up_gpu
+from bounce_mjx.training.helpers import Helpers
+from bounce_mjx.training.setup import compiler_options
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
 _NAMES = {
@@ -91,8 +93,6 @@ class Command(TrainConfig):
     """Further .jsonl files with records to show."""
     out: Path = Path("benchmarks/results")
     """Folder for jax_vs_torch.jsonl, .md and .png."""
-    worker: bool = False
-    """Train one method and seed in this process; the command itself starts such processes."""
 
 
 def main() -> None:
@@ -100,10 +100,6 @@ def main() -> None:
     with exit_on_user_error():
         args = sys.argv[1:]
         command = read_command(args)
-        if command.worker:
-            set_up_gpu()
-            train_here(command)
-            return
         command.out.mkdir(parents=True, exist_ok=True)
         for seed in command.seeds:
             for method in command.methods:
@@ -131,16 +127,18 @@ def read_command(args: list[str]) -> Command:
 
 def train_in_a_process(command: Command, args: list[str], method: Method, seed: int) -> None:
     """Trains one method with one seed in a new process, with an empty compilation cache."""
-    own = ["--methods", method, "--seed", str(seed), "--worker", "--out", str(command.out)]
+    own = ["--methods", method, "--seed", str(seed), "--out", str(command.out)]
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {
             "JAX_COMPILATION_CACHE_DIR": cache,
             # JAX would otherwise reserve most of the memory, and PyTorch needs some of it.
             "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+            # `one_training.py` does not change the package.
+            "BOUNCE_MJX_HELPERS": "on",
             _STARTED: str(time.time()),
         }
         finished = subprocess.run(
-            [sys.executable, __file__, *args, *own],
+            [sys.executable, Path(__file__).with_name("one_training.py"), *args, *own],
             env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -153,12 +151,21 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
         print(lines[-1], flush=True)
 
 
-def train_here(command: Command) -> None:
-    """Trains in this process, and writes each evaluation as it ends."""
+def train_here(command: Command, helpers: Helpers | None) -> None:
+    """Trains in this process, and writes each evaluation as it ends.
+
+    Args:
+      helpers: processes that lower the kernels of our trainer, as for our command.
+    """
     (method,) = command.methods
     config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
+    if helpers is not None:
+        helpers.begin(config)
+        lower_elsewhere(helpers)
     with (command.out / _RECORDS).open("a", encoding="utf-8") as file:
         TRAINERS[method](config, _Judge(command, config, method, file))
+    if helpers is not None:
+        helpers.close()
 
 
 class _Judge:
