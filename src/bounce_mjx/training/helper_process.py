@@ -14,9 +14,13 @@ import sys
 import threading
 from collections.abc import Collection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.training.helpers import encoded, module_files
+
+if TYPE_CHECKING:
+    from bounce_mjx.runs.config import TrainConfig
 
 _writing = threading.Lock()
 
@@ -66,7 +70,7 @@ def compile_evaluation() -> None:
             Evaluators(config, env, mesh, Programs(pool, Path(folder))).wait()
 
 
-def _receive_config():
+def _receive_config() -> "TrainConfig":
     # A process whose modules are not the same as these would train something else.
     for command in ("main", "train"):
         importlib.import_module(f"bounce_mjx.commands.{command}")
