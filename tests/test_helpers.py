@@ -15,7 +15,7 @@ import bounce_mjx
 from bounce_mjx.config.validation import validate
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import latest_checkpoint
-from bounce_mjx.training import helpers
+from bounce_mjx.training import helper_process, helpers
 from bounce_mjx.training.helpers import Helpers, start_helpers
 from tiny_runs import TINY, arrays, job
 
@@ -26,7 +26,7 @@ HELPED = """
 import sys
 import jax
 from bounce_mjx.commands.train import main
-from bounce_mjx.training import helpers
+from bounce_mjx.training import helper_process, helpers
 helped = "--helped" in sys.argv
 helpers._are_of_use = lambda: helped
 helpers._WORK = (helpers.EVALUATION,)
@@ -124,6 +124,36 @@ def test_a_kernel_comes_from_a_helper_or_from_nowhere(
     assert started.wait_for("sums", "b") is None and not started.lowers("sums")
 
 
+@pytest.mark.parametrize(("modes", "alone"), [((0, 0), False), ((0, 3), True), (None, False)])
+def test_a_gpu_for_one_process_is_left_to_the_training(
+    monkeypatch: pytest.MonkeyPatch, modes: tuple[int, ...] | None, alone: bool
+) -> None:
+    """A stand-in for NVIDIA's library, whose functions return 0 where they succeed."""
+
+    class Library:
+        def __init__(self, _: str):
+            if modes is None:
+                raise OSError("no library")
+
+        def nvmlInit_v2(self) -> int:
+            return 0
+
+        def nvmlDeviceGetCount_v2(self, count) -> int:
+            count._obj.value = len(modes)
+            return 0
+
+        def nvmlDeviceGetHandleByIndex_v2(self, index: int, device) -> int:
+            device._obj.value = index + 1
+            return 0
+
+        def nvmlDeviceGetComputeMode(self, device, mode) -> int:
+            mode._obj.value = modes[device.value - 1]
+            return 0
+
+    monkeypatch.setattr(helper_process.ctypes, "CDLL", Library)
+    assert helper_process.admits_one_process() == alone
+
+
 def test_helpers_end_with_the_training(fake_process, tmp_path: Path) -> None:
     fake_process("sys.stdin.readline()\ntime.sleep(600)")
     started = Helpers(tmp_path / "note")
@@ -210,6 +240,10 @@ class TestStart:
 
     def test_no_gpu(self, monkeypatch) -> None:
         monkeypatch.setattr(helpers.importlib.util, "find_spec", lambda _: None)
+        assert start_helpers([]) is None
+
+    def test_a_deleted_working_folder(self, monkeypatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(helpers.os, "getcwd", Path(tmp_path / "missing").stat)
         assert start_helpers([]) is None
 
     def test_programs_that_are_kept(self, tmp_path: Path) -> None:

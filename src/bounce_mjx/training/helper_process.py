@@ -7,6 +7,8 @@ standard input, and write lines of JSON to the standard output.
 
 import base64
 import concurrent.futures
+import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -84,6 +86,22 @@ def _receive_config() -> "TrainConfig":
     return TrainConfig.model_validate_json(line)
 
 
+def admits_one_process() -> bool:
+    """Whether a GPU is in a mode in which only one process can use it: the training's own."""
+    with contextlib.suppress(OSError, AttributeError):
+        nvml = ctypes.CDLL("libnvidia-ml.so.1")
+        count, device, mode = ctypes.c_uint(), ctypes.c_void_p(), ctypes.c_int()
+        if nvml.nvmlInit_v2() or nvml.nvmlDeviceGetCount_v2(ctypes.byref(count)):
+            return False
+        for index in range(count.value):
+            found = nvml.nvmlDeviceGetHandleByIndex_v2(index, ctypes.byref(device)) == 0
+            if found and nvml.nvmlDeviceGetComputeMode(device, ctypes.byref(mode)) == 0:
+                # 0 is NVML_COMPUTEMODE_DEFAULT.
+                if mode.value != 0:
+                    return True
+    return False
+
+
 def _send(**message: object) -> None:
     with _writing:
         print(json.dumps(message), flush=True)
@@ -92,6 +110,8 @@ def _send(**message: object) -> None:
 def main() -> None:
     """Runs the command line."""
     what, *kinds = sys.argv[1:]
+    if admits_one_process():
+        sys.exit("only one process can use the GPU")
     with no_garbage_collection():
         from bounce_mjx.training.setup import find_devices, set_up_jax
 

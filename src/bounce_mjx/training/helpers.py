@@ -37,6 +37,7 @@ _WORK = (
 _MODULE = "bounce_mjx.training.helper_process"
 # With fewer processor cores the processes would slow the training's own start down.
 _MIN_CORES = 8
+_MOST_NOTES = 100
 
 # "off" never starts them; "on" starts them in every program, whatever it has changed in memory.
 _SWITCH = "BOUNCE_MJX_HELPERS"
@@ -61,10 +62,11 @@ def start_helpers(args: Sequence[str]) -> "Helpers | None":
     Args:
       args: the command's arguments.
     """
-    if not _are_of_use():
-        return None
-    note = _note(args)
-    return None if note.exists() else Helpers(note)
+    # Without a home or working folder, the training itself tells what is wrong.
+    with contextlib.suppress(OSError, RuntimeError):
+        if _are_of_use() and not (note := _note(args)).exists():
+            return Helpers(note)
+    return None
 
 
 def _are_of_use() -> bool:
@@ -101,11 +103,10 @@ def _note(args: Sequence[str]) -> Path:
     words = list(args)
     for flag in NOT_COMPILED:
         words = _without(words, flag)
-    files = [Path(bounce_mjx.__file__).parent.rglob("*.py"), map(Path, words)]
-    changed = [
-        (str(path), path.stat().st_mtime_ns) for group in files for path in group if path.is_file()
-    ]
-    described = repr((words, sorted(changed), os.getcwd(), sys.version))
+    files = [*map(str, Path(bounce_mjx.__file__).parent.rglob("*.py"))]
+    files += filter(os.path.isfile, words)
+    changed = sorted((name, os.stat(name).st_mtime_ns) for name in files)
+    described = repr((words, changed, os.getcwd(), sys.version))
     return cache_folder() / "starts" / hashlib.sha256(described.encode()).hexdigest()[:40]
 
 
@@ -194,9 +195,13 @@ class Helpers:
     def remember(self) -> None:
         """Notes that the programs of this command line are kept, so that its next start needs no
         helpers."""
+        folder = self._note.parent
         with contextlib.suppress(OSError):
-            self._note.parent.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
             self._note.touch()
+            newest = sorted(folder.iterdir(), key=lambda note: -note.stat().st_mtime)
+            for old in newest[_MOST_NOTES:]:
+                old.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Ends the processes."""
@@ -249,6 +254,8 @@ def _start(*arguments: str) -> subprocess.Popen:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
+        # The memory is the training's, whatever its user has set.
+        env=os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
         # Ctrl-C is for the training, which ends its helpers.
         start_new_session=True,
     )
