@@ -164,6 +164,19 @@ def test_helpers_end_with_the_training(fake_process, tmp_path: Path) -> None:
     assert all(process.poll() is not None for process in started._processes.values())
 
 
+def test_a_helper_that_hangs_is_given_up(fake_process, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(helpers, "_PATIENCE", 0.1)
+    fake_process("time.sleep(600)")
+    started = Helpers(tmp_path / "note")
+    try:
+        started.begin(validate(TrainConfig, {}, "test"))
+        assert started.wait_for("sums", "a") is None
+        started.wait_for_evaluation()
+        assert started._processes[helpers.EVALUATION].poll() is not None
+    finally:
+        started.close()
+
+
 def test_a_helper_ends_when_the_training_has_died() -> None:
     started = [helpers._start(*work) for work in helpers._WORK[2:]]
     for process in started:

@@ -213,6 +213,8 @@ def test_functions_with_other_numbers_are_other_kernels():
         lambda x: loop(x, 3, 1.0),
         lambda x: loop(x, 4, 1.0),
         lambda x: loop(x, 3, 2.0),
+        lambda x: jnp.where(x > 0.0, x, 1.0),
+        lambda x: jnp.where(x > 0.0, x, 2.0),
     ]
     digests = [digest(function) for function in functions]
     assert len(set(digests)) == len(functions)

@@ -122,9 +122,11 @@ def _digest(trace: ClosedJaxpr) -> str:
         for equation in jaxpr.eqns:
             plain = {}
             for name, value in sorted(equation.params.items()):
-                if isinstance(value, Jaxpr | ClosedJaxpr):
-                    closed = isinstance(value, ClosedJaxpr)
-                    add(value.jaxpr if closed else value, value.consts if closed else ())
+                inner = value if isinstance(value, tuple) else (value,)
+                if any(isinstance(x, Jaxpr | ClosedJaxpr) for x in inner):
+                    for x in inner:
+                        closed = isinstance(x, ClosedJaxpr)
+                        add(x.jaxpr if closed else x, x.consts if closed else ())
                 else:
                     plain[name] = value
             operands = [of(v) for v in equation.invars], [of(v) for v in equation.outvars]

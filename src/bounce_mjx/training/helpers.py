@@ -38,6 +38,8 @@ _MODULE = "bounce_mjx.training.helper_process"
 # With fewer processor cores the processes would slow the training's own start down.
 _MIN_CORES = 8
 _MOST_NOTES = 100
+# Time after which a process does not help any more, s.
+_PATIENCE = 120.0
 
 # "off" never starts them; "on" starts them in every program, whatever it has changed in memory.
 _SWITCH = "BOUNCE_MJX_HELPERS"
@@ -180,7 +182,9 @@ class Helpers:
 
     def wait_for(self, kind: Hashable, name: str) -> "Attributes | None":
         with self._changed:
-            self._changed.wait_for(lambda: name in self._lowered or not self.lowers(kind))
+            self._changed.wait_for(
+                lambda: name in self._lowered or not self.lowers(kind), timeout=_PATIENCE
+            )
             return self._lowered.get(name)
 
     def keep_in(self, folder: Path) -> None:
@@ -190,7 +194,8 @@ class Helpers:
     def wait_for_evaluation(self) -> None:
         """Waits until the evaluation is compiled and kept, or cannot be."""
         with self._changed:
-            self._changed.wait_for(lambda: EVALUATION not in self._busy)
+            self._changed.wait_for(lambda: EVALUATION not in self._busy, timeout=_PATIENCE)
+        _end(self._processes[EVALUATION])
 
     def remember(self) -> None:
         """Notes that the programs of this command line are kept, so that its next start needs no
