@@ -1,12 +1,32 @@
 """Kernels under `jax.vmap` and on several devices."""
 
-from collections.abc import Callable
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.custom_partitioning import custom_partitioning
 from jax.sharding import NamedSharding, PartitionSpec
+
+_outer_axis: contextvars.ContextVar[int] = contextvars.ContextVar("outer_axis", default=0)
+
+
+@contextlib.contextmanager
+def outer_axis(size: int) -> Iterator[None]:
+    """Tells that `jax.vmap` adds an axis of this size around all that is traced within. JAX first
+    traces the functions of `batch_by` without it, and drops what it has traced."""
+    token = _outer_axis.set(size)
+    try:
+        yield
+    finally:
+        _outer_axis.reset(token)
+
+
+def is_dropped() -> bool:
+    """Whether a function of `batch_by` is being traced without the outer axis."""
+    return _outer_axis.get() > 0
 
 
 def batch_by(function: Callable[..., tuple], batched: Callable[..., tuple]) -> Callable[..., tuple]:
@@ -24,7 +44,8 @@ def batch_by(function: Callable[..., tuple], batched: Callable[..., tuple]) -> C
             x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             for x, is_batched in zip(args, in_batched, strict=True)
         ]
-        results = tuple(batched(*args))
+        with outer_axis(0 if axis_size == _outer_axis.get() else _outer_axis.get()):
+            results = tuple(batched(*args))
         return results, (True,) * len(results)
 
     return call

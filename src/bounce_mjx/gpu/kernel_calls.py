@@ -20,6 +20,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import mlir
 
+from bounce_mjx.gpu.batches import is_dropped
+
 _TARGET = "mosaic_gpu_v2"
 # Kernels that are kept for a second call.
 _MOST_KEPT = 8
@@ -101,39 +103,42 @@ def call_kernel(
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args)
     leaves, structure = jax.tree.flatten(results)
     if _receive is not None:
-        if key is not None:
+        if key is not None and not is_dropped():
             _receive(key, kernel, shapes)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), results)
-    if _helper is not None and key is not None and _helper.lowers(key[0]):
-        called = _awaited.bind(*args, kernel=kernel, key=key, results=tuple(leaves))
+    lowers = _helper is not None and key is not None and _helper.lowers(key[0])
+    if lowers or is_dropped():
+        called = _deferred.bind(*args, kernel=kernel, key=key, results=tuple(leaves))
     else:
         attributes = _kept_or_lowered(kernel, shapes, key)
         called = jax.ffi.ffi_call(_TARGET, leaves)(*args, **attributes)
     return structure.unflatten(called)
 
 
-# The call of a kernel that another process lowers. This process traces on; it waits for the kernel
-# when it lowers the program that calls it.
-_awaited = Primitive("awaited_kernel")
-_awaited.multiple_results = True
+# The call of a kernel that is not lowered yet: another process lowers it, and this one waits for it
+# when it lowers the program that calls it; or JAX drops the call.
+_deferred = Primitive("deferred_kernel")
+_deferred.multiple_results = True
 
 
-@_awaited.def_abstract_eval
+@_deferred.def_abstract_eval
 def _result_types(*_: ShapedArray, results: Shapes, **__: object) -> list[ShapedArray]:
     return [ShapedArray(x.shape, x.dtype) for x in results]
 
 
 def _call_when_lowered(
-    *args: jax.Array, kernel: Callable[..., Any], key: Key, results: Shapes
+    *args: jax.Array, kernel: Callable[..., Any], key: Key | None, results: Shapes
 ) -> Sequence[jax.Array]:
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args)
-    attributes = None if _helper is None else _helper.wait_for(key[0], _name(key, shapes))
+    attributes = None
+    if _helper is not None and key is not None:
+        attributes = _helper.wait_for(key[0], _name(key, shapes))
     if attributes is None:
         attributes = _kept_or_lowered(kernel, shapes, key)
     return jax.ffi.ffi_call(_TARGET, results)(*args, **attributes)
 
 
-mlir.register_lowering(_awaited, mlir.lower_fun(_call_when_lowered, multiple_results=True))
+mlir.register_lowering(_deferred, mlir.lower_fun(_call_when_lowered, multiple_results=True))
 
 
 def _name(key: Key, shapes: Shapes) -> str:

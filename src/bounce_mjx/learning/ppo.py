@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.batches import outer_axis
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
 from bounce_mjx.learning import forward_kernel, minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
@@ -509,13 +510,12 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 def population(trainer: Trainer) -> Trainer:
     """A trainer of S independent trainings: keys [S, 2] -> states with S as the first axis of every
     array; metrics are [S, I]."""
-    return Trainer(
-        jax.vmap(trainer.init),
-        lambda states, num_iterations: jax.vmap(lambda state: trainer.run(state, num_iterations))(
-            states
-        ),
-        trainer.has_products,
-    )
+
+    def run(states: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
+        with outer_axis(len(states.iteration)):
+            return jax.vmap(lambda state: trainer.run(state, num_iterations))(states)
+
+    return Trainer(jax.vmap(trainer.init), run, trainer.has_products)
 
 
 def num_groups(config: PPOConfig) -> int:
