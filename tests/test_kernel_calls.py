@@ -16,7 +16,7 @@ from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, kernel_calls, rows
 from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.gpu.scalars import as_scalars
-from bounce_mjx.learning import ppo
+from bounce_mjx.learning import forward_kernel, minibatch_kernel, ppo
 from bounce_mjx.learning.config import PPOConfig
 
 SIZE = 256
@@ -63,7 +63,9 @@ def lowered_kernels(monkeypatch) -> list:
 
 
 def trainer_with_kernels(monkeypatch, num_seeds: int = 1):
-    """A trainer as on a GPU, and the shapes of its state."""
+    """A trainer as on a GPU, and the shapes of its state, as if nothing had been traced before."""
+    for module in (minibatch_kernel, forward_kernel):
+        module._batched_call.cache_clear()
     for module in (elementwise, rows, ppo):
         monkeypatch.setattr(module, "has_kernels", lambda: True)
     env = BounceBall()
@@ -146,6 +148,8 @@ def test_another_process_can_lower_the_kernels_of_a_training(
     kernel_calls.lower_for_another(KINDS, given.append)
     jax.make_jaxpr(lambda state: trainer.run(state, 1))(state)
     monkeypatch.setattr(kernel_calls, "_receive", None)
+    # These are two processes, so one does not know what the other one has traced.
+    trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
     helper = Elsewhere({kernel.name: kernel.attributes for kernel in given}, KINDS)
     assert len(helper.kernels) == len(given)
     lowered_kernels.clear()
