@@ -59,13 +59,13 @@ def prepare_kernels(kinds: Collection[str]) -> None:
 def compile_evaluation() -> None:
     """Leaves the program in the folder that the second line of the standard input names."""
     from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.training.devices import make_mesh
     from bounce_mjx.training.evaluators import Evaluators
-    from bounce_mjx.training.ppo_trainer import PPOTrainer
     from bounce_mjx.training.programs import Programs
 
     config = _receive_config()
     env = BounceBall(config.env)
-    mesh = PPOTrainer(config, env).mesh
+    mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
     folder = sys.stdin.readline().strip()
     if folder:
         with concurrent.futures.ThreadPoolExecutor() as pool:
@@ -95,10 +95,10 @@ def admits_one_process() -> bool:
             return False
         for index in range(count.value):
             found = nvml.nvmlDeviceGetHandleByIndex_v2(index, ctypes.byref(device)) == 0
-            if found and nvml.nvmlDeviceGetComputeMode(device, ctypes.byref(mode)) == 0:
-                # 0 is NVML_COMPUTEMODE_DEFAULT.
-                if mode.value != 0:
-                    return True
+            told = found and nvml.nvmlDeviceGetComputeMode(device, ctypes.byref(mode)) == 0
+            # 0 is NVML_COMPUTEMODE_DEFAULT.
+            if told and mode.value != 0:
+                return True
     return False
 
 

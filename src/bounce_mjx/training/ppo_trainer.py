@@ -43,8 +43,11 @@ class PPOTrainer:
             key = jax.random.PRNGKey
             return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
 
-        # One object, not a method, so that JAX traces it only once.
-        self._initial_state = initial_state
+        def train_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
+            return self._trainer.run(state, self._compiled_iterations)
+
+        # One object each, not methods, so that JAX traces them only once.
+        self._initial_state, self._train_block = initial_state, train_block
 
     @functools.cached_property
     def _shapes(self) -> TrainingState:
@@ -64,17 +67,12 @@ class PPOTrainer:
 
     def trace(self) -> None:
         """Traces the training's program."""
-        jax.make_jaxpr(lambda state: self._trainer.run(state, self._compiled_iterations))(
-            self._shapes
-        )
+        jax.make_jaxpr(self._train_block)(self._shapes)
 
     def _lower_run(self) -> jax.stages.Lowered:
-        def train_block(state: TrainingState):
-            return self._trainer.run(state, self._compiled_iterations)
-
         sharding = self._sharding
         run = jax.jit(
-            train_block,
+            self._train_block,
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,

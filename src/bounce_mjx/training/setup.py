@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import jax
 
-from bounce_mjx.training.helpers import cache_folder
+from bounce_mjx.training.helpers import cache_folder, module_files
 
 
 def set_up_jax() -> None:
@@ -41,9 +41,8 @@ def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
     main = getattr(sys.modules["__main__"], "__file__", None)
     if main is None or sys.argv[1:] not in ([*args], ["train", *args]):
         return None
-    files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
     described = []
-    for name in sorted(filter(None, files)):
+    for name in sorted({main, *module_files()}):
         with contextlib.suppress(OSError):
             status = os.stat(name)
             described.append(f"{name} {status.st_size} {status.st_mtime_ns}")
