@@ -42,12 +42,12 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     trainer = make_trainer(config.ppo, env, config.env.episode_steps)
     iterations = block_iterations(config)
     key = jax.random.PRNGKey(config.seed)
-    init = jax.jit(trainer.init)
+    init = jax.jit(trainer.init, compiler_options=compiler_options(runs_once=True))
     run = jax.jit(
         trainer.run,
         static_argnums=1,
         donate_argnums=0,
-        compiler_options=compiler_options(has_products=trainer.has_products),
+        compiler_options=compiler_options(tunes_products=trainer.has_products),
     )
     with concurrent.futures.ThreadPoolExecutor() as pool:
         shapes = jax.eval_shape(init, key)

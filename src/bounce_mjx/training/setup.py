@@ -78,13 +78,13 @@ def set_up_gpu() -> None:
 
 
 def compiler_options(
-    runs_once: bool = False, has_products: bool = True
+    runs_once: bool = False, tunes_products: bool = False
 ) -> dict[str, bool | int | str]:
     """Options of XLA for `jax.jit`.
 
-    On a GPU, XLA times several kernels for each matrix product. The option skips its check that
-    their results agree, which doubles that time; without matrix products XLA times nothing, as
-    other kernels gain nothing by it.
+    On a GPU, XLA may time several kernels for each matrix product and for some sums. It then takes
+    other ones in each compilation, whose results differ in their last bits, and doubles the time
+    of the compilation.
 
     On a CPU, XLA leaves matrix products and sums to YNNPACK, which takes one thread for products as
     small as those of a minibatch. One option leaves YNNPACK only convolutions, of which there are
@@ -94,10 +94,11 @@ def compiler_options(
     Args:
       runs_once: whether the program runs only once, so that on a CPU, where LLVM takes most of the
         time to compile it, it is not worth optimising.
-      has_products: whether the program has matrix products.
+      tunes_products: whether XLA times kernels on a GPU. It does not check that their results
+        agree, which would take as long again.
     """
     if jax.default_backend() == "gpu":
-        return {"xla_gpu_autotune_level": int(has_products)}
+        return {"xla_gpu_autotune_level": int(tunes_products)}
     # XLA may drop these options, and refuses those that it does not know.
     if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 12):
         return {}
