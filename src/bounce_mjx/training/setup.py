@@ -82,9 +82,9 @@ def compiler_options(
 ) -> dict[str, bool | int | str]:
     """Options of XLA for `jax.jit`.
 
-    On a GPU, XLA may time several kernels for each matrix product and for some sums. It then takes
-    other ones in each compilation, whose results differ in their last bits, and doubles the time
-    of the compilation.
+    On a GPU, XLA may time several kernels for each matrix product and for some other operations,
+    which doubles the time of the compilation. The quickest is not the same one each time, and then
+    the last bits of the results differ.
 
     On a CPU, XLA leaves matrix products and sums to YNNPACK, which takes one thread for products as
     small as those of a minibatch. One option leaves YNNPACK only convolutions, of which there are
