@@ -2,15 +2,15 @@
 history."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.task import noise
-from bounce_mjx.task.actuation import taken
-from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics, ObservationConfig, parts
-from bounce_mjx.task.randomization import RandomizationConfig, World
+from bounce_mjx.world import noise
+from bounce_mjx.world.actuation import taken
+from bounce_mjx.world.observation import Kinematics, ObservationConfig
+from bounce_mjx.world.randomization import RandomizationConfig, World
 
 SENSOR_TERMS = frozenset(
     "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
@@ -39,16 +39,10 @@ class Sensing(NamedTuple):
     balls: jax.Array
     """True position and velocity of the ball in the last control steps [K, 6], the newest first."""
     picture: Picture
-    flight_apex: jax.Array
-    """Highest measured position since the ball was last near the paddle [], m."""
-    is_low: jax.Array
-    """Whether the ball was measured near the paddle [], bool."""
-    lowest: jax.Array
-    """Lowest measured position while the ball is near the paddle [], m."""
-    flight_time: jax.Array
-    """Time since the first measurement near the paddle in the last bounce [], s."""
     seen: dict[str, jax.Array]
     """Last values of each observed quantity [H, size], the newest first."""
+    task: Any
+    """What the task remembers of the measurements."""
 
 
 def is_needed(randomization: RandomizationConfig, observation: ObservationConfig) -> bool:
@@ -61,35 +55,27 @@ def start_sensing(
     observation: ObservationConfig,
     control_dt: float,
     truth: Kinematics,
-    target_height: jax.Array,
+    values: dict[str, jax.Array],
+    task: Any,
 ) -> Sensing:
-    """Memory at a reset: the history repeats the present state, measured without error."""
+    """Memory at a reset: the history repeats the present state, measured without error.
+
+    Args:
+      values: value [size] of each observed quantity.
+      task: what the task remembers of the measurements.
+    """
     dtype = truth.ball_position.dtype
     length = math.ceil(oldest_picture(randomization) / control_dt - 1e-6) + 1
     ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
     zero = jnp.zeros((), dtype)
-    values = truth._asdict() | {
-        "target_height": target_height[None],
-        "action": jnp.zeros_like(truth.joint_angles),
-        "ball_age": zero[None],
-        "apex_error": zero[None],
-        "bounce_position": truth.ball_position[:2],
-        "bounce_interval": zero[None],
-        "bounce_joint_angles": truth.joint_angles,
-        "bounce_joint_velocities": truth.joint_velocities,
-    }
     return Sensing(
         balls=jnp.broadcast_to(ball, (length, 6)),
         picture=Picture(truth.ball_position, truth.ball_velocity, zero, -jnp.ones((), dtype)),
-        flight_apex=truth.ball_position[2],
-        is_low=jnp.zeros((), bool),
-        lowest=truth.ball_position[2],
-        flight_time=zero,
         seen={
-            part.name: jnp.broadcast_to(values[part.name], (n, part.size))
-            for part in parts(len(truth.joint_angles))
-            if (n := getattr(observation, part.name))
+            name: jnp.broadcast_to(values[name], (count, *values[name].shape))
+            for name, count in observation.seen().items()
         },
+        task=task,
     )
 
 
@@ -204,51 +190,18 @@ def measured_joints(
 
 
 def remember(
-    sensing: Sensing,
+    observation: ObservationConfig,
+    seen: dict[str, jax.Array],
     measured: dict[str, jax.Array],
-    picture: Picture,
-    near_height: jax.Array,
-    target_height: jax.Array,
-    control_dt: float,
-) -> Sensing:
-    """Memory after the measurements of a control step.
-
-    A bounce starts when the ball is first measured near the paddle. The values of a bounce are
-    taken at the ball's lowest measured point.
+) -> dict[str, jax.Array]:
+    """Histories after the measurements of a control step; those of the task's own quantities stay.
 
     Args:
-      measured: value [size] of each quantity except the quantities of bounces.
-      near_height: height below which the ball counts as near the paddle [], m.
+      seen: last values of each observed quantity [H, size].
+      measured: value [size] of each quantity except the task's own.
     """
-    height = picture.position[2]
-    is_low = height < near_height
-    starts = is_low & ~sensing.is_low
-    at_lowest = starts | (is_low & (height < sensing.lowest))
-    flight_time = sensing.flight_time + control_dt
-    flight_values = {
-        "apex_error": (sensing.flight_apex - target_height)[None],
-        "bounce_interval": flight_time[None],
+    own = observation.seen("task")
+    return {
+        name: past if name in own else jnp.concatenate([measured[name][None], past[:-1]])
+        for name, past in seen.items()
     }
-    lowest_values = {
-        "bounce_position": picture.position[:2],
-        "bounce_joint_angles": measured["joint_angles"],
-        "bounce_joint_velocities": measured["joint_velocities"],
-    }
-    seen = {}
-    for name, past in sensing.seen.items():
-        if name in BOUNCE_QUANTITIES:
-            newest = flight_values[name] if name in flight_values else lowest_values[name]
-            shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
-            changes = starts if name in flight_values else at_lowest
-            newest = jnp.where(changes, newest, shifted[0])
-            seen[name] = jnp.concatenate([newest[None], shifted[1:]])
-        else:
-            seen[name] = jnp.concatenate([measured[name][None], past[:-1]])
-    return sensing._replace(
-        picture=picture,
-        flight_apex=jnp.where(is_low, height, jnp.maximum(sensing.flight_apex, height)),
-        is_low=is_low,
-        lowest=jnp.where(at_lowest, height, sensing.lowest),
-        flight_time=jnp.where(starts, 0.0, flight_time),
-        seen=seen,
-    )

@@ -13,10 +13,10 @@ import numpy as np
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.ball_filter import BallFilter, Constants, Track
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.randomization import World
-from bounce_mjx.task.sensing import Picture, oldest_picture
+from bounce_mjx.world.ball_filter import BallFilter, Constants, Track
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import World
+from bounce_mjx.world.sensing import Picture, oldest_picture
 
 # Pictures lost in a row up to which the estimator knows the paddle's planes.
 _LOST_IN_A_ROW = 2.0
@@ -39,7 +39,7 @@ class Estimate(NamedTuple):
 class Estimator:
     """The estimator of an environment with these settings."""
 
-    def __init__(self, config: EnvConfig, mj_model: mujoco.MjModel, engine: Engine):
+    def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine):
         self._config, self._engine = config, engine
         constants = filter_constants(config, mj_model)
         self._filter = BallFilter(constants, config.control_dt, jnp, _repeat)
@@ -104,7 +104,7 @@ def _repeat(count: int, function: Callable[[Any], Any], start: Any) -> Any:
     return jax.lax.fori_loop(0, count, lambda _, carry: function(carry), start)
 
 
-def filter_constants(config: EnvConfig, mj_model: mujoco.MjModel) -> Constants:
+def filter_constants(config: WorldConfig, mj_model: mujoco.MjModel) -> Constants:
     """Constants of the filter from the config and the nominal model."""
     addresses = find_addresses(mj_model)
     paddle, ball = addresses.paddle_geom, addresses.ball_geom

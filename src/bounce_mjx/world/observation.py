@@ -15,13 +15,18 @@ History = Annotated[int, Field(ge=0, le=100)]
 
 
 class Quantity(NamedTuple):
-    """A quantity that an observation may contain."""
+    """The entries of a quantity that an observation may contain: the metadata of its setting."""
 
-    name: str
     size: int | None
     """Number of entries of one value; None for one entry for each acting joint."""
-    unit: str
+    unit: str = ""
     """Unit of the entries; empty for a pure number."""
+    group: Literal["state", "command", "past", "task"] = "task"
+    """Place in the observation: the present state, the commands, what the world remembers of the
+    past, the task's own quantities."""
+
+
+_GROUPS = ("state", "command", "past", "task")
 
 
 class Part(NamedTuple):
@@ -34,72 +39,28 @@ class Part(NamedTuple):
     """Unit of the entries; empty for a pure number."""
 
 
-QUANTITIES = (
-    Quantity("joint_angles", None, "rad"),
-    Quantity("ball_position", 3, "m"),
-    Quantity("ball_quaternion", 4, ""),
-    Quantity("joint_velocities", None, "rad/s"),
-    Quantity("ball_velocity", 3, "m/s"),
-    Quantity("ball_angular_velocity", 3, "rad/s"),
-    Quantity("paddle_position", 3, "m"),
-    Quantity("target_height", 1, "m"),
-    Quantity("action", None, ""),
-    Quantity("ball_age", 1, "s"),
-    Quantity("apex_error", 1, "m"),
-    Quantity("bounce_position", 2, "m"),
-    Quantity("bounce_interval", 1, "s"),
-    Quantity("bounce_joint_angles", None, "rad"),
-    Quantity("bounce_joint_velocities", None, "rad/s"),
-)
-"""The quantities that an observation may contain, in order, and the size of one value of each."""
-
-
-def parts(num_joints: int) -> tuple[Part, ...]:
-    """One value of each quantity for an arm with this number of acting joints, in order."""
-    return tuple(Part(q.name, num_joints if q.size is None else q.size, q.unit) for q in QUANTITIES)
-
-
-BOUNCE_QUANTITIES = frozenset(
-    "apex_error bounce_position bounce_interval bounce_joint_angles bounce_joint_velocities".split()
-)
-"""Quantities that have one value per bounce instead of one per control step."""
-
-
 class ObservationConfig(StrictModel):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
-    joint_angles: History = 1
+    joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints."""
-    ball_position: History = 1
+    ball_position: Annotated[History, Quantity(3, "m", "state")] = 1
     """Measured position of the ball."""
-    ball_quaternion: History = 1
+    ball_quaternion: Annotated[History, Quantity(4, "", "state")] = 1
     """Orientation of the ball, which no sensor of a robot measures."""
-    joint_velocities: History = 1
+    joint_velocities: Annotated[History, Quantity(None, "rad/s", "state")] = 1
     """Measured velocities of the acting joints."""
-    ball_velocity: History = 1
+    ball_velocity: Annotated[History, Quantity(3, "m/s", "state")] = 1
     """Measured or estimated velocity of the ball."""
-    ball_angular_velocity: History = 1
+    ball_angular_velocity: Annotated[History, Quantity(3, "rad/s", "state")] = 1
     """Spin of the ball, which no sensor of a robot measures."""
-    paddle_position: History = 1
+    paddle_position: Annotated[History, Quantity(3, "m", "state")] = 1
     """Centre of the paddle by the forward kinematics of the measured joint angles."""
-    target_height: History = 1
-    """Target height."""
-    action: History = 0
+    action: Annotated[History, Quantity(None, "", "past")] = 0
     """Actions of the last control steps."""
-    ball_age: History = 0
+    ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
     """Time since the picture of the ball was taken."""
-    apex_error: History = 0
-    """Highest measured ball position minus the target height, of the flights before the last
-    bounces."""
-    bounce_position: History = 0
-    """Measured horizontal position of the ball at the lowest point of the last bounces."""
-    bounce_interval: History = 0
-    """Time between the last bounces."""
-    bounce_joint_angles: History = 0
-    """Measured joint angles at the lowest points of the last bounces."""
-    bounce_joint_velocities: History = 0
-    """Measured joint velocities at the lowest points of the last bounces."""
     position: Literal["measured", "filter"] = "measured"
     """Source of ball_position: the last picture, or the estimate of the Kalman filter
     (env.estimator)."""
@@ -107,18 +68,52 @@ class ObservationConfig(StrictModel):
     """Source of ball_velocity: a sensor, the differences between pictures, or the estimate of the
     Kalman filter (env.estimator)."""
 
+    @classmethod
+    def quantities(cls) -> dict[str, Quantity]:
+        """All quantities by name, in the order of the observation."""
+        found = {
+            name: mark
+            for name, field in cls.model_fields.items()
+            for mark in field.metadata
+            if isinstance(mark, Quantity)
+        }
+        return dict(sorted(found.items(), key=lambda item: _GROUPS.index(item[1].group)))
+
+    def seen(self, group: str | None = None) -> dict[str, int]:
+        """The number of values of each quantity that the policy sees, all or those of a group."""
+        return {
+            name: count
+            for name, quantity in self.quantities().items()
+            if (count := getattr(self, name)) and group in (None, quantity.group)
+        }
+
+    def parts(self, num_joints: int) -> tuple[Part, ...]:
+        """One value of each quantity that the policy sees, for an arm with this number of acting
+        joints, in order."""
+        known = self.quantities()
+        return tuple(
+            Part(
+                name, num_joints if known[name].size is None else known[name].size, known[name].unit
+            )
+            for name in self.seen()
+        )
+
     def layout(self, num_joints: int) -> ObservationLayout:
         """The order of the entries for an arm with this number of acting joints."""
-        values = ((part, getattr(self, part.name)) for part in parts(num_joints))
-        return ObservationLayout(tuple(p._replace(size=p.size * n) for p, n in values if n))
+        counts = self.seen()
+        return ObservationLayout(
+            tuple(
+                part._replace(size=part.size * counts[part.name]) for part in self.parts(num_joints)
+            )
+        )
 
     @property
     def is_momentary(self) -> bool:
-        """Whether the true state of one instant determines the whole observation."""
-        past = any(getattr(self, p.name) > 1 for p in QUANTITIES)
-        remembered = any(getattr(self, name) for name in {"action", "ball_age"} | BOUNCE_QUANTITIES)
-        sources = {self.position, self.velocity}
-        return not past and not remembered and sources == {"measured"}
+        """Whether the true state of one instant and the commands determine the whole
+        observation."""
+        past = any(count > 1 for count in self.seen().values())
+        remembered = self.seen("past") or self.seen("task")
+        return not past and not remembered and {self.position, self.velocity} == {"measured"}
 
     @property
     def is_filtered(self) -> bool:
@@ -180,10 +175,6 @@ class ObservationLayout:
         """The observation [size] from the value of every part, [part.size]."""
         # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
         return jnp.stack([values[part.name][i] for part in self.parts for i in range(part.size)])
-
-
-OBSERVATION = ObservationConfig().layout(6)
-"""The layout of the original specification: the default quantities, and six joints."""
 
 
 class Kinematics(NamedTuple):

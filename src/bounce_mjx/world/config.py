@@ -1,22 +1,40 @@
-"""Settings of the task."""
+"""Settings of the world, which each task extends with its own."""
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
 from bounce_mjx.robot.config import RobotConfig, is_packaged
-from bounce_mjx.task.observation import EstimatorConfig, ObservationConfig, ObservationLayout
-from bounce_mjx.task.randomization import RandomizationConfig
-from bounce_mjx.task.rewards import RewardConfig
+from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
+from bounce_mjx.world.randomization import RandomizationConfig
 
 
-class EnvConfig(StrictModel):
-    """The task: the model, its time steps, the resets, the bounces, the terminations and the
-    reward."""
+class Command(NamedTuple):
+    """A number that is wished of the policy: drawn at a reset and after each interval
+    (`randomization.command_interval`), or set by a user."""
+
+    low: float
+    """Lower end of the range from which it is drawn."""
+    high: float
+    """Upper end of that range."""
+    unit: str = ""
+    """Unit; empty for a pure number."""
+    least: float = -math.inf
+    """Smallest value that a user may set."""
+    greatest: float = math.inf
+    """Greatest value that a user may set."""
+
+
+class WorldConfig(StrictModel):
+    """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
+    and the randomisation. The config of a task extends it."""
+
+    task: ClassVar[Any] = None
+    """The class of the task that these settings are of (`task.Task`)."""
 
     physics: Literal["auto", "fused", "mjx"] = "auto"
     """Physics engine: fused (fast, for one kind of model), mjx (any MJCF), auto (fused if it
@@ -46,20 +64,6 @@ class EnvConfig(StrictModel):
     """Ball position at a reset, before noise, m."""
     ball_position_noise: NonNegative = 0.01
     """Half-width of the uniform noise of each ball coordinate at a reset, m."""
-    target_height_range: tuple[float, float] = (0.4, 0.6)
-    """Range from which a reset draws the target height, m; equal ends fix it."""
-    bounce_min_velocity: NonNegative = 0.01
-    """Vertical velocity above which the ball counts as rising, m/s."""
-    bounce_max_distance: Positive = 0.12
-    """Vertical distance between ball and paddle within which a reversal is a bounce, m."""
-    apex_tolerance: NonNegative = 0.1
-    """Distance below the target up to which an apex continues the bounce count, m."""
-    min_ball_height: Finite = 0.05
-    """The episode ends when the ball is below this height, m."""
-    max_height_above_target: Positive = 1.0
-    """The episode ends when the ball is higher than this above the target height, m."""
-    max_horizontal_distance: Positive = 1.5
-    """The episode ends when |x| or |y| of the ball exceeds this, m."""
     max_joint_velocity: Positive = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
@@ -68,11 +72,9 @@ class EnvConfig(StrictModel):
     """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
-    reward: RewardConfig = RewardConfig()
-    """The reward terms."""
 
     @pydantic.model_validator(mode="after")
-    def _check_times_and_ranges(self):
+    def _check_times(self):
         substeps = self.control_dt / self.physics_dt
         if not max(substeps, self.episode_seconds / self.control_dt) < 2**31:
             raise ValueError(
@@ -88,12 +90,6 @@ class EnvConfig(StrictModel):
             raise ValueError(
                 f"episode_seconds {self.episode_seconds} is shorter than one control step of "
                 f"{self.control_dt} s; choose a longer episode"
-            )
-        low, high = self.target_height_range
-        if not 0.0 < low <= high < math.inf:
-            raise ValueError(
-                f"target_height_range {self.target_height_range} is not 0 < low <= high; "
-                "give two heights in metres, the lower first"
             )
         return self
 
@@ -119,9 +115,9 @@ class EnvConfig(StrictModel):
         return self.observation.layout(self.num_joints)
 
     @property
-    def target_heights(self) -> tuple[float, float]:
-        """Range of all target heights, m."""
-        return self.randomization.target_height or self.target_height_range
+    def commands(self) -> dict[str, Command]:
+        """What is wished of the policy, by name; a task's config has its own."""
+        return {}
 
     @property
     def num_substeps(self) -> int:

@@ -80,8 +80,7 @@ TERMS: dict[str, Term] = {
     "joint_velocity_bias": Term(None, 0.0, _ANY),
     "push_speed": Term((), 0.0, _NOT_NEGATIVE),
     "push_interval": Term((), None, (0.01, math.inf)),
-    "target_height": Term((), None, (1e-3, math.inf)),
-    "target_interval": Term((), None, (0.01, math.inf)),
+    "command_interval": Term((), None, (0.01, math.inf)),
     "ball_start": Term((3,), 0.0, _ANY),
     "joint_start": Term(None, 0.0, _ANY),
 }
@@ -153,10 +152,8 @@ class RandomizationConfig(StrictModel):
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
     push_interval: Range | None = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    target_height: Range | None = None
-    """Target height, m; replaces target_height_range."""
-    target_interval: Range | None = None
-    """Time between two draws of the target height within an episode, s."""
+    command_interval: Range | None = None
+    """Time between two draws of the task's commands within an episode, s."""
     ball_start: Range | None = None
     """Displacement of each coordinate of the ball at a reset, m."""
     joint_start: Range | None = None

@@ -20,7 +20,7 @@ class Stream(enum.IntEnum):
     JOINTS = 1
     FRAME_DROP = 2
     PUSH = 3
-    TARGET = 4
+    COMMAND = 4
 
 
 def next_counter(counter: jax.Array) -> jax.Array:

@@ -1,12 +1,13 @@
-"""`BounceBall`: the arm, the ball, and the task of bouncing it at a chosen height."""
+"""`Env`: one environment, which is a world and a task."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
+from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import (
     Control,
@@ -24,38 +25,23 @@ from bounce_mjx.robot.model import (
     load_model,
     resting_activations,
 )
-from bounce_mjx.task import actuation, noise, sensing
-from bounce_mjx.task.actuation import Actuation
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.estimator import Estimate, Estimator
-from bounce_mjx.task.observation import BOUNCE_QUANTITIES, Kinematics
-from bounce_mjx.task.randomization import Ranges, World, draw_world, physics_parameters
-from bounce_mjx.task.rewards import (
-    TERM_NAMES,
-    RewardInputs,
-    horizontal_distance,
-    weighted_terms,
+from bounce_mjx.task.task import Start, Step, Task, TaskStep
+from bounce_mjx.world import actuation, noise, sensing
+from bounce_mjx.world.actuation import Actuation
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.estimator import Estimate, Estimator
+from bounce_mjx.world.observation import Kinematics
+from bounce_mjx.world.randomization import (
+    TERMS,
+    Ranges,
+    World,
+    draw_world,
+    physics_parameters,
 )
-from bounce_mjx.task.sensing import Sensing
-from bounce_mjx.task.state import State
+from bounce_mjx.world.sensing import Sensing
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-
-
-class TaskState(NamedTuple):
-    """State of an episode, apart from the physics."""
-
-    target_height: jax.Array
-    """Target height of the bounces [], m."""
-    last_action: jax.Array
-    """Clipped action of the last step [n]."""
-    rising: jax.Array
-    """Whether the ball moved upward after the last step [], bool."""
-    n_bounces: jax.Array
-    """Consecutive bounces [], float."""
-    apex: jax.Array
-    """Highest ball position since the last bounce [], m."""
 
 
 class Memory(NamedTuple):
@@ -66,21 +52,26 @@ class Memory(NamedTuple):
     step: jax.Array
     """Control steps since the reset [], int32."""
     phases: jax.Array
-    """Share of the current interval that had passed at the reset [3]: camera, pushes, targets."""
-    target_age: jax.Array
-    """Time since the target height was drawn [], s."""
-    target_range: tuple[jax.Array, jax.Array] | None
-    """Range of later target heights, m; None if the target does not change."""
+    """Share of the current interval that had passed at the reset [3]: camera, pushes, commands."""
+    command_age: jax.Array
+    """Time since the commands were drawn [], s."""
+    command_ranges: dict[str, tuple[jax.Array, jax.Array]] | None
+    """Ranges of later commands; None if they do not change."""
     actuation: Actuation | None
     sensing: Sensing | None
     estimate: Estimate | None = None
 
 
-class BounceState(NamedTuple):
+class EnvState(NamedTuple):
     """The whole state of one environment, `State.pipeline_state`."""
 
     physics: PhysicsState
-    task: TaskState
+    command: dict[str, jax.Array]
+    """Value [] of each command."""
+    last_action: jax.Array
+    """Clipped action of the last step [n]."""
+    task: Any = ()
+    """What the task keeps of the episode."""
     parameters: PhysicsParameters = PhysicsParameters()
     """The physics of this environment; drawn at its reset."""
     world: World = {}
@@ -88,7 +79,7 @@ class BounceState(NamedTuple):
     memory: Memory | None = None
 
 
-class BounceBall:
+class Env:
     """One environment, unbatched and pure: apply `jax.vmap` and `jax.jit` to `reset` and `step`.
 
     It has the interface of brax's `Env` by structure. `done` is 1 where the episode terminated;
@@ -97,7 +88,7 @@ class BounceBall:
 
     def __init__(
         self,
-        config: EnvConfig | None = None,
+        config: WorldConfig,
         randomize: Callable[[jax.Array], PhysicsParameters] | None = None,
     ):
         """Compiles the model and chooses the physics engine.
@@ -109,7 +100,8 @@ class BounceBall:
         Raises:
           UserError: the MJCF file or the engine does not fit the task.
         """
-        self.config = config or EnvConfig()
+        self.config = config
+        self.task: Task = config.task(config)
         self.mj_model: mujoco.MjModel = load_model(
             self.config.mjcf, self.config.physics_dt, robot=self.config.robot
         )
@@ -155,7 +147,7 @@ class BounceBall:
         return self.engine.name
 
     @property
-    def unwrapped(self) -> "BounceBall":
+    def unwrapped(self) -> "Env":
         """The environment itself, as there is no wrapper around it."""
         return self
 
@@ -194,7 +186,8 @@ class BounceBall:
         """
         check_unedited(self.mj_model, self._fingerprint)
         config, addresses = self.config, self._addresses
-        ranges = self.ranges() if ranges is None else ranges
+        given = self.ranges() if ranges is None else ranges
+        ranges = {name: ends for name, ends in given.items() if name in TERMS}
         world, parameters = {}, PhysicsParameters()
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
@@ -203,17 +196,19 @@ class BounceBall:
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
-            given = self._randomize(world_rng)
             parameters = PhysicsParameters(
-                *(b if a is None else a for a, b in zip(given, parameters, strict=True))
+                *(
+                    drawn if own is None else own
+                    for own, drawn in zip(self._randomize(world_rng), parameters, strict=True)
+                )
             )
         n = self.action_size
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
-        draws = jax.random.uniform(rng, (2 * n + 4,), minval=-1.0, maxval=1.0)
+        commands = config.commands
+        draws = jax.random.uniform(rng, (2 * n + 3 + len(commands),), minval=-1.0, maxval=1.0)
         dtype = draws.dtype
         zero = jnp.zeros((), dtype)
-        low, high = config.target_height_range
 
         qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
         qvel = [zero] * self.mj_model.nv
@@ -236,34 +231,32 @@ class BounceBall:
             jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
         )
 
-        task = TaskState(
-            target_height=world.get(
-                "target_height", low + (high - low) * 0.5 * (draws[2 * n + 3] + 1.0)
-            ),
-            last_action=jnp.zeros(self.action_size, dtype),
-            rising=jnp.zeros((), bool),
-            n_bounces=zero,
-            apex=physics.qpos[addresses.ball_qpos[2]],
-        )
-        metrics = {f"reward/{name}": zero for name in TERM_NAMES}
-        metrics |= dict.fromkeys(
-            ("bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"), zero
-        )
-        state = BounceState(physics, task, parameters, world)
+        ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
+        command = {
+            name: low + (high - low) * 0.5 * (draws[2 * n + 3 + i] + 1.0)
+            for i, (name, (low, high)) in enumerate(ends.items())
+        }
+        last_action = jnp.zeros(n, dtype)
+        state = EnvState(physics, command, last_action, parameters=parameters, world=world)
         truth = self.kinematics(state)
+        task = self.task.reset(Start(truth, command))
+        state = state._replace(task=task)
         if world or self._needs_sensing:
             memory = self._first_memory(state, truth, memory_rng)
-            if "target_interval" in world:
-                target_range = ranges.get("target_height", config.target_height_range)
-                later = tuple(jnp.asarray(end, dtype) for end in target_range)
-                memory = memory._replace(target_range=later)
+            if "command_interval" in world:
+                memory = memory._replace(
+                    command_ranges=jax.tree.map(lambda end: jnp.asarray(end, dtype), ends)
+                )
             state = state._replace(memory=memory)
+        # The names alone: no step is computed.
+        step = Step(truth, command, last_action, last_action)
+        metrics = jax.eval_shape(lambda: _metrics(self.task.step(task, step), dtype))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
             reward=zero,
             done=zero,
-            metrics=metrics | self._privileged(world, truth),
+            metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -278,7 +271,7 @@ class BounceBall:
         return self.finish_step(state, action, physics)
 
     def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
-        """The task's part of a step before the physics: the control of a clipped action [n]."""
+        """The part of a step before the physics: the control of a clipped action [n]."""
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
@@ -290,7 +283,6 @@ class BounceBall:
             world, memory.actuation, targets, config.control_dt, config.num_substeps
         )
         memory = memory._replace(counter=noise.next_counter(memory.counter), actuation=queue)
-        task = before.task
         if "air_drag" in world:
             velocity = jnp.stack([before.physics.qvel[i] for i in self._addresses.ball_qvel[:3]])
             mass = before.parameters.ball_mass
@@ -302,24 +294,26 @@ class BounceBall:
                 world, memory.counter, memory.phases[1], memory.step, config.control_dt
             )
             control = control._replace(ball_push=push)
-        if "target_interval" in world:
-            task, memory = self._next_target(world, task, memory)
-        before = before._replace(task=task, memory=memory)
+        command = before.command
+        if "command_interval" in world:
+            command, memory = self._next_command(world, command, memory)
+        before = before._replace(command=command, memory=memory)
         return state.replace(pipeline_state=before), control
 
-    def _next_target(
-        self, world: World, task: TaskState, memory: Memory
-    ) -> tuple[TaskState, Memory]:
-        """Draws a new target height if its interval has passed."""
+    def _next_command(
+        self, world: World, command: dict[str, jax.Array], memory: Memory
+    ) -> tuple[dict[str, jax.Array], Memory]:
+        """Draws new commands if their interval has passed."""
         now = actuation.passes(
-            world["target_interval"], memory.phases[2], memory.step, self.config.control_dt
+            world["command_interval"], memory.phases[2], memory.step, self.config.control_dt
         )
-        low, high = memory.target_range
-        share = noise.uniform(memory.counter, noise.Stream.TARGET, (), task.target_height.dtype)
-        drawn = jnp.where(now, low + (high - low) * share, task.target_height)
-        return task._replace(target_height=drawn), memory._replace(
-            target_age=jnp.where(now, 0.0, memory.target_age)
-        )
+        dtype = memory.command_age.dtype
+        shares = noise.uniform(memory.counter, noise.Stream.COMMAND, (len(command),), dtype)
+        drawn = {}
+        for i, name in enumerate(self.config.commands):
+            low, high = memory.command_ranges[name]
+            drawn[name] = jnp.where(now, low + (high - low) * shares[i], command[name])
+        return drawn, memory._replace(command_age=jnp.where(now, 0.0, memory.command_age))
 
     def servo_targets(
         self, physics: PhysicsState, action: jax.Array, error: jax.Array | None = None
@@ -348,8 +342,7 @@ class BounceBall:
         return jnp.stack(targets)
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
-        """The task's part of a step after the physics: bounces, reward, termination and
-        observation.
+        """The part of a step after the physics: the task's, and the observation.
 
         A non-finite physics state ends the episode and is replaced by the previous one, so that
         nothing non-finite leaves the environment.
@@ -359,7 +352,6 @@ class BounceBall:
           action: clipped [n].
           physics: after the step, from any engine.
         """
-        config = self.config
         before = state.pipeline_state
         finite = jnp.array(True)
         for coordinates in jax.tree.leaves(physics):
@@ -372,59 +364,27 @@ class BounceBall:
             physics,
             before.physics,
         )
-        action = jnp.where(finite, action, before.task.last_action)
+        action = jnp.where(finite, action, before.last_action)
 
-        kinematics = self.kinematics(before._replace(physics=physics))
-        ball = kinematics.ball_position
+        truth = self.kinematics(before._replace(physics=physics))
+        done = self.task.step(before.task, Step(truth, before.command, action, before.last_action))
+        too_fast = jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity)
 
-        task, bounced = update_task(
-            config,
-            before.task,
-            ball,
-            kinematics.ball_velocity,
-            kinematics.paddle_position,
-            action,
-        )
-        terms = weighted_terms(
-            config.reward,
-            RewardInputs(
-                ball_position=ball,
-                ball_velocity=kinematics.ball_velocity,
-                paddle_position=kinematics.paddle_position,
-                target_height=task.target_height,
-                n_bounces=task.n_bounces,
-                bounced=bounced,
-                action=action,
-                last_action=before.task.last_action,
-                joint_velocity=kinematics.joint_velocities,
-            ),
-        )
-        ended = ~finite | terminated(config, ball, kinematics.joint_velocities, task.target_height)
-        target = (config.reward.target_x, config.reward.target_y)
-        apex_error = jnp.abs(before.task.apex - task.target_height)
-
-        dtype = ball.dtype
-        metrics = {f"reward/{name}": value for name, value in terms.items()}
-        metrics |= {
-            "bounced": bounced.astype(dtype),
-            "n_bounces": task.n_bounces,
-            "ball_xy_error": horizontal_distance(ball, target),
-            "apex_error": jnp.where(bounced, apex_error, 0.0),
-            "non_finite": (~finite).astype(dtype),
-        }
-        after = before._replace(physics=physics, task=task)
+        dtype = truth.ball_position.dtype
+        metrics = _metrics(done, dtype) | {"non_finite": (~finite).astype(dtype)}
+        after = before._replace(physics=physics, task=done.state, last_action=action)
         if before.memory is not None:
-            after = after._replace(memory=self._next_memory(after, kinematics))
+            after = after._replace(memory=self._next_memory(after, truth))
         return state.replace(
             pipeline_state=after,
-            obs=self.observe(after, kinematics),
-            reward=sum(terms.values()),
-            done=ended.astype(dtype),
+            obs=self.observe(after, truth),
+            reward=sum(done.reward.values()),
+            done=(~finite | done.ended | too_fast).astype(dtype),
             # Wrappers add their own metrics, which a step must keep.
-            metrics=state.metrics | metrics | self._privileged(before.world, kinematics),
+            metrics=state.metrics | metrics | self._privileged(before.world, truth),
         )
 
-    def kinematics(self, state: BounceState) -> Kinematics:
+    def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
         addresses, (qpos, qvel) = self._addresses, (state.physics.qpos, state.physics.qvel)
         return Kinematics(
@@ -437,50 +397,41 @@ class BounceBall:
             paddle_position=self.engine.paddle_position(state.parameters, qpos),
         )
 
-    def observe(self, state: BounceState, truth: Kinematics | None = None) -> jax.Array:
+    def observe(self, state: EnvState, truth: Kinematics | None = None) -> jax.Array:
         """The observation [observation_size] of a state, laid out as `layout`.
 
         Args:
           truth: `kinematics(state)`, if it has already been computed.
         """
-        target_height = state.task.target_height[None]
+        command = _entries(state.command)
         if state.memory is None or state.memory.sensing is None:
             truth = self.kinematics(state) if truth is None else truth
-            return self.layout.pack(truth._asdict() | {"target_height": target_height})
+            return self.layout.pack(truth._asdict() | command)
         seen = dict(state.memory.sensing.seen)
-        if "target_height" in seen:
-            seen["target_height"] = jnp.concatenate(
-                [target_height[None], seen["target_height"][1:]]
-            )
+        # A command may have been set since the last step.
+        for name in command.keys() & seen.keys():
+            seen[name] = jnp.concatenate([command[name][None], seen[name][1:]])
         return self.layout.pack({name: values.reshape(-1) for name, values in seen.items()})
 
     @property
     def _needs_sensing(self) -> bool:
         return sensing.is_needed(self.config.randomization, self.config.observation)
 
-    def _first_memory(self, state: BounceState, truth: Kinematics, rng: jax.Array) -> Memory:
+    def _first_memory(self, state: EnvState, truth: Kinematics, rng: jax.Array) -> Memory:
         config, dtype = self.config, truth.ball_position.dtype
         counter = jax.lax.bitcast_convert_type(jax.random.bits(rng, dtype=jnp.uint32), jnp.int32)
         return Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),
-            phases=noise.uniform(counter, noise.Stream.TARGET, (3,), dtype),
-            target_age=jnp.zeros((), dtype),
-            target_range=None,
+            phases=noise.uniform(counter, noise.Stream.COMMAND, (3,), dtype),
+            command_age=jnp.zeros((), dtype),
+            command_ranges=None,
             actuation=actuation.start_actuation(
                 config.randomization,
                 config.control_dt,
                 self.servo_targets(state.physics, jnp.zeros(self.action_size, dtype)),
             ),
-            sensing=sensing.start_sensing(
-                config.randomization,
-                config.observation,
-                config.control_dt,
-                truth,
-                state.task.target_height,
-            )
-            if self._needs_sensing
-            else None,
+            sensing=self._first_sensing(state, truth) if self._needs_sensing else None,
             estimate=None
             if self._estimator is None
             else self._estimator.start(
@@ -488,11 +439,28 @@ class BounceBall:
             ),
         )
 
-    def _next_memory(self, state: BounceState, truth: Kinematics) -> Memory:
+    def _first_sensing(self, state: EnvState, truth: Kinematics) -> Sensing:
+        config = self.config
+        measured = truth._asdict() | _entries(state.command)
+        measured |= {
+            "action": state.last_action,
+            "ball_age": jnp.zeros_like(truth.ball_position[:1]),
+        }
+        task, own = self.task.first_quantities(measured)
+        return sensing.start_sensing(
+            config.randomization,
+            config.observation,
+            config.control_dt,
+            truth,
+            measured | own,
+            task,
+        )
+
+    def _next_memory(self, state: EnvState, truth: Kinematics) -> Memory:
         """The memory after a control step: time, and the measurements of the new state."""
         memory, config = state.memory, self.config
         memory = memory._replace(
-            step=memory.step + 1, target_age=memory.target_age + config.control_dt
+            step=memory.step + 1, command_age=memory.command_age + config.control_dt
         )
         if memory.sensing is None:
             return memory
@@ -531,16 +499,15 @@ class BounceBall:
             "ball_position": ball_position,
             "ball_velocity": ball_velocity,
             "paddle_position": paddle,
-            "target_height": state.task.target_height[None],
-            "action": state.task.last_action,
+            **_entries(state.command),
+            "action": state.last_action,
             "ball_age": picture.age[None],
+            "ball_picture": picture.position,
         }
-        near_height = paddle[2] + config.bounce_max_distance
-        return memory._replace(
-            sensing=sensing.remember(
-                past, measured, picture, near_height, state.task.target_height, config.control_dt
-            )
-        )
+        seen = sensing.remember(config.observation, past.seen, measured)
+        own = {name: past.seen[name] for name in config.observation.seen("task")}
+        task, own = self.task.next_quantities(past.task, own, measured)
+        return memory._replace(sensing=past._replace(picture=picture, seen=seen | own, task=task))
 
     def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
         """qpos [nq] with measured joint angles [n]."""
@@ -554,9 +521,7 @@ class BounceBall:
         """Whether the measured paddle position differs from the true one, and matters."""
         observation = self.config.observation
         wrong = {"encoder_bias", "joint_angle_noise", "paddle_offset", "paddle_tilt"}
-        matters = observation.paddle_position or any(
-            getattr(observation, q) for q in BOUNCE_QUANTITIES
-        )
+        matters = observation.paddle_position or observation.seen("task")
         return bool(matters and wrong & set(self.config.randomization.terms))
 
     def _privileged(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
@@ -575,49 +540,12 @@ class BounceBall:
         }
 
 
-def update_task(
-    config: EnvConfig,
-    task: TaskState,
-    ball: jax.Array,
-    ball_velocity: jax.Array,
-    paddle: jax.Array,
-    action: jax.Array,
-) -> tuple[TaskState, jax.Array]:
-    """Detects a bounce and counts it.
-
-    A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
-    the apex before it was above the target height minus the tolerance; otherwise the count restarts
-    at 1, which is also the count after the first bounce of an episode.
-
-    Args:
-      ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
-      action: clipped action [n] of the step.
-
-    Returns:
-      The new task state, and whether this step is a bounce [] (bool).
-    """
-    rising = ball_velocity[2] > config.bounce_min_velocity
-    near = jnp.abs(ball[2] - paddle[2]) < config.bounce_max_distance
-    bounced = rising & ~task.rising & near
-    continues = task.apex > task.target_height - config.apex_tolerance
-    counted = jnp.where(continues, task.n_bounces + 1.0, 1.0)
-    updated = TaskState(
-        target_height=task.target_height,
-        last_action=action,
-        rising=rising,
-        n_bounces=jnp.where(bounced, counted, task.n_bounces),
-        apex=jnp.where(bounced, ball[2], jnp.maximum(task.apex, ball[2])),
-    )
-    return updated, bounced
+def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
+    """The metrics of a task's step, each []."""
+    numbers = {name: jnp.asarray(value, dtype) for name, value in done.metrics.items()}
+    return {f"reward/{name}": value for name, value in done.reward.items()} | numbers
 
 
-def terminated(
-    config: EnvConfig, ball: jax.Array, joint_velocity: jax.Array, target_height: jax.Array
-) -> jax.Array:
-    """Whether the episode ends [] (bool): the ball fell, flew too high or too far, or a joint is
-    too fast. Units m and rad/s."""
-    fell = ball[2] < config.min_ball_height
-    too_high = ball[2] > target_height + config.max_height_above_target
-    too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
-    too_fast = jnp.any(jnp.abs(joint_velocity) > config.max_joint_velocity)
-    return fell | too_high | too_far | too_fast
+def _entries(command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Commands as quantities of the observation, each [1]."""
+    return {name: value[None] for name, value in command.items()}

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.env.state import Env, State
 from bounce_mjx.gpu.elementwise import in_one_kernel
-from bounce_mjx.task.state import Env, State
 
 
 class VectorState(NamedTuple):

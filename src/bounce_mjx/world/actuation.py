@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics import Control
 from bounce_mjx.physics.control import servo_target
-from bounce_mjx.task import noise
-from bounce_mjx.task.randomization import RandomizationConfig, World
+from bounce_mjx.world import noise
+from bounce_mjx.world.randomization import RandomizationConfig, World
 
 # Time between pushes if only their speed is given, s.
 DEFAULT_PUSH_INTERVAL = 2.0

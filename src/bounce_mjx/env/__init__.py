@@ -1,0 +1,1 @@
+"""One environment, and batches of it."""

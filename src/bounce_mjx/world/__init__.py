@@ -1,0 +1,1 @@
+"""The world of an environment: what is the same for every task."""
