@@ -1,4 +1,4 @@
-"""The five expected results: their bounds, and the report that compares an evaluation with them."""
+"""The report of an evaluation: the task's expected results, and further figures."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -7,52 +7,17 @@ import jax
 import pydantic
 from pydantic import Field, InstanceOf
 
-from bounce_mjx.evaluation.recording import Recording
-from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, MAX_X_ERROR, Statistics
-from bounce_mjx.task.env import BounceBall
-
-MIN_CONSECUTIVE_BOUNCES = 3
-MIN_EPISODE_SHARE = 0.99
-"""Minimum share of episodes with enough consecutive bounces, and of stable episodes."""
-
-MIN_STEP_SHARE = 0.95
-"""Minimum share of centred steps, and of accurate bounces."""
-
-UPWARD_SPEED_RANGE = (0.1, 1.5)
-"""Bounds of the mean upward speed, m/s."""
-
-UPWARD_SPEED_TARGETS = (0.4, 0.6)
-"""Target heights at which the upward speed is judged, m, for a paddle with the home height
-`HOME_HEIGHT`; another home height shifts them."""
-
-HOME_HEIGHT = 0.05
-"""Home height of the original specification, m."""
-
-
-Figure = Annotated[float, Field(allow_inf_nan=False)] | None
-"""A stored measurement; None where there was nothing to measure, such as the height without a
-bounce."""
+from bounce_mjx.env.env import Env
+from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.task.results import Episodes, Figure, Result
+from bounce_mjx.task.shown import Recording
 
 
 def _complete(details: dict[str, Figure]) -> dict[str, Figure]:
-    for name in ("episodes", "mean_consecutive_bounces", "mean_return", "mean_length_s"):
+    for name in ("episodes", "mean_return", "mean_length_s"):
         if details.get(name) is None:
             raise ValueError(f"{name} is missing")
-    return {"mean_apex_error_m": None} | details
-
-
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """One expected result, as measured."""
-
-    name: str
-    measured: str
-    """Description of the measured quantity, with its unit."""
-    value: Figure
-    bound: str
-    """The bound in words."""
-    passed: bool | None
-    """Whether the value meets the bound; None where the bound does not apply."""
+    return details
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +26,7 @@ class Report:
 
     results: Annotated[tuple[Result, ...], Field(min_length=1)]
     details: Annotated[dict[str, Figure], pydantic.AfterValidator(_complete)]
-    """Further figures: episodes, mean_consecutive_bounces, mean_apex_error_m, mean_return and
-    mean_length_s."""
+    """Further figures: episodes, the task's own, mean_return and mean_length_s."""
     recording: Annotated[InstanceOf[Recording] | None, Field(exclude=True)] = None
     """The first episodes, if they were recorded; not stored."""
     screening: bool = False
@@ -74,6 +38,11 @@ class Report:
         return all(result.passed is not False for result in self.results)
 
     @property
+    def passed_with_margin(self) -> bool:
+        """Whether all judged results are met with a margin."""
+        return all(result.with_margin for result in self.results if result.passed is not None)
+
+    @property
     def summary(self) -> str:
         """The number of results that are met, such as "4 of 5 results met". A result that is not
         judged does not count."""
@@ -82,11 +51,11 @@ class Report:
         return f"{sum(judged)} of {len(judged)} {kind} met"
 
     @property
-    def score(self) -> tuple[bool, int, float]:
+    def score(self) -> tuple[bool, int, bool, float]:
         """Sort key of quality: a full evaluation ranks above a screening, then the number of
-        results met counts, then the mean return."""
+        results met counts, then whether all are met with a margin, then the mean return."""
         met = sum(result.passed is not False for result in self.results)
-        return not self.screening, met, self.details["mean_return"]
+        return not self.screening, met, self.passed_with_margin, self.details["mean_return"]
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> "Report":
@@ -104,90 +73,27 @@ class Report:
 
 
 def judge(
-    env: BounceBall,
+    env: Env,
     statistics: Statistics,
-    target_heights: tuple[float, float] | None = None,
+    commands: dict[str, tuple[float, float]] | None = None,
 ) -> Report:
-    """The report of an evaluation: the five expected results, from the statistics of E episodes.
+    """The report of an evaluation, from the statistics of E episodes.
 
     Args:
-      target_heights: range of the target heights in these episodes, m; by default, the config's.
+      commands: ranges of commands in these episodes, where they are not the config's.
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
-    episodes = len(s.running)
-    enough_bounces = float((s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).mean())
-    centred = _ratio(s.centred_steps.sum(), s.settled_steps.sum())
-    accurate = _ratio(s.accurate_bounces.sum(), s.settled_bounces.sum())
-    stable = float(s.running.mean())
-    results = (
-        _share_result(
-            "consecutive bounces",
-            f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
-            enough_bounces,
-            MIN_EPISODE_SHARE,
-        ),
-        _share_result(
-            "horizontal position",
-            f"steps with |x error| <= {MAX_X_ERROR} m",
-            centred,
-            MIN_STEP_SHARE,
-        ),
-        _share_result(
-            "height", f"bounces with |apex error| <= {MAX_APEX_ERROR} m", accurate, MIN_STEP_SHARE
-        ),
-        _speed_result(
-            _ratio(s.rising_speed.sum(), s.rising_steps.sum()),
-            target_heights or env.config.target_heights,
-            env.config.reward.paddle_home_height,
-        ),
-        _share_result(
-            "stable",
-            f"episodes that last the full {env.config.episode_seconds:g} s",
-            stable,
-            MIN_EPISODE_SHARE,
-        ),
+    episodes = Episodes(
+        sums=s.tally.sums,
+        maxima=s.tally.maxima,
+        lasted=s.running,
+        commands={name: (c.low, c.high) for name, c in env.config.commands.items()}
+        | (commands or {}),
     )
     details = {
-        "episodes": float(episodes),
-        "mean_consecutive_bounces": float(s.max_bounces.mean()),
-        "mean_apex_error_m": _ratio(s.apex_error.sum(), s.settled_bounces.sum()),
+        "episodes": float(len(s.running)),
+        **env.task.details(episodes),
         "mean_return": float(s.episode_return.mean()),
         "mean_length_s": float(s.steps.mean() * env.dt),
     }
-    return Report(results, details)
-
-
-def _share_result(name: str, measured: str, share: float | None, minimum: float) -> Result:
-    """The result for a share of all episodes, steps or bounces; without any of them it fails."""
-    return Result(
-        name,
-        f"{measured}, %",
-        None if share is None else 100.0 * share,
-        f">= {100 * minimum:g}",
-        share is not None and share >= minimum,
-    )
-
-
-def _speed_result(
-    speed: float | None, target_heights: tuple[float, float], home_height: float
-) -> Result:
-    """The upward speed, which is judged only if all targets are as high above the paddle's home as
-    `UPWARD_SPEED_TARGETS`."""
-    low, high = UPWARD_SPEED_RANGE
-    bound = f"{low} to {high}"
-    # Rounded, as a config has the heights of another arm with four digits.
-    lowest, highest = (round(h + home_height - HOME_HEIGHT, 4) for h in UPWARD_SPEED_TARGETS)
-    judged = lowest <= target_heights[0] and target_heights[1] <= highest
-    passed = speed is not None and low <= speed <= high
-    return Result(
-        "upward speed",
-        "mean velocity of the rising ball, m/s",
-        speed,
-        bound if judged else f"{bound} (targets {lowest} to {highest} only)",
-        passed if judged else None,
-    )
-
-
-def _ratio(total: float, count: float) -> float | None:
-    """A mean or a share; None where the count is 0."""
-    return float(total / count) if count else None
+    return Report(env.task.results(episodes), details)

@@ -1,26 +1,17 @@
-"""Running sums over the episodes of an evaluation, from which the five results are computed."""
+"""Running figures of the episodes of an evaluation, from which the results are computed."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.state import State
-
-SETTLING_SECONDS = 2.0
-"""Time at the start of an episode that does not count for the horizontal position and the height,
-s. For the height, the same time after a change of the target does not count either."""
-
-MAX_X_ERROR = 0.05
-"""Largest distance of a centred ball from the target point along x, m."""
-
-MAX_APEX_ERROR = 0.1
-"""Largest distance of an accurate apex from the target height, m."""
+from bounce_mjx.env.env import Env
+from bounce_mjx.env.state import State
+from bounce_mjx.task.task import Moment, Tally
 
 
 class Statistics(NamedTuple):
-    """Sums over the steps of E episodes, each up to its end."""
+    """Figures over the steps of E episodes, each up to its end."""
 
     running: jax.Array
     """Whether the episode has not ended [E], bool."""
@@ -28,34 +19,34 @@ class Statistics(NamedTuple):
     """Steps of the episode [E]."""
     episode_return: jax.Array
     """Sum of the rewards [E]."""
-    max_bounces: jax.Array
-    """Largest bounce count of the episode [E]."""
-    settled_steps: jax.Array
-    """Steps after `SETTLING_SECONDS` [E]."""
-    centred_steps: jax.Array
-    """Settled steps with the ball's x within `MAX_X_ERROR` of the target point [E]."""
-    settled_bounces: jax.Array
-    """Bounces at least `SETTLING_SECONDS` after the reset and after any change of the target
-    [E]."""
-    accurate_bounces: jax.Array
-    """Settled bounces with an apex within `MAX_APEX_ERROR` of the target height [E]."""
-    apex_error: jax.Array
-    """Sum of |apex - target height| over the settled bounces [E], m."""
-    rising_steps: jax.Array
-    """Steps on which the ball rose [E]."""
-    rising_speed: jax.Array
-    """Sum of the ball's vertical velocity over the rising steps [E], m/s."""
+    tally: Tally
+    """Sums and greatest values of what the task tallies, each [E]."""
 
 
-def empty_statistics(episodes: int) -> Statistics:
-    """Statistics before the first step."""
+def moment(env: Env, state: State, step: jax.Array) -> Moment:
+    """One environment after the control step with this index [], from 0."""
+    now = state.pipeline_state
+    seconds = (step + 1) * env.dt
+    changes = "command_interval" in now.world
+    return Moment(
+        truth=env.kinematics(now),
+        command=now.command,
+        state=now.task,
+        metrics=state.metrics,
+        seconds=seconds,
+        command_seconds=now.memory.command_age if changes else seconds,
+    )
+
+
+def empty_statistics(env: Env, states: State) -> Statistics:
+    """Statistics of E episodes (batch last) before their first step."""
+    episodes = states.done.shape[-1]
     zeros = jnp.zeros(episodes)
-    return Statistics(jnp.ones(episodes, bool), *[zeros] * (len(Statistics._fields) - 1))
+    tally = jax.eval_shape(lambda: _tally(env, states, jnp.int32(0)))
+    return Statistics(jnp.ones(episodes, bool), zeros, zeros, jax.tree.map(lambda _: zeros, tally))
 
 
-def accumulate(
-    env: BounceBall, statistics: Statistics, states: State, step: jax.Array
-) -> Statistics:
+def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array) -> Statistics:
     """Adds one control step of E environments (batch last) to their statistics.
 
     It reads the true state, not the observation, which may be noisy.
@@ -64,29 +55,19 @@ def accumulate(
       states: the states after the step.
       step: index of the step [], from 0.
     """
-    s, metrics = statistics, states.metrics
-    running = s.running
-    settling_steps = round(SETTLING_SECONDS / env.dt)
-    settled = running & (step >= settling_steps)
-    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
-    x, vz = kinematics.ball_position[0], kinematics.ball_velocity[2]
-    centred = jnp.abs(x - env.config.reward.target_x) <= MAX_X_ERROR
-    bounced = settled & (metrics["bounced"] > 0)
-    if "target_interval" in states.pipeline_state.world:
-        age = states.pipeline_state.memory.target_age / env.dt
-        bounced &= jnp.round(age) > settling_steps
-    accurate = metrics["apex_error"] <= MAX_APEX_ERROR
-    rising = running & (vz > 0.0)
+    s, now, running = statistics, _tally(env, states, step), statistics.running
+    counted = jax.tree.map(lambda value: jnp.where(running, value, 0.0), now)
     return Statistics(
         running=running & (states.done == 0),
         steps=s.steps + running,
         episode_return=s.episode_return + jnp.where(running, states.reward, 0.0),
-        max_bounces=jnp.maximum(s.max_bounces, jnp.where(running, metrics["n_bounces"], 0.0)),
-        settled_steps=s.settled_steps + settled,
-        centred_steps=s.centred_steps + (settled & centred),
-        settled_bounces=s.settled_bounces + bounced,
-        accurate_bounces=s.accurate_bounces + (bounced & accurate),
-        apex_error=s.apex_error + jnp.where(bounced, metrics["apex_error"], 0.0),
-        rising_steps=s.rising_steps + rising,
-        rising_speed=s.rising_speed + jnp.where(rising, vz, 0.0),
+        tally=Tally(
+            sums=jax.tree.map(jnp.add, s.tally.sums, counted.sums),
+            maxima=jax.tree.map(jnp.maximum, s.tally.maxima, counted.maxima),
+        ),
     )
+
+
+def _tally(env: Env, states: State, step: jax.Array) -> Tally:
+    tally = lambda state: env.task.tally(moment(env, state, step))  # noqa: E731
+    return jax.vmap(tally, in_axes=-1, out_axes=-1)(states)

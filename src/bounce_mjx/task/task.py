@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
+from bounce_mjx.task.results import Episodes, Figure, Result
+from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
 
@@ -50,6 +52,32 @@ class TaskStep(NamedTuple):
     """Further numbers [] of the step."""
 
 
+class Moment(NamedTuple):
+    """A control step of an episode that is measured."""
+
+    truth: Kinematics
+    """Positions and velocities after the step."""
+    command: Values
+    """Value [] of each command."""
+    state: State
+    """The task's state after the step."""
+    metrics: Values
+    """The environment's metrics of the step, each []."""
+    seconds: jax.Array
+    """Time since the reset [], s."""
+    command_seconds: jax.Array
+    """Time since the commands were drawn [], s; at most `seconds`."""
+
+
+class Tally(NamedTuple):
+    """Numbers of a control step, each []."""
+
+    sums: Values
+    """Numbers that are summed over the steps of an episode."""
+    maxima: Values = {}
+    """Numbers of which the greatest over the steps of an episode counts; at least 0."""
+
+
 class Task:
     """A task: what the arm and the ball are to do. A subclass holds all that belongs to it.
 
@@ -59,6 +87,11 @@ class Task:
 
     Config: ClassVar[type[WorldConfig]]
     """The settings of an environment with this task: those of the world, and the task's own."""
+    curves: ClassVar[tuple[Curve, ...]] = ()
+    """What a training logs and a report draws of the metrics; the first is the progress line's."""
+    critic_metrics: ClassVar[tuple[str, ...]] = ()
+    """Metrics that the value network sees by default, because the reward depends on them and the
+    observation does not contain them."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -101,3 +134,41 @@ class Task:
           measured: value [size] of each quantity of the world and of each command.
         """
         return memory, seen
+
+    def tally(self, moment: Moment) -> Tally:
+        """What a control step adds to the figures of its episode."""
+        return Tally({})
+
+    def results(self, episodes: Episodes) -> tuple[Result, ...]:
+        """The expected results, from the figures of E episodes."""
+        raise NotImplementedError
+
+    def details(self, episodes: Episodes) -> dict[str, Figure]:
+        """Further figures by name; a unit is the end of the name, such as `mean_error_m`."""
+        return {}
+
+    def recorded(self, moment: Moment) -> Values:
+        """Numbers [] of a control step that `plots` needs, beside the coordinates."""
+        return {}
+
+    def plots(self, recording: Recording) -> tuple[Histogram | Hits, ...]:
+        """What a report draws of the first episodes of an evaluation, as NumPy arrays."""
+        return ()
+
+    def markers(self, command: dict[str, float]) -> tuple[Marker, ...]:
+        """Shapes in the scene, for these commands; the same names in the same order for all."""
+        return ()
+
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        """Heights that a plot shows beside those of ball and paddle, m."""
+        return {}
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        """What a viewer writes over an environment, by name; the first stands for all where there
+        is little room."""
+        return {}
+
+    def focus(self) -> tuple[float, float, float]:
+        """Point at which a viewer looks, m: the paddle below the ball at a reset."""
+        x, y, z = self.config.ball_init_pos
+        return x, y, z - 0.4

@@ -12,21 +12,63 @@ import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, Positive
 from bounce_mjx.env.env import Env
-from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task import (
     Command,
+    Curve,
+    Episodes,
+    Figure,
+    Histogram,
     History,
+    Hits,
+    Marker,
+    Moment,
     ObservationConfig,
     Quantity,
+    Recording,
+    Result,
     Start,
     Step,
+    Tally,
     Task,
     TaskStep,
     WorldConfig,
     latest,
+    mean_and_margin,
+    mean_of_events,
+    share_of_episodes,
+    share_of_events,
     weighted_terms,
 )
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
+
+SETTLING_SECONDS = 2.0
+"""Time at the start of an episode that does not count for the horizontal position and the height,
+s. For the height, the same time after a change of the target does not count either."""
+
+MAX_X_ERROR = 0.05
+"""Largest distance of a centred ball from the target point along x, m."""
+
+MAX_APEX_ERROR = 0.1
+"""Largest distance of an accurate apex from the target height, m."""
+
+MIN_CONSECUTIVE_BOUNCES = 3
+
+MIN_EPISODE_SHARE = 0.99
+"""Minimum share of episodes with enough consecutive bounces, and of stable episodes."""
+
+MIN_STEP_SHARE = 0.95
+"""Minimum share of centred steps, and of accurate bounces."""
+
+UPWARD_SPEED_RANGE = (0.1, 1.5)
+"""Bounds of the mean upward speed, m/s."""
+
+UPWARD_SPEED_TARGETS = (0.4, 0.6)
+"""Target heights at which the upward speed is judged, m, for a paddle with the home height
+`HOME_HEIGHT`; another home height shifts them."""
+
+HOME_HEIGHT = 0.05
+"""Home height of the original specification, m."""
 
 
 class BounceObservation(ObservationConfig):
@@ -130,6 +172,13 @@ class Bounce(Task):
 
     Config = BounceConfig
     config: BounceConfig
+    curves = (
+        Curve("episode/bounces", "n_bounces", "episodes", "bounces in a row at its end"),
+        Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
+        Curve("task/ball_xy_error", "ball_xy_error"),
+        Curve("task/n_bounces", "n_bounces"),
+    )
+    critic_metrics = ("n_bounces",)
 
     def reset(self, start: Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
@@ -249,6 +298,135 @@ class Bounce(Task):
             time=jnp.where(starts, 0.0, time),
         )
         return flight, {name: latest(past, starts, *new[name]) for name, past in seen.items()}
+
+    def tally(self, moment: Moment) -> Tally:
+        """Bounces, centred steps, apexes and the speed of the rising ball."""
+        metrics = moment.metrics
+        bounced = metrics["bounced"] > 0
+        x, vz = moment.truth.ball_position[0], moment.truth.ball_velocity[2]
+        settling = SETTLING_SECONDS + 0.5 * self.config.control_dt
+        settled = moment.seconds > settling
+        judged = bounced & (moment.command_seconds > settling)
+        centred = jnp.abs(x - self.config.reward.target_x) <= MAX_X_ERROR
+        accurate = metrics["apex_error"] <= MAX_APEX_ERROR
+        return Tally(
+            sums={
+                "settled_steps": settled,
+                "centred_steps": settled & centred,
+                "settled_bounces": judged,
+                "accurate_bounces": judged & accurate,
+                "apex_error": jnp.where(judged, metrics["apex_error"], 0.0),
+                "rising_steps": vz > 0.0,
+                "rising_speed": jnp.maximum(vz, 0.0),
+            },
+            maxima={"n_bounces": metrics["n_bounces"]},
+        )
+
+    def results(self, episodes: Episodes) -> tuple[Result, ...]:
+        """The five results of the specification."""
+        sums, heights = episodes.sums, episodes.commands["target_height"]
+        # Rounded, as a config has the heights of another arm with four digits.
+        rise = self.config.reward.paddle_home_height - HOME_HEIGHT
+        lowest, highest = (round(height + rise, 4) for height in UPWARD_SPEED_TARGETS)
+        is_judged = lowest <= heights[0] and heights[1] <= highest
+        return (
+            share_of_episodes(
+                "consecutive bounces",
+                f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
+                episodes.maxima["n_bounces"] >= MIN_CONSECUTIVE_BOUNCES,
+                MIN_EPISODE_SHARE,
+            ),
+            share_of_events(
+                "horizontal position",
+                f"steps with |x error| <= {MAX_X_ERROR} m",
+                sums["centred_steps"],
+                sums["settled_steps"],
+                MIN_STEP_SHARE,
+            ),
+            share_of_events(
+                "height",
+                f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
+                sums["accurate_bounces"],
+                sums["settled_bounces"],
+                MIN_STEP_SHARE,
+            ),
+            mean_of_events(
+                "upward speed",
+                "mean velocity of the rising ball, m/s",
+                sums["rising_speed"],
+                sums["rising_steps"],
+                UPWARD_SPEED_RANGE,
+                "" if is_judged else f"targets {lowest} to {highest} only",
+            ),
+            share_of_episodes(
+                "stable",
+                f"episodes that last the full {self.config.episode_seconds:g} s",
+                episodes.lasted,
+                MIN_EPISODE_SHARE,
+            ),
+        )
+
+    def details(self, episodes: Episodes) -> dict[str, Figure]:
+        """The mean bounce count and apex error."""
+        error, _ = mean_and_margin(episodes.sums["apex_error"], episodes.sums["settled_bounces"])
+        return {
+            "mean_consecutive_bounces": float(episodes.maxima["n_bounces"].mean()),
+            "mean_apex_error_m": error,
+        }
+
+    def recorded(self, moment: Moment) -> dict[str, jax.Array]:
+        """Bounces, and the apex so far."""
+        return {"bounced": moment.metrics["bounced"], "apex": moment.state.apex}
+
+    def plots(self, recording: Recording) -> tuple[Histogram | Hits, ...]:
+        """Apex errors, and where the ball hits the paddle."""
+        apex = np.roll(recording.task["apex"], 1, axis=0)
+        bounces = (recording.task["bounced"] > 0) & recording.running
+        bounces[: max(1, round(SETTLING_SECONDS / self.config.control_dt))] = False
+        errors = (apex - recording.command["target_height"])[bounces]
+        return (
+            Histogram(
+                "apex minus target height, cm", "bounces", 100.0 * errors, 100.0 * MAX_APEX_ERROR
+            ),
+            Hits("hits on the paddle, cm", bounces),
+        )
+
+    def markers(self, command: dict[str, float]) -> tuple[Marker, ...]:
+        """A disc at the target height, and the outline of the paddle's home."""
+        reward = self.config.reward
+        x, y = reward.target_x, reward.target_y
+        return (
+            Marker(
+                "target_height",
+                (x, y, command["target_height"]),
+                (0.05, 0.001, 0.0),
+                (0.15, 0.9, 0.3, 0.4),
+                "cylinder",
+            ),
+            Marker(
+                "paddle_home",
+                (x, y, reward.paddle_home_height),
+                (0.05, 0.065, 0.001),
+                (0.15, 0.45, 1.0, 0.9),
+                "frame",
+            ),
+        )
+
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        """The target height."""
+        return {"target": command["target_height"]}
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        """Bounces in a row, and the target height."""
+        return {
+            "bounces": f"{metrics['n_bounces']:.0f}",
+            "target": f"{command['target_height']:.2f} m",
+        }
+
+    def focus(self) -> tuple[float, float, float]:
+        """The paddle's home."""
+        reward = self.config.reward
+        return reward.target_x, reward.target_y, reward.paddle_home_height
 
 
 class BounceBall(Env):

@@ -1,0 +1,124 @@
+"""What judges a policy: results with bounds, from figures of many episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
+
+from bounce_mjx.lazy import np
+
+MARGIN_EPISODES = 64
+"""Number of episodes in a quick evaluation, which a policy should pass as well."""
+
+MARGIN_ERRORS = 2.0
+"""Distance from the bound of a result that is met with a margin, for means and shares over steps
+and events, in standard errors of `MARGIN_EPISODES` episodes."""
+
+MARGIN_FAILURES = 0.5
+"""Largest number of failed episodes, as a share of those that the bound allows, in a result that is
+met with a margin."""
+
+Figure = Annotated[float, Field(allow_inf_nan=False)] | None
+"""A measurement; None where there was nothing to measure, such as the height without a bounce."""
+
+
+class Episodes(NamedTuple):
+    """Figures of E episodes, each up to its end, as NumPy arrays [E]."""
+
+    sums: dict[str, np.ndarray]
+    """Sums over the steps of what `Task.tally` gave."""
+    maxima: dict[str, np.ndarray]
+    """Greatest values over the steps of what `Task.tally` gave."""
+    lasted: np.ndarray
+    """Whether the episode lasted until its time limit, bool."""
+    commands: dict[str, tuple[float, float]]
+    """The range of each command in these episodes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One expected result, as measured."""
+
+    name: str
+    measured: str
+    """Description of the measured quantity, with its unit."""
+    value: Figure
+    bound: str
+    """The bound in words."""
+    passed: bool | None
+    """Whether the value meets the bound; None where the bound does not apply."""
+    with_margin: bool | None = None
+    """Whether the value meets the bound so clearly that `MARGIN_EPISODES` other episodes should
+    meet it too; None where the bound does not apply."""
+
+
+def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
+    """The result for the share of the episodes [E] that meet a condition, at least `least`."""
+    share, margin = float(met.mean()), MARGIN_FAILURES * (1.0 - least)
+    return _at_least(name, measured, share, margin, least)
+
+
+def share_of_events(
+    name: str, measured: str, met: np.ndarray, events: np.ndarray, least: float
+) -> Result:
+    """The result for the share of steps or events that meet a condition, at least `least`; without
+    any it fails.
+
+    Args:
+      met: number that meet the condition in each episode [E].
+      events: number of all in each episode [E].
+    """
+    return _at_least(name, measured, *mean_and_margin(met, events), least)
+
+
+def mean_of_events(
+    name: str,
+    measured: str,
+    totals: np.ndarray,
+    events: np.ndarray,
+    bounds: tuple[float, float],
+    condition: str = "",
+) -> Result:
+    """The result for a mean over steps or events, between two bounds; without any it fails.
+
+    Args:
+      totals: sum of the quantity in each episode [E].
+      events: number of steps or events in each episode [E].
+      condition: the condition that the bounds need and that does not hold, in words; "" judges.
+    """
+    mean, margin = mean_and_margin(totals, events)
+    low, high = bounds
+    bound = f"{low} to {high}" if math.isfinite(low) else f"<= {high:g}"
+    if condition:
+        return Result(name, measured, mean, f"{bound} ({condition})", None, None)
+    passed = mean is not None and low <= mean <= high
+    with_margin = mean is not None and low + margin <= mean <= high - margin
+    return Result(name, measured, mean, bound, passed, with_margin)
+
+
+def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:
+    """The mean over all steps or events of E episodes, None without any; and its margin.
+
+    The steps of one episode are alike, so the margin comes from the spread between episodes: the
+    standard error of a ratio estimator (W. G. Cochran, Sampling Techniques, 1977, section 2.11).
+    """
+    count = events.sum()
+    if not count:
+        return None, 0.0
+    mean = float(totals.sum() / count)
+    spread = float((totals - mean * events).std() / events.mean())
+    return mean, MARGIN_ERRORS * spread / math.sqrt(MARGIN_EPISODES)
+
+
+def _at_least(name: str, measured: str, share: float | None, margin: float, least: float) -> Result:
+    return Result(
+        name,
+        f"{measured}, %",
+        None if share is None else 100.0 * share,
+        f">= {100 * least:g}",
+        share is not None and share >= least,
+        share is not None and share >= least + margin,
+    )
