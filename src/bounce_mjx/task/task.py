@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
@@ -95,8 +96,12 @@ class Task:
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        if "Config" in cls.__dict__:
-            cls.Config.task = cls
+        if "Config" not in cls.__dict__:
+            # A config has one task, so a task that extends another one needs a class of its own.
+            base = cls.__base__.Config
+            doc = {"__doc__": base.__doc__, "__module__": cls.__module__}
+            cls.Config = type(f"{cls.__name__}Config", (base,), doc)
+        cls.Config.task = cls
 
     def __init__(self, config: WorldConfig):
         self.config = config
@@ -167,6 +172,11 @@ class Task:
         """What a viewer writes over an environment, by name; the first stands for all where there
         is little room."""
         return {}
+
+    def script(self) -> Callable[[Kinematics, Values], jax.Array] | None:
+        """A hand-written controller to compare a policy with: (truth, command) -> action [n];
+        None if there is none for this robot."""
+        return None
 
     def focus(self) -> tuple[float, float, float]:
         """Point at which a viewer looks, m: the paddle below the ball at a reset."""

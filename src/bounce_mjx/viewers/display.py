@@ -1,25 +1,22 @@
-"""The displayed model: the two markers, and each visible geom as a mesh."""
+"""The displayed model: the task's markers, and each visible geom as a mesh."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 import trimesh
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.robot.arm import compile_spec
 from bounce_mjx.robot.model import scene_spec
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.shown import Marker
+from bounce_mjx.world.config import WorldConfig
 
-TARGET_SITE = "target_height"
-HOME_SITE = "paddle_home"
-HOME_EDGES = tuple(f"{HOME_SITE}_edge{i}" for i in range(4))
-"""Markers of the home's outline; a plate would hide the paddle."""
-MARKERS = (TARGET_SITE, *HOME_EDGES)
 # By default MuJoCo shows the geom groups 0 to 2.
 _SHOWN_GROUPS = 3
 _SEGMENTS = 40
-# Width of the outline of the paddle's home, m.
+# Width of the outline of a frame, m.
 _EDGE = 0.004
 _CREASE_ANGLE = np.radians(30.0)
 
@@ -27,75 +24,102 @@ _CREASE_ANGLE = np.radians(30.0)
 class Display:
     """A model for display, and the poses of its parts for given coordinates."""
 
-    def __init__(self, env: BounceBall):
-        self.model = _with_markers(env.config)
-        self.data = mujoco.MjData(self.model)
-        self._config = env.config
-        self._target = self.model.site(TARGET_SITE).id
-        # MuJoCo ignores changes to a position that was zero in the file.
-        self.model.site_sameframe[self._target] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-
-    def pose(self, qpos: np.ndarray, target_height: float) -> None:
-        """Moves `data` to generalised positions [nq] and the marker to a target height, m."""
-        self.data.qpos[:] = qpos
-        self.model.site_pos[self._target] = (
-            self._config.reward.target_x,
-            self._config.reward.target_y,
-            target_height,
+    def __init__(self, env: Env):
+        self._task = env.task
+        commands = env.config.commands
+        lowest, highest = (
+            env.task.markers({name: command[end] for name, command in commands.items()})
+            for end in range(2)
         )
+        self.model = _with_markers(env.config, lowest)
+        self.data = mujoco.MjData(self.model)
+        self.markers = tuple(name for marker in lowest for name in _site_names(marker))
+        """Names of the sites of the task's markers."""
+        moving = [one.name for one, other in zip(lowest, highest, strict=True) if one != other]
+        self._moving = frozenset(moving)
+        for name in self.markers:
+            # MuJoCo ignores changes to a position that was zero in the file.
+            self.model.site(name).sameframe = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+    def pose(self, qpos: np.ndarray, command: dict[str, float]) -> None:
+        """Moves `data` to generalised positions [nq], and the markers to those of the commands."""
+        self.data.qpos[:] = qpos
+        for marker in self._task.markers(command):
+            if marker.name in self._moving:
+                names, offsets = _site_names(marker), _offsets(self.model.site(marker.name), marker)
+                for name, offset in zip(names, offsets, strict=True):
+                    self.model.site(name).pos = np.asarray(marker.position) + offset
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
 
-def _with_markers(config: EnvConfig) -> mujoco.MjModel:
-    """The config's model, with the two marker sites added if it lacks them."""
+def _site_names(marker: Marker) -> tuple[str, ...]:
+    """The sites of a marker; a plate would hide what a frame surrounds."""
+    if marker.shape != "frame":
+        return (marker.name,)
+    return tuple(f"{marker.name}_edge{i}" for i in range(4))
+
+
+def _offsets(plate: Any, marker: Marker) -> np.ndarray:
+    """Positions of a marker's sites [K, 3] from the centre of its site, m."""
+    if marker.shape != "frame":
+        return np.zeros((1, 3))
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, plate.quat)
+    return np.array([middle for middle, _ in _edges(plate.size)]) @ rotation.reshape(3, 3).T
+
+
+def _edges(size: np.ndarray) -> list[tuple[list[float], list[float]]]:
+    """Centres and half-sizes of the four edges around a plate of a half-size [3]."""
+    (x, y, z), half = size, _EDGE / 2.0
+    return [
+        ([x + half, 0.0, 0.0], [half, y + _EDGE, z]),
+        ([-x - half, 0.0, 0.0], [half, y + _EDGE, z]),
+        ([0.0, y + half, 0.0], [x, half, z]),
+        ([0.0, -y - half, 0.0], [x, half, z]),
+    ]
+
+
+def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjModel:
+    """The config's model with the sites of the markers, of which it may have some."""
     spec, path = scene_spec(config.mjcf, config.robot)
-    sites = {site.name for site in spec.sites}
-    reward = config.reward
-    if TARGET_SITE not in sites:
-        spec.worldbody.add_site(
-            name=TARGET_SITE,
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[0.05, 0.001, 0],
-            rgba=[0.15, 0.9, 0.3, 0.4],
-        )
-    if HOME_SITE not in sites:
-        spec.worldbody.add_site(
-            name=HOME_SITE,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.05, 0.065, 0.001],
-            pos=[reward.target_x, reward.target_y, reward.paddle_home_height],
-            rgba=[0.15, 0.45, 1.0, 0.45],
-        )
-    _add_outline(spec)
+    if config.mjcf is None:
+        # The project's own file has markers of one task.
+        for site in {site.name for site in spec.sites} - {marker.name for marker in markers}:
+            spec.site(site).rgba = np.zeros(4)
+            spec.site(site).material = ""
+    kinds = {"cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
+    for marker in markers:
+        site = spec.site(marker.name)
+        if site is None:
+            site = spec.worldbody.add_site(
+                name=marker.name,
+                type=kinds.get(marker.shape, mujoco.mjtGeom.mjGEOM_BOX),
+                pos=marker.position,
+                size=marker.size,
+                rgba=marker.rgba,
+            )
+        if marker.shape == "frame":
+            _add_outline(spec, site, marker)
     return compile_spec(spec, path)
 
 
-def _add_outline(spec: mujoco.MjSpec) -> None:
-    """Replaces the plate of the paddle's home by the four edges around it."""
-    home = spec.site(HOME_SITE)
-    (x, y, z), material = home.size, spec.material(home.material)
-    rgba = home.rgba.copy() if material is None else material.rgba.copy()
-    home.rgba = [*rgba[:3], 0.0]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, home.quat)
-    half = _EDGE / 2.0
-    edges = (
-        ([x + half, 0.0], [half, y + _EDGE]),
-        ([-x - half, 0.0], [half, y + _EDGE]),
-        ([0.0, y + half], [x, half]),
-        ([0.0, -y - half], [x, half]),
-    )
-    for name, (middle, size) in zip(HOME_EDGES, edges, strict=True):
+def _add_outline(spec: mujoco.MjSpec, plate: mujoco.MjsSite, marker: Marker) -> None:
+    """Adds the four edges around a plate, which becomes invisible."""
+    material = spec.material(plate.material)
+    rgba = plate.rgba.copy() if material is None else material.rgba.copy()
+    plate.rgba = [*rgba[:3], 0.0]
+    edges = zip(_site_names(marker), _offsets(plate, marker), _edges(plate.size), strict=True)
+    for name, offset, (_, size) in edges:
         spec.worldbody.add_site(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=home.pos + rotation.reshape(3, 3) @ [*middle, 0.0],
-            quat=home.quat,
-            size=[*size, z],
+            pos=plate.pos + offset,
+            quat=plate.quat,
+            size=size,
             rgba=[*rgba[:3], 0.9],
-            group=home.group,
+            group=plate.group,
         )
 
 

@@ -15,17 +15,16 @@ from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.pace import Pace
-from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.simulation import Simulation, frame_readings, of_environment
 
 _PICTURE_RATE = 60.0
 _TRAIL_SECONDS = 0.5
-_TARGET_STEP = 0.05
 _PUSH = 0.2
 _KEYS = "RTGMNIKJL"
 _HELP = {
     "space": "pause",
     "R": "reset",
-    "T / G": "target height",
+    "T / G": "command up / down",
     "M / N": "speed",
     "I K J L": "push the ball",
 }
@@ -82,7 +81,7 @@ class _Window:
         dt = simulation.env.dt
         pace, trail = Pace(dt), [simulation.frame.ball[0]]
         steps_left = float("inf") if seconds is None else round(seconds / dt)
-        display.pose(simulation.frame.qpos[0], simulation.frame.target_height[0])
+        display.pose(simulation.frame.qpos[0], of_environment(simulation.frame.command, 0))
         with mujoco.viewer.launch_passive(
             display.model,
             display.data,
@@ -108,7 +107,7 @@ class _Window:
                 frame = simulation.frame
                 with viewer.lock():
                     viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS] = flags
-                    display.pose(frame.qpos[0], frame.target_height[0])
+                    display.pose(frame.qpos[0], of_environment(frame.command, 0))
                     viewer.user_scn.ngeom = 0
                     draw_trail(viewer.user_scn, np.array(trail))
                 viewer.set_texts(self._texts())
@@ -125,9 +124,7 @@ class _Window:
         elif key == ord("R"):
             simulation.reset()
         elif key in (ord("T"), ord("G")):
-            step = _TARGET_STEP if key == ord("T") else -_TARGET_STEP
-            height = float(simulation.frame.target_height[0])
-            simulation.target_height = max(_TARGET_STEP, height + step)
+            self._change_command(1.0 if key == ord("T") else -1.0)
         elif key in (ord("M"), ord("N")):
             factor = 1.25 if key == ord("M") else 0.8
             self._speed = float(np.clip(self._speed * factor, 0.1, 4.0))
@@ -136,11 +133,18 @@ class _Window:
             view = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             simulation.push(_PUSH * direction(pushes[chr(key)], view))
 
+    def _change_command(self, direction: float) -> None:
+        """Moves the first command by its step."""
+        simulation = self._simulation
+        for name, command in list(simulation.env.config.commands.items())[:1]:
+            value = float(simulation.frame.command[name][0]) + direction * command.step
+            value = float(np.clip(value, max(command.least, command.step), command.greatest))
+            simulation.command = simulation.command | {name: value}
+
     def _texts(self) -> list[tuple]:
         frame = self._simulation.frame
         state = {
-            "bounces": f"{frame.n_bounces[0]:.0f}",
-            "target": f"{frame.target_height[0]:.2f} m",
+            **frame_readings(self._simulation.env, frame),
             "ball": f"{frame.ball[0, 2]:.2f} m",
             "speed": "paused" if self._paused else f"{self._speed:.2g}",
         }

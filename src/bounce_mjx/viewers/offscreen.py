@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.display import Display
 
 CAMERA = "overview"
@@ -61,7 +61,7 @@ class Renderer:
 
     def __init__(
         self,
-        env: BounceBall,
+        env: Env,
         width: int,
         height: int,
         backend: str,
@@ -108,16 +108,16 @@ class Renderer:
         self._gl.free()
 
     def render(
-        self, qpos: np.ndarray, target_height: float, trail: np.ndarray | None = None
+        self, qpos: np.ndarray, command: dict[str, float], trail: np.ndarray | None = None
     ) -> np.ndarray:
         """A picture [height, width, 3] (uint8).
 
         Args:
           qpos: generalised positions [nq].
-          target_height: height of the marker, m.
+          command: the commands, which place the markers.
           trail: ball positions [P, 3] to connect by a line, oldest first, m.
         """
-        self._display.pose(qpos, target_height)
+        self._display.pose(qpos, command)
         self._gl.make_current()
         mujoco.mjv_updateScene(
             self._display.model,

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.rewards import RewardConfig
-from bounce_mjx.viewers.display import MARKERS, TARGET_SITE, Display, body_scenes, site_mesh
-from bounce_mjx.viewers.simulation import Frame
+from bounce_mjx.env.env import Env
+from bounce_mjx.viewers.display import Display, body_scenes, site_mesh
+from bounce_mjx.viewers.simulation import Frame, frame_readings, of_environment
 
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
@@ -22,8 +21,9 @@ _ANNOUNCED_SECONDS = 1.5
 _TRAIL_SECONDS = 0.6
 _TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
-# With the default reward, the camera looks at this point, from a place that far from it, and sees
-# one arm and its ball up to the highest target.
+# With the task's focus at _USUAL_FOCUS, the camera looks at this point, from a place that far from
+# it, and sees one arm and its ball up to the highest target.
+_USUAL_FOCUS = np.array([0.58856, 0.0, 0.05])
 _LOOK_AT = np.array([0.34, 0.0, 0.44])
 _VIEW = np.array([1.06, -1.17, 0.42])
 _HIGHEST = 0.85
@@ -47,7 +47,7 @@ class Scene:
     def __init__(
         self,
         server: viser.ViserServer,
-        env: BounceBall,
+        env: Env,
         num_envs: int,
         names: Sequence[str] | None = None,
     ):
@@ -78,7 +78,6 @@ class Scene:
         _add_lights(scene)
         _add_floor(scene)
         model = self._display.model
-        reward = self._env.config.reward
         home = np.zeros((num_envs, 3)) + self._offsets
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
         self._bodies = {
@@ -91,9 +90,10 @@ class Scene:
             )
             for body, shapes in body_scenes(model)
         }
-        self._display.pose(model.qpos0, 0.0)
+        middle = {n: 0.5 * (c.low + c.high) for n, c in self._env.config.commands.items()}
+        self._display.pose(model.qpos0, middle)
         self._markers = {}
-        for name in MARKERS:
+        for name in self._display.markers:
             mesh, rgba = site_mesh(model, name)
             self._markers[name] = scene.add_batched_meshes_simple(
                 f"/markers/{name}",
@@ -102,7 +102,7 @@ class Scene:
                 batched_wxyzs=upright,
                 batched_positions=self._display.data.site(name).xpos + self._offsets,
                 batched_colors=np.round(rgba[:3] * 255.0).astype(np.uint8),
-                opacity=0.55 if name == TARGET_SITE else 0.9,
+                opacity=0.9 if "_edge" in name else 0.55,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,
@@ -114,7 +114,8 @@ class Scene:
             np.zeros((num_envs * (length - 1), 2, 3), np.uint8),
             thickness=0.006,
         )
-        self._label_places = self._offsets + (reward.target_x, reward.target_y, 0.0)
+        self._focus = np.array(self._env.task.focus())
+        self._label_places = self._offsets + self._focus * (1.0, 1.0, 0.0)
         self._labels = [
             scene.add_label(
                 f"/labels/{i}",
@@ -126,7 +127,7 @@ class Scene:
             for i, place in enumerate(self._label_places)
         ]
         self._lost = np.zeros(num_envs, bool)
-        position, self._gaze = camera_pose(self._offsets, reward)
+        position, self._gaze = camera_pose(self._offsets, self._focus)
         for client in self._server.get_clients().values():
             self._frame(client)
         initial = self._server.initial_camera
@@ -139,17 +140,22 @@ class Scene:
         frame = frames[-1]
         positions = np.zeros((number, model.nbody, 3))
         rotations = np.zeros((number, model.nbody, 4))
-        targets = np.zeros((number, 3))
+        markers = {name: np.zeros((number, 3)) for name in self._markers}
+        tops = np.zeros(number)
         for i in range(number):
-            display.pose(frame.qpos[i], frame.target_height[i])
+            command = of_environment(frame.command, i)
+            display.pose(frame.qpos[i], command)
             positions[i], rotations[i] = display.data.xpos, display.data.xquat
-            targets[i] = display.data.site(TARGET_SITE).xpos
+            for name, places in markers.items():
+                places[i] = display.data.site(name).xpos
+            tops[i] = max(self._env.task.levels(command).values(), default=0.0)
         with self._server.atomic():
             for body, handle in self._bodies.items():
                 if model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
-            self._markers[TARGET_SITE].batched_positions = targets + self._offsets
+            for name, places in markers.items():
+                self._markers[name].batched_positions = places + self._offsets
             self._line.points, self._line.colors = self._trails(frames)
             for seen in frames:
                 over = seen.over[:number]
@@ -158,7 +164,7 @@ class Scene:
                 text = self._label(frame, i)
                 if label.text != text:
                     label.text = text
-                height = max(_LABEL_HEIGHT, frame.target_height[i] + _LABEL_DISTANCE)
+                height = max(_LABEL_HEIGHT, tops[i] + _LABEL_DISTANCE)
                 position = self._label_places[i] + (0.0, 0.0, height)
                 if not np.array_equal(label.position, position):
                     label.position = position
@@ -175,17 +181,18 @@ class Scene:
         self._gaze = gaze
 
     def _label(self, frame: Frame, index: int) -> str:
-        """An environment's name if there are several, and its bounces or the loss of its ball."""
+        """An environment's name if there are several, and the task's readings or the loss of its
+        ball."""
         name = "" if self._num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
         short = self._num_envs > _MAX_LONG_LABELS
         if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
             return f"{name}LOST" if short else f"{name}BALL LOST"
-        count, height = frame.n_bounces[index], frame.target_height[index]
+        readings = frame_readings(self._env, frame, index)
         if short:
-            return f"{name}{count:.0f}"
-        return f"{name}bounces {count:.0f}   target {height:.2f} m"
+            return name + next(iter(readings.values()), "")
+        return name + "   ".join(f"{word} {value}" for word, value in readings.items())
 
     def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
         """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
@@ -226,28 +233,27 @@ class Scene:
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
             on_phone = client.client_id in self._phones
-            reward, aspect = self._env.config.reward, client.camera.aspect
-            position, gaze = camera_pose(self._offsets, reward, aspect, on_phone)
+            aspect = client.camera.aspect
+            position, gaze = camera_pose(self._offsets, self._focus, aspect, on_phone)
             if np.all(np.isfinite(position)):
                 client.camera.position, client.camera.look_at = position, gaze
 
 
 def camera_pose(
-    offsets: np.ndarray, reward: RewardConfig, aspect: float = 1.0, on_phone: bool = False
+    offsets: np.ndarray, focus: np.ndarray, aspect: float = 1.0, on_phone: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
 
     Args:
       offsets: positions of the environments [N, 3], m.
-      reward: its paddle's home and target point are in the middle of the picture.
+      focus: the task's point [3] in the middle of the picture (`Task.focus`), m.
       aspect: width / height of the picture.
       on_phone: whether the controls cover the lower part of the picture.
     """
-    usual = RewardConfig()
-    aside = np.array([reward.target_x - usual.target_x, reward.target_y - usual.target_y])
-    rise = max(0.0, reward.paddle_home_height - usual.paddle_home_height)
+    *aside, rise = focus - _USUAL_FOCUS
+    rise = max(0.0, rise)
     size = 1.0 + max(rise / _HIGHEST, np.linalg.norm(aside))
-    look_at = _LOOK_AT + (*0.5 * aside, 0.5 * rise)
+    look_at = _LOOK_AT + 0.5 * np.array([*aside, rise])
     extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
     down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if on_phone else 0.0

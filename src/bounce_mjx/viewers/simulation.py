@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bounce_mjx.env.env import Env, EnvState
+from bounce_mjx.env.state import State
 from bounce_mjx.learning.policy import Policy, forget
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import BounceBall, BounceState
-from bounce_mjx.task.randomization import TERMS, Ranges, World, physics_parameters
-from bounce_mjx.task.rewards import TERM_NAMES
-from bounce_mjx.task.state import State
 from bounce_mjx.viewers.controllers import Controller
+from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters
 
 
 class Frame(NamedTuple):
@@ -28,12 +27,10 @@ class Frame(NamedTuple):
     """The ball's centre [N, 3], m."""
     paddle: np.ndarray
     """The paddle's centre [N, 3], m."""
-    target_height: np.ndarray
-    """Target height [N], m."""
-    n_bounces: np.ndarray
-    """Consecutive bounces [N]."""
-    reward_terms: np.ndarray
-    """Weighted reward terms of the step [N, R], in the order of `rewards.TERM_NAMES`."""
+    command: dict[str, np.ndarray]
+    """Commands [N]."""
+    metrics: dict[str, np.ndarray]
+    """Metrics of the step [N], among them the weighted reward terms `reward/<term>`."""
     over: np.ndarray
     """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
     episode."""
@@ -42,12 +39,24 @@ class Frame(NamedTuple):
     fast."""
 
 
+def of_environment(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
+    """Commands or metrics [N] of one environment, each a number."""
+    return {name: float(value[index]) for name, value in values.items()}
+
+
+def frame_readings(env: Env, frame: Frame, index: int = 0) -> dict[str, str]:
+    """The task's readings of one environment of a frame."""
+    return env.task.readings(
+        of_environment(frame.command, index), of_environment(frame.metrics, index)
+    )
+
+
 class Simulation:
     """N environments under a controller; an environment is reset when its episode ends."""
 
     def __init__(
         self,
-        env: BounceBall,
+        env: Env,
         controller: Controller,
         num_envs: int,
         seed: int,
@@ -57,14 +66,14 @@ class Simulation:
         """Compiles the programs, which takes seconds, and resets all environments.
 
         Args:
-          ranges: from which the resets draw the worlds, see `BounceBall.reset`.
+          ranges: from which the resets draw the worlds, see `Env.reset`.
           policy: the first value of `policy`, for an exchangeable controller.
         """
         self.env = env
         self.num_envs = num_envs
         self.policy = policy
         """The policy that acts; another one of the same shapes may replace it between two steps."""
-        self._target_height: float | None = None
+        self._command: dict[str, float] = {}
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for the world drawn at each reset."""
@@ -89,20 +98,21 @@ class Simulation:
         self.reset()
 
     @property
-    def target_height(self) -> float | None:
-        """Target height of all environments, m; None for the height drawn at each reset."""
-        return self._target_height
+    def command(self) -> dict[str, float]:
+        """Commands of all environments that are set; the others are drawn."""
+        return self._command
 
-    @target_height.setter
-    def target_height(self, height: float | None) -> None:
-        self._target_height = height
-        self.frame = self._with_target(self.frame)
+    @command.setter
+    def command(self, command: dict[str, float]) -> None:
+        self._command = dict(command)
+        self.frame = self._with_command(self.frame)
 
-    def _with_target(self, frame: Frame) -> Frame:
-        """A frame that already shows the target height that the next step sets."""
-        if self._target_height is None:
-            return frame
-        return frame._replace(target_height=np.full_like(frame.target_height, self._target_height))
+    def _with_command(self, frame: Frame) -> Frame:
+        """A frame that already shows the commands that the next step sets."""
+        given = {
+            name: np.full_like(frame.command[name], value) for name, value in self._command.items()
+        }
+        return frame._replace(command=frame.command | given)
 
     def reset(self) -> Frame:
         """Starts a new episode in every environment; returns the first frame."""
@@ -128,10 +138,13 @@ class Simulation:
         """The current frame and the frames of the following `seconds`, stacked."""
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
-        return Frame(*(np.stack(values) for values in zip(*frames, strict=True)))
+        return jax.tree.map(lambda *values: np.stack(values), *frames)
 
-    def _target(self) -> np.float32:
-        return np.float32(np.nan if self._target_height is None else self._target_height)
+    def _set_command(self) -> dict[str, np.float32]:
+        """Every command; nan where the drawn one stays."""
+        return {
+            name: np.float32(self._command.get(name, np.nan)) for name in self.env.config.commands
+        }
 
     def _world(self) -> World:
         """The terms that have a nominal value; nan where the drawn ones stay."""
@@ -145,7 +158,7 @@ class Simulation:
 
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
-        changes = self._target(), self._push, self._world()
+        changes = self._set_command(), self._push, self._world()
         state = self._key, self._states, self._steps, self._memory
         return self.policy, *state, *changes
 
@@ -153,7 +166,7 @@ class Simulation:
         """Starts a new episode in some environments [N]; the frame of all."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
-        return self._with_target(jax.device_get(frame))
+        return self._with_command(jax.device_get(frame))
 
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
@@ -166,9 +179,9 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, memory, target, push, world):
+    def _advance(self, policy, key, states, steps, memory, command, push, world):
         key, action_key = jax.random.split(key)
-        states = _influence(self.env, states, target, push, world)
+        states = _influence(self.env, states, command, push, world)
         memory = forget(memory, steps == 0)
         actions, memory = self._controller.act(policy, states, action_key, memory)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
@@ -188,18 +201,17 @@ class SideBySide:
     @property
     def frame(self) -> Frame:
         """The current frame of all environments."""
-        frames = [simulation.frame for simulation in self._simulations]
-        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+        return _joined([simulation.frame for simulation in self._simulations])
 
     @property
-    def target_height(self) -> float | None:
-        """See `Simulation.target_height`."""
-        return self._simulations[0].target_height
+    def command(self) -> dict[str, float]:
+        """See `Simulation.command`."""
+        return self._simulations[0].command
 
-    @target_height.setter
-    def target_height(self, height: float | None) -> None:
+    @command.setter
+    def command(self, command: dict[str, float]) -> None:
         for simulation in self._simulations:
-            simulation.target_height = height
+            simulation.command = command
 
     @property
     def world(self) -> dict[str, Sequence[float]] | None:
@@ -224,13 +236,17 @@ class SideBySide:
 
     def step(self) -> Frame:
         """See `Simulation.step`."""
-        frames = [simulation.step() for simulation in self._simulations]
-        return Frame(*(np.concatenate(values) for values in zip(*frames, strict=True)))
+        return _joined([simulation.step() for simulation in self._simulations])
 
     def record(self, seconds: float) -> Frame:
         """See `Simulation.record`."""
         recordings = [simulation.record(seconds) for simulation in self._simulations]
-        return Frame(*(np.concatenate(values, axis=1) for values in zip(*recordings, strict=True)))
+        return _joined(recordings, axis=1)
+
+
+def _joined(frames: Sequence[Frame], axis: int = 0) -> Frame:
+    """Frames of several simulations as one; the environments are along the axis."""
+    return jax.tree.map(lambda *values: np.concatenate(values, axis), *frames)
 
 
 def resample(recording: Frame, dt: float, fps: float) -> Frame:
@@ -251,7 +267,7 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
     before = np.minimum(steps.astype(int), last)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]
-    frames = Frame(*(values[before] for values in recording))
+    frames = jax.tree.map(lambda values: values[before], recording)
 
     def blend(values):
         return values[before] + fraction[..., None] * (values[after] - values[before])
@@ -265,18 +281,21 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
 
 
 def _influence(
-    env: BounceBall, states: State, target: jax.Array, push: jax.Array, world: World
+    env: Env, states: State, command: dict[str, jax.Array], push: jax.Array, world: World
 ) -> State:
-    """States [..., N] with another target height [] (nan keeps it), a ball pushed by a velocity
-    [3] (m/s), and another world (nan keeps a term)."""
-    physics, task = states.pipeline_state.physics, states.pipeline_state.task
+    """States [..., N] with other commands, each [] (nan keeps it), a ball pushed by a velocity [3]
+    (m/s), and another world (nan keeps a term)."""
+    before = states.pipeline_state
     velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
-    changed = states.pipeline_state._replace(
-        physics=physics._replace(qvel=physics.qvel.at[velocity].add(push[:, None])),
-        task=task._replace(target_height=jnp.where(jnp.isnan(target), task.target_height, target)),
+    changed = before._replace(
+        physics=before.physics._replace(qvel=before.physics.qvel.at[velocity].add(push[:, None])),
+        command={
+            name: jnp.where(jnp.isnan(command[name]), drawn, command[name])
+            for name, drawn in before.command.items()
+        },
     )
 
-    def in_world(state: BounceState) -> BounceState:
+    def in_world(state: EnvState) -> EnvState:
         terms = {
             name: jnp.where(jnp.isnan(value), state.world[name], value)
             for name, value in world.items()
@@ -290,19 +309,17 @@ def _influence(
     return states.replace(pipeline_state=changed, obs=observation)
 
 
-def _view(env: BounceBall, states: State, steps: jax.Array, over: jax.Array) -> Frame:
+def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> Frame:
     """The frame of states (batch last) `steps` control steps after their resets."""
-    physics, task = states.pipeline_state.physics, states.pipeline_state.task
-    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
-    terms = [states.metrics[f"reward/{name}"] for name in TERM_NAMES]
+    now = states.pipeline_state
+    kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(now)
     return Frame(
         time=steps * env.dt,
-        qpos=physics.qpos.T,
+        qpos=now.physics.qpos.T,
         ball=kinematics.ball_position.T,
         paddle=kinematics.paddle_position.T,
-        target_height=task.target_height,
-        n_bounces=task.n_bounces,
-        reward_terms=jnp.stack(terms, axis=-1),
+        command=now.command,
+        metrics=states.metrics,
         over=over,
         lost=over & (states.done > 0),
     )

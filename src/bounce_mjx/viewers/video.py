@@ -6,14 +6,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imageio_ffmpeg
+import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.files import replace_file
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
-from bounce_mjx.viewers.simulation import Frame, Simulation, resample
+from bounce_mjx.viewers.simulation import (
+    Frame,
+    Simulation,
+    frame_readings,
+    of_environment,
+    resample,
+)
 
 SUFFIXES = (".mp4", ".gif")
 # A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
@@ -94,39 +101,36 @@ class VideoWriter:
         ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
         return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
-    def _pictures(self, env: BounceBall, frames: Frame) -> Iterator[np.ndarray]:
+    def _pictures(self, env: Env, frames: Frame) -> Iterator[np.ndarray]:
         """One picture [height, width, 3] for each frame."""
         length = round(_TRAIL_SECONDS * self.fps)
         with Renderer(env, *self._size, self._backend) as renderer:
             for i in range(len(frames.time)):
-                frame = Frame(*(values[i] for values in frames))
+                frame = jax.tree.map(lambda values, i=i: values[i], frames)
                 start = max(0, i - length)
                 resets = np.flatnonzero(np.diff(frames.time[start : i + 1, 0]) < 0.0)
                 start += resets[-1] + 1 if resets.size else 0
                 trail = frames.ball[start : i + 1, 0]
-                picture = renderer.render(frame.qpos[0], frame.target_height[0], trail)
-                yield caption(picture, frame)
+                picture = renderer.render(frame.qpos[0], of_environment(frame.command, 0), trail)
+                yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 
-def caption(picture: np.ndarray, frame: Frame) -> np.ndarray:
-    """A picture [height, width, 3] with a caption: the first environment's bounce count, target
-    height and ball height."""
+def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.ndarray:
+    """A picture [height, width, 3] with a caption: the task's readings, the first one large, and
+    the ball's height, m."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     unit = max(10, image.height // 24)
     large, small = ImageFont.load_default(2 * unit), ImageFont.load_default(unit)
-    draw.rounded_rectangle((unit, unit, 11 * unit, 6.2 * unit), unit // 2, fill=(15, 20, 28, 170))
-    count = f"{frame.n_bounces[0]:.0f}"
-    draw.text((1.6 * unit, 1.2 * unit), count, font=large, fill="white")
-    left = 1.6 * unit + draw.textlength(count, font=large) + 0.5 * unit
-    draw.text((left, 2.1 * unit), "bounces", font=small, fill=(255, 255, 255, 220))
-    for row, (name, value, color) in enumerate(
-        (
-            ("target", frame.target_height[0], (120, 235, 140, 255)),
-            ("ball", frame.ball[0, 2], (255, 190, 120, 255)),
-        )
-    ):
+    (name, value), *others = [*readings.items(), ("ball", f"{height:.2f} m")]
+    bottom = (3.9 + 1.15 * len(others)) * unit
+    draw.rounded_rectangle((unit, unit, 11 * unit, bottom), unit // 2, fill=(15, 20, 28, 170))
+    draw.text((1.6 * unit, 1.2 * unit), value, font=large, fill="white")
+    left = 1.6 * unit + draw.textlength(value, font=large) + 0.5 * unit
+    draw.text((left, 2.1 * unit), name, font=small, fill=(255, 255, 255, 220))
+    for row, (name, value) in enumerate(others):
+        color = (255, 190, 120, 255) if name == "ball" else (120, 235, 140, 255)
         top = 3.7 * unit + 1.15 * row * unit
         draw.text((1.6 * unit, top), name, font=small, fill=color)
-        draw.text((10.4 * unit, top), f"{value:.2f} m", font=small, fill=color, anchor="ra")
+        draw.text((10.4 * unit, top), value, font=small, fill=color, anchor="ra")
     return np.asarray(image)

@@ -27,6 +27,10 @@ class Command(NamedTuple):
     """Smallest value that a user may set."""
     greatest: float = math.inf
     """Greatest value that a user may set."""
+    span: tuple[float, float] | None = None
+    """Range that a viewer offers; by default, and at least, the range from which it is drawn."""
+    step: float = 0.05
+    """Change by a key of a viewer."""
 
 
 class WorldConfig(StrictModel):
