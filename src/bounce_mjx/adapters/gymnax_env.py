@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.config.validation import validate
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.state import State
+from bounce_mjx.env.env import Env
+from bounce_mjx.env.state import State
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 class EnvParams(NamedTuple):
@@ -47,16 +48,17 @@ class Box:
 class GymnaxBounceBall:
     """One environment in the form of gymnax 1.x; an ended episode is reset within the step."""
 
-    def __init__(self, **settings: Any):
+    def __init__(self, task: str | type[Task] = DEFAULT, **settings: Any):
         """Makes the environment.
 
         Args:
-          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+          task: its class, its name, or FILE.py:CLASS.
+          settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
           UserError: a setting is wrong.
         """
-        self.task = BounceBall(validate(EnvConfig, settings, self.name))
+        self.task = Env(validate(task_config(task), settings, self.name))
 
     @property
     def name(self) -> str:

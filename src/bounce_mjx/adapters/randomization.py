@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import (
     MODEL_PARAMETERS,
@@ -38,8 +39,7 @@ from bounce_mjx.physics.parameters import (
     to_direct_solref,
 )
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.randomization import RandomizationConfig, draw_world, physics_parameters
+from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
 
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
@@ -120,9 +120,7 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     return _read(mj_model, changed, varied)
 
 
-def randomized_task(
-    task: BounceBall, mj_model: mujoco.MjModel, base: Any, model: Any
-) -> BounceBall:
+def randomized_task(task: Env, mj_model: mujoco.MjModel, base: Any, model: Any) -> Env:
     """The environment in the physics of a randomised model; itself if the model changes nothing.
 
     The arguments after the task, and the errors, are those of `parameters_of`.
@@ -130,7 +128,7 @@ def randomized_task(
     parameters = parameters_of(mj_model, base, model)
     if parameters == MODEL_PARAMETERS:
         return task
-    return BounceBall(task.config, randomize=lambda key: parameters)
+    return Env(task.config, randomize=lambda key: parameters)
 
 
 def _check_acting(mj_model: mujoco.MjModel, varied: Fields) -> None:

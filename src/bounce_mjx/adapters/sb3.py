@@ -8,9 +8,8 @@ import numpy as np
 
 from bounce_mjx.adapters.gymnasium.batch import Batch, action_space, observation_space
 from bounce_mjx.adapters.gymnasium.environments import (
-    BounceBallEnv,
     EpisodeStatistics,
-    checked_height,
+    TaskEnv,
     checked_options,
 )
 from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
@@ -40,6 +39,7 @@ class Sb3VecEnv(VecEnv):
     def __init__(
         self,
         num_envs: int = 256,
+        task: str | type[Task] = DEFAULT,
         render_mode: str | None = None,
         max_episode_steps: int | None = MAX_EPISODE_STEPS,
         width: int = WIDTH,
@@ -50,18 +50,19 @@ class Sb3VecEnv(VecEnv):
         """Makes the environments; the first reset compiles them.
 
         Args:
+          task: its class, its name, or FILE.py:CLASS.
           render_mode: "rgb_array" for pictures, in which the first four environments are tiled.
           max_episode_steps: time limit of an episode in steps.
           width: of an environment's picture, in pixels, as is `height`.
           camera: name of a camera of the model; None for the overview.
-          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+          settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
         check_render_mode(render_mode)
-        self._batch = Batch(settings, num_envs, max_episode_steps)
+        self._batch = Batch(task, settings, num_envs, max_episode_steps)
         self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
         self._statistics = EpisodeStatistics(num_envs)
         self._actions: np.ndarray | None = None
@@ -72,7 +73,7 @@ class Sb3VecEnv(VecEnv):
         )
         self.metadata["render_fps"] = round(1.0 / self.dt)
 
-    task, dt, mj_model = BounceBallEnv.task, BounceBallEnv.dt, BounceBallEnv.mj_model
+    task, dt, mj_model = TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
 
     def reset(self) -> np.ndarray:
         """Starts a new episode in every environment: observations [B, N], float32. It uses the
@@ -174,10 +175,11 @@ class Sb3VecEnv(VecEnv):
         self, chosen: np.ndarray, seeds: list[int | None], options: list[dict[str, Any] | None]
     ) -> np.ndarray:
         mask = np.isin(np.arange(self.num_envs), chosen)
-        heights = [checked_options(o, "target_height").get("target_height") for o in options]
-        targets = np.array([checked_height(height) for height in heights])
+        commands = self._batch.config.commands
+        given = [checked_commands(checked_options(o, *commands), commands) for o in options]
+        values = {name: np.array([one.get(name, np.nan) for one in given]) for name in commands}
         self._statistics.restart(mask)
-        return self._batch.restart(seeds, np.random.default_rng(), mask, targets)
+        return self._batch.restart(seeds, np.random.default_rng(), mask, values)
 
     def _picture(self, index: int) -> np.ndarray:
         return self._pictures.draw(self.task, *self._batch.pose(index))

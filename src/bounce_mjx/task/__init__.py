@@ -1,5 +1,6 @@
 """What a task is made of: `Task`, its settings, reward terms, results and pictures."""
 
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.task.quantities import latest
 from bounce_mjx.task.results import (
     Episodes,
@@ -41,6 +42,7 @@ __all__ = [
     "RewardTerm",
     "Start",
     "Step",
+    "StrictModel",
     "Tally",
     "Task",
     "TaskStep",

@@ -91,7 +91,9 @@ def mean_of_events(
     """
     mean, margin = mean_and_margin(totals, events)
     low, high = bounds
-    bound = f"{low} to {high}" if math.isfinite(low) else f"<= {high:g}"
+    bound = f"{low} to {high}"
+    if not (math.isfinite(low) and math.isfinite(high)):
+        bound = f"<= {high:g}" if math.isfinite(high) else f">= {low:g}"
     if condition:
         return Result(name, measured, mean, f"{bound} ({condition})", None, None)
     passed = mean is not None and low <= mean <= high

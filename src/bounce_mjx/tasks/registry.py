@@ -14,6 +14,7 @@ from pathlib import Path
 
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.task.task import Task
+from bounce_mjx.world.config import WorldConfig
 
 DEFAULT = "bounce"
 """Name of the task of the original specification."""
@@ -47,6 +48,11 @@ def find_task(name: str) -> type[Task]:
         raise UserError(
             f"the task {name} cannot be imported ({error}); install the package that has it again"
         ) from error
+
+
+def task_config(task: str | type[Task]) -> type[WorldConfig]:
+    """The settings of a task: its class, or a name as for `find_task`."""
+    return (find_task(task) if isinstance(task, str) else task).Config
 
 
 def is_file(name: str) -> bool:

@@ -2,7 +2,7 @@
 
 Then `brax.envs.get_environment("bounce_ball", target_height_range=(0.3, 0.8))` returns a
 `BraxBounceBall` with these settings. brax's wrappers and trainers accept it, and also every
-`BounceBall`. Needs the extra `brax`.
+`Env`. Needs the extra `brax`.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from bounce_mjx.adapters.brax.checkpoints import load_policy
 from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
 from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 
 __all__ = [
     "ENV_NAME",
@@ -34,6 +34,6 @@ __all__ = [
     "ppo_settings",
 ]
 
-# BounceBall has the interface of brax's Env; this lets it pass brax's isinstance checks.
-brax.envs.Env.register(BounceBall)
+# An Env has the interface of brax's Env; this lets it pass brax's isinstance checks.
+brax.envs.Env.register(Env)
 brax.envs.register_environment(ENV_NAME, BraxBounceBall)

@@ -16,10 +16,12 @@ from flax import struct
 from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env, EnvState
+from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall, BounceState
-from bounce_mjx.task.state import State
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.world.config import WorldConfig
 
 ENV_NAME = "bounce_ball"
 
@@ -35,7 +37,7 @@ class _Model:
 class PipelineState:
     """The state of the physics and the task, with the names of brax's `base.State`."""
 
-    task: BounceState
+    task: EnvState
     """Everything that the next step depends on."""
     model: _Model = struct.field(pytree_node=False)
 
@@ -68,21 +70,28 @@ class PipelineState:
 
 
 class BraxBounceBall(brax.envs.Env):
-    """One environment with brax's interface; `task` is the `BounceBall` in it."""
+    """One environment with brax's interface; `task` is the `Env` in it."""
 
-    def __init__(self, config: EnvConfig | None = None, **settings: Any):
+    def __init__(
+        self,
+        config: WorldConfig | None = None,
+        task: str | type[Task] = DEFAULT,
+        **settings: Any,
+    ):
         """Makes the environment.
 
         Args:
-          config: all settings; None for the defaults.
-          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8), which replace
-            fields of `config`.
+          config: all settings; None for the defaults of the task.
+          task: its class, its name, or FILE.py:CLASS, if there is no config.
+          settings: fields of the task's config, such as episode_seconds=30, which replace fields of
+            `config`.
 
         Raises:
           UserError: a setting is wrong.
         """
         given = {} if config is None else config.model_dump()
-        self.task = BounceBall(validate(EnvConfig, given | settings, ENV_NAME))
+        kind = task_config(task) if config is None else type(config)
+        self.task = Env(validate(kind, given | settings, ENV_NAME))
         self._model = _Model(self.task.mj_model)
         self._base: brax.base.System | None = None
         self._sys: brax.base.System | None = None

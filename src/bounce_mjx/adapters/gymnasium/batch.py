@@ -15,14 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env
+from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.elementwise import in_one_kernel
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.state import State
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import task_config
 from bounce_mjx.training.setup import cache_compilations
+from bounce_mjx.world.config import Command, WorldConfig
 
 _NO_LIMIT = 2**31 - 1
 # The process in which a program has run. JAX's threads are lost when this process forks.
@@ -38,12 +39,12 @@ class ResetNeeded(UserError, gymnasium.error.ResetNeeded):
     """A step or a picture before the first reset."""
 
 
-def action_space(task: BounceBall) -> gymnasium.spaces.Box:
+def action_space(task: Env) -> gymnasium.spaces.Box:
     """The space of the actions of one environment."""
     return gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 
-def observation_space(task: BounceBall) -> gymnasium.spaces.Box:
+def observation_space(task: Env) -> gymnasium.spaces.Box:
     """The space of the observations of one environment."""
     return gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
 
@@ -68,18 +69,25 @@ class StepArrays(NamedTuple):
 class Batch:
     """B environments. It can be pickled and copied, including the state of its episodes."""
 
-    def __init__(self, settings: dict[str, Any], num_envs: int, max_episode_steps: int | None):
+    def __init__(
+        self,
+        task: str | type[Task],
+        settings: dict[str, Any],
+        num_envs: int,
+        max_episode_steps: int | None,
+    ):
         """Compiles nothing and does not use JAX's device; the first `restart` does both.
 
         Args:
-          settings: fields of `EnvConfig`.
+          task: its class, or a name as for `find_task`.
+          settings: fields of its config.
           max_episode_steps: time limit of an episode in steps; None or -1 for no limit other than
             a given `episode_seconds`.
 
         Raises:
           UserError: a setting is wrong; if its name is unknown, the error is a TypeError too.
         """
-        self.config = _task_config(settings)
+        self.config = _task_config(task, settings)
         self.num_envs = _whole("num_envs", num_envs, at_least=1)
         limits = [_NO_LIMIT]
         if max_episode_steps not in (None, -1):
@@ -91,7 +99,7 @@ class Batch:
         self._episodes: _Episodes | None = None
 
     @property
-    def task(self) -> BounceBall:
+    def task(self) -> Env:
         """The environment on JAX."""
         return self._programs.task
 
@@ -100,7 +108,7 @@ class Batch:
         seeds: Sequence[int | None],
         generator: np.random.Generator,
         mask: np.ndarray | None = None,
-        target_heights: float | np.ndarray = np.nan,
+        commands: dict[str, float | np.ndarray] | None = None,
     ) -> np.ndarray:
         """Starts new episodes.
 
@@ -108,7 +116,7 @@ class Batch:
           seeds: seed of each environment; None goes on with its random numbers.
           generator: seeds the environments that have neither a seed nor random numbers yet.
           mask: environments to reset [B], bool; None for all.
-          target_heights: m, [] or [B]; NaN draws it.
+          commands: some commands, each [] or [B]; NaN draws it.
 
         Returns:
           The observations of all environments [B, N], float32.
@@ -120,9 +128,13 @@ class Batch:
             seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
         seeded = np.array([s is not None for s in seeds])
         numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
-        targets = np.broadcast_to(np.asarray(target_heights, np.float32), self.num_envs)
+        given = dict.fromkeys(self.config.commands, np.nan) | (commands or {})
+        values = {
+            name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
+            for name, value in given.items()
+        }
         keys = None if self._episodes is None else self._episodes.key
-        started = self._programs.start(keys, numbers, seeded, targets)
+        started = self._programs.start(keys, numbers, seeded, values)
         if mask is not None and self._episodes is not None:
             started = self._programs.choose(mask, started, self._episodes)
         self._episodes = started
@@ -164,11 +176,12 @@ class Batch:
             metrics=dict(zip(sorted(self._episodes.env.metrics), metrics, strict=True)),
         )
 
-    def pose(self, index: int) -> tuple[np.ndarray, float]:
-        """The generalised positions [nq] and the target height (m) of one environment."""
+    def pose(self, index: int) -> tuple[np.ndarray, dict[str, float]]:
+        """The generalised positions [nq] and the commands of one environment."""
         self._check_started()
         state = self._episodes.env.pipeline_state
-        return np.array(state.physics.qpos[:, index]), float(state.task.target_height[index])
+        command = {name: float(value[index]) for name, value in state.command.items()}
+        return np.array(state.physics.qpos[:, index]), command
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_programs": None, "_episodes": jax.device_get(self._episodes)}
@@ -206,23 +219,23 @@ class _Episodes(NamedTuple):
 class _Programs(NamedTuple):
     """The functions of `_Episodes`, compiled for one config and number of environments."""
 
-    task: BounceBall
+    task: Env
     start: Any
     choose: Any
     step: Any
 
 
-def _programs_for(config: EnvConfig, num_envs: int) -> _Programs:
+def _programs_for(config: WorldConfig, num_envs: int) -> _Programs:
     # An edited file is another model.
     edited = None if config.mjcf is None or not config.mjcf.exists() else config.mjcf.stat()
     return _programs(config, num_envs, edited and edited.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=32)
-def _programs(config: EnvConfig, num_envs: int, edited: int | None) -> _Programs:
+def _programs(config: WorldConfig, num_envs: int, edited: int | None) -> _Programs:
     del edited
     cache_compilations()
-    task = BounceBall(config)
+    task = Env(config)
     return _Programs(
         task=task,
         start=jax.jit(functools.partial(_start, task)),
@@ -232,40 +245,43 @@ def _programs(config: EnvConfig, num_envs: int, edited: int | None) -> _Programs
 
 
 def _start(
-    task: BounceBall,
+    task: Env,
     keys: jax.Array | None,
     seeds: jax.Array,
     seeded: jax.Array,
-    targets: jax.Array,
+    commands: dict[str, jax.Array],
 ) -> _Episodes:
     """New episodes; `keys` [B, ...] is None before the first ones."""
     new_keys = jax.vmap(jax.random.PRNGKey)(seeds)
     if keys is not None:
         new_keys = jnp.where(seeded[:, None], new_keys, keys)
     keys, now = _split(new_keys)
-    env = jax.vmap(functools.partial(_first_state, task), out_axes=-1)(now, targets)
+    env = jax.vmap(functools.partial(_first_state, task), out_axes=-1)(now, commands)
     return _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
 
 
-def _first_state(task: BounceBall, key: jax.Array, target: jax.Array) -> State:
-    """The start of an episode with a target height [], m; NaN keeps the drawn one."""
+def _first_state(task: Env, key: jax.Array, commands: dict[str, jax.Array]) -> State:
+    """The start of an episode with commands, each []; NaN keeps the drawn one."""
     state = task.reset(key)
     start = state.pipeline_state
-    drawn = start.task.target_height
-    height = jnp.where(jnp.isnan(target), drawn, target).astype(drawn.dtype)
-    start = start._replace(task=start.task._replace(target_height=height))
+    start = start._replace(
+        command={
+            name: jnp.where(jnp.isnan(commands[name]), drawn, commands[name]).astype(drawn.dtype)
+            for name, drawn in start.command.items()
+        }
+    )
     memory = start.memory
     if memory is not None and memory.sensing is not None:
         seen = dict(memory.sensing.seen)
-        if "target_height" in seen:
-            seen["target_height"] = jnp.full_like(seen["target_height"], height)
+        for name in start.command.keys() & seen.keys():
+            seen[name] = jnp.full_like(seen[name], start.command[name])
         memory = memory._replace(sensing=memory.sensing._replace(seen=seen))
         start = start._replace(memory=memory)
     return state.replace(pipeline_state=start, obs=task.observe(start))
 
 
 def _step(
-    task: BounceBall,
+    task: Env,
     episodes: _Episodes,
     actions: jax.Array,
     limit: jax.Array,
@@ -308,16 +324,42 @@ def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     return pairs[:, 0], pairs[:, 1]
 
 
-def _task_config(settings: dict[str, Any]) -> EnvConfig:
+def _task_config(task: str | type[Task], settings: dict[str, Any]) -> WorldConfig:
+    config = task_config(task)
     try:
-        return validate(EnvConfig, settings, ENV_ID)
+        return validate(config, settings, "the environment's settings")
     except UserError as error:
-        unknown = [name for name in settings if name not in EnvConfig.model_fields]
+        unknown = [name for name in settings if name not in config.model_fields]
         if not unknown:
             raise
         # Libraries look for this part of Python's own message.
         python = f"got an unexpected keyword argument {unknown[0]!r}"
         raise UnexpectedArgument(f"{error} ({python})") from error
+
+
+def checked_commands(options: dict[str, Any], commands: dict[str, Command]) -> dict[str, float]:
+    """The commands among the options of a reset.
+
+    Raises:
+      UserError: one is not a number within its limits.
+    """
+    checked = {}
+    for name in commands.keys() & options.keys():
+        command, value = commands[name], options[name]
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = np.nan
+        if value is None:
+            continue
+        if not (command.least <= number <= command.greatest and np.isfinite(number)):
+            unit = f" {command.unit}" if command.unit else ""
+            raise UserError(
+                f"the option {name} is {value!r}, but must be a number from {command.least:g} to "
+                f"{command.greatest:g}{unit}"
+            )
+        checked[name] = number
+    return checked
 
 
 def _whole(name: str, value: Any, at_least: int) -> int:

@@ -1,10 +1,10 @@
-"""The classes behind `gymnasium.make` and `gymnasium.make_vec("bounce_mjx/BounceBall-v0")`.
+"""The classes behind `gymnasium.make` and `gymnasium.make_vec`.
 
 The arrays are NumPy arrays; `adapters/torch/gymnasium_env.py` has a vectorised environment with
-tensors that stay on JAX's device. Keyword arguments are the settings of `EnvConfig`.
+tensors that stay on JAX's device. Keyword arguments are the
+settings of the task's config.
 """
 
-import math
 import multiprocessing
 import time
 from collections.abc import Sequence
@@ -21,16 +21,19 @@ from bounce_mjx.adapters.gymnasium.batch import (
     UnexpectedArgument,
     action_space,
     checked_actions,
+    checked_commands,
     observation_space,
 )
 from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT
 
 _FRAMES_PER_SECOND = 100
 
 
-class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment.
 
     `gymnasium.make` ends its episodes after `max_episode_steps` steps. Without it, only a given
@@ -41,6 +44,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
+        task: str | type[Task] = DEFAULT,
         render_mode: str | None = None,
         width: int = WIDTH,
         height: int = HEIGHT,
@@ -50,9 +54,10 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Makes the environment. The first reset compiles it, unless an equal one exists.
 
         Args:
+          task: its class, its name, or FILE.py:CLASS.
           width: of the pictures, in pixels, as is `height`.
           camera: name of a camera of the model; None for the overview.
-          settings: fields of `EnvConfig`, such as target_height_range=(0.3, 0.8).
+          settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
@@ -60,7 +65,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         check_render_mode(render_mode)
         _prefer_forkserver()
-        self._batch = Batch(settings, 1, None)
+        self._batch = Batch(task, settings, 1, None)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
         self.render_mode = render_mode
         self.action_space = action_space(self.task)
@@ -68,7 +73,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
 
     @property
-    def task(self) -> BounceBall:
+    def task(self) -> Env:
         """The environment on JAX; equal environments share it."""
         return self._batch.task
 
@@ -88,15 +93,15 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Starts an episode.
 
         Args:
-          options: {"target_height": h} sets the target height of this episode, m.
+          options: the task's commands of this episode by name, instead of drawn ones.
 
         Returns:
           The first observation [N] and an empty info.
         """
         super().reset(seed=seed)
-        options = checked_options(options, "target_height")
-        target = checked_height(options.get("target_height"))
-        return self._batch.restart([seed], self.np_random, target_heights=target)[0], {}
+        commands = self._batch.config.commands
+        given = checked_commands(checked_options(options, *commands), commands)
+        return self._batch.restart([seed], self.np_random, commands=given)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances one control step under the action [n].
@@ -127,7 +132,7 @@ class BounceBallEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._pictures.close()
 
 
-class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """B environments in one compiled step.
 
     Given the same seeds and actions, they return the same as a `gymnasium.vector.SyncVectorEnv` of
@@ -143,6 +148,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
 
     def __init__(
         self,
+        task: str | type[Task] = DEFAULT,
         num_envs: int = 1,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -152,7 +158,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         camera: str | None = None,
         **settings: Any,
     ):
-        """Makes `num_envs` environments; the other arguments are as in `BounceBallEnv`.
+        """Makes `num_envs` environments; the other arguments are as in `TaskEnv`.
 
         Args:
           max_episode_steps: time limit of an episode in steps; `gymnasium.make_vec` gives 2000.
@@ -161,7 +167,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         """
         check_render_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self._batch = Batch(settings, num_envs, max_episode_steps)
+        self._batch = Batch(task, settings, num_envs, max_episode_steps)
         self.metadata = self.metadata | {
             "render_fps": round(1.0 / self.dt),
             "autoreset_mode": self.autoreset_mode,
@@ -178,7 +184,7 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
         self._ended = np.zeros(num_envs, bool)
         self._statistics = EpisodeStatistics(num_envs)
 
-    task, dt, mj_model = BounceBallEnv.task, BounceBallEnv.dt, BounceBallEnv.mj_model
+    task, dt, mj_model = TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
 
     def reset(
         self,
@@ -190,18 +196,19 @@ class BounceBallVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.
 
         Args:
           seed: s seeds the environments with s, s + 1, ...; a list gives each one's seed.
-          options: "target_height" sets the target height of these episodes, m; "reset_mask" [B],
-            bool, chooses the environments.
+          options: the task's commands of these episodes by name; "reset_mask" [B], bool, chooses
+            the environments.
 
         Returns:
           The observations of all environments [B, N] and an empty info.
         """
-        options = checked_options(options, "target_height", "reset_mask")
-        target = checked_height(options.get("target_height"))
+        commands = self._batch.config.commands
+        options = checked_options(options, *commands, "reset_mask")
+        given = checked_commands(options, commands)
         mask = _checked_mask(options.get("reset_mask"), self.num_envs)
         seeds = _seeds(seed, self.num_envs)
         super().reset(seed=seeds[0])
-        observation = self._batch.restart(seeds, self.np_random, mask, target)
+        observation = self._batch.restart(seeds, self.np_random, mask, given)
         chosen = slice(None) if mask is None else mask
         self._ended[chosen] = False
         self._statistics.restart(chosen)
@@ -316,23 +323,6 @@ def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, An
             f"{', '.join(known) or 'none'}"
         )
     return options or {}
-
-
-def checked_height(height: Any) -> float:
-    """A target height, m; NaN for None.
-
-    Raises:
-      UserError: it is not a positive number.
-    """
-    if height is None:
-        return math.nan
-    try:
-        number = float(height)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not 0.0 < number < math.inf:
-        raise UserError(f"the option target_height is {height!r}, but must be a height above 0 m")
-    return number
 
 
 def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:

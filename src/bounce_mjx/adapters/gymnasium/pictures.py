@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 
 WIDTH, HEIGHT = 640, 480
@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 640, 480
 class Pictures:
     """Draws states of the environment. A copy or an unpickled one opens its own renderer."""
 
-    def __init__(self, task: BounceBall, width: int, height: int, camera: str | None):
+    def __init__(self, task: Env, width: int, height: int, camera: str | None):
         """Opens the renderer.
 
         Args:
@@ -33,12 +33,11 @@ class Pictures:
         self._renderer: Renderer | None = None
         self._open(task)
 
-    def draw(self, task: BounceBall, qpos: np.ndarray, target_height: float) -> np.ndarray:
-        """The picture [height, width, 3], uint8, of generalised positions [nq] and a target height
-        (m)."""
+    def draw(self, task: Env, qpos: np.ndarray, command: dict[str, float]) -> np.ndarray:
+        """The picture [height, width, 3], uint8, of generalised positions [nq] and commands."""
         if self._renderer is None:
             self._open(task)
-        return np.ascontiguousarray(self._renderer.render(qpos, target_height))
+        return np.ascontiguousarray(self._renderer.render(qpos, command))
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -46,7 +45,7 @@ class Pictures:
             self._close()
             self._renderer = None
 
-    def _open(self, task: BounceBall) -> None:
+    def _open(self, task: Env) -> None:
         self._renderer = Renderer(task, *self._settings, plain=True)
         # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self._close = weakref.finalize(self, self._renderer.close)

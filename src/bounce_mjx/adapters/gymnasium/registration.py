@@ -7,14 +7,15 @@ import sys
 import types
 from collections.abc import Sequence
 
-ENV_ID = "bounce_mjx/BounceBall-v0"
+ENV_IDS = ("bounce_mjx/BounceBall-v0", "bounce_mjx/Task-v0")
+"""Names of the environments: the specification's, and any other by the argument `task`."""
 MAX_EPISODE_STEPS = 2000
-"""The task's episode of 20 s. A constant, because reading `EnvConfig` would import JAX."""
+"""The tasks' episode of 20 s. A constant, because reading a config would import JAX."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
 def register_when_imported() -> None:
-    """Makes `gymnasium.make(ENV_ID)` and `gymnasium.make_vec(ENV_ID)` work.
+    """Makes `gymnasium.make` and `gymnasium.make_vec` work for `ENV_IDS`.
 
     Gymnasium is optional and takes half a second to import, so it is not imported here. If it is
     not loaded yet, the registration follows its import.
@@ -29,12 +30,13 @@ def register() -> None:
     """Adds the environment to Gymnasium's registry; its classes are imported on first use."""
     import gymnasium
 
-    gymnasium.register(
-        ENV_ID,
-        entry_point=f"{_MODULE}:BounceBallEnv",
-        vector_entry_point=f"{_MODULE}:BounceBallVectorEnv",
-        max_episode_steps=MAX_EPISODE_STEPS,
-    )
+    for name in ENV_IDS:
+        gymnasium.register(
+            name,
+            entry_point=f"{_MODULE}:TaskEnv",
+            vector_entry_point=f"{_MODULE}:TaskVectorEnv",
+            max_episode_steps=MAX_EPISODE_STEPS,
+        )
 
 
 class _RegisterAfterImport(importlib.abc.MetaPathFinder):

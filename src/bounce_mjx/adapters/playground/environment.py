@@ -15,13 +15,14 @@ from mujoco import mjx
 from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env import state as core
+from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
-from bounce_mjx.task import state as core
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall, BounceState
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 try:
     from mujoco_playground import MjxEnv, State
@@ -33,9 +34,9 @@ except ImportError as error:
 ENV_NAME = "BounceBall"
 
 
-def default_config() -> config_dict.ConfigDict:
-    """The settings of `EnvConfig`, some under Playground's own names."""
-    config = EnvConfig()
+def default_config(task: str | type[Task] = DEFAULT) -> config_dict.ConfigDict:
+    """The settings of a task's config, some under Playground's own names."""
+    config = task_config(task)()
     return config_dict.create(
         ctrl_dt=config.control_dt,
         sim_dt=config.physics_dt,
@@ -52,7 +53,7 @@ def default_config() -> config_dict.ConfigDict:
 
 
 @struct.dataclass
-class BounceData:
+class TaskData:
     """The state of the physics and the task, with those names of MJX's data that wrappers and
     renderers read."""
 
@@ -70,30 +71,31 @@ class BounceData:
     mocap_quat: jax.Array
     xfrc_applied: jax.Array
     """Zero [nbody, 6]."""
-    task: BounceState
+    task: EnvState
     """Everything else that the next step depends on."""
 
 
 class PlaygroundBounceBall(MjxEnv):
-    """One environment with Playground's interface; `task` is the `BounceBall` in it."""
+    """One environment with Playground's interface; `task` is the `Env` in it."""
 
     def __init__(
         self,
         config: config_dict.ConfigDict | None = None,
         config_overrides: dict[str, Any] | None = None,
+        task: str | type[Task] = DEFAULT,
     ):
-        """Makes the environment.
+        """Makes the environment; a config must be the one of the task.
 
         Raises:
           UserError: a setting is wrong.
         """
-        super().__init__(config or default_config(), config_overrides)
+        super().__init__(config or default_config(task), config_overrides)
         settings = self._config.task.to_dict() | {
             "control_dt": self._config.ctrl_dt,
             "physics_dt": self._config.sim_dt,
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
-        self.task = BounceBall(validate(EnvConfig, settings, ENV_NAME))
+        self.task = Env(validate(task_config(task), settings, ENV_NAME))
         self._randomized: mjx.Model | None = None
 
     def reset(self, rng: jax.Array) -> State:
@@ -105,7 +107,7 @@ class PlaygroundBounceBall(MjxEnv):
         state = task.reset(rng)
         m, (qpos, qvel, act) = self.mj_model, state.pipeline_state.physics
         dtype = qpos.dtype
-        data = BounceData(
+        data = TaskData(
             qpos=qpos,
             qvel=qvel,
             act=act,

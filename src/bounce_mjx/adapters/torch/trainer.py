@@ -12,11 +12,11 @@ from jax.sharding import Mesh
 
 from bounce_mjx.adapters.torch.learner import CHECKED, Learner
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.trainer import Metrics, Snapshot
@@ -31,7 +31,7 @@ class TorchTrainer:
 
     checked = CHECKED
 
-    def __init__(self, library: str, config: TrainConfig, env: BounceBall):
+    def __init__(self, library: str, config: TrainConfig, env: Env):
         """
         Raises:
           UserError: the library is not installed, or the config does not fit it or the environment.
@@ -98,7 +98,7 @@ class TorchTrainer:
             learner.save_model(run / MODEL_FILE)
 
 
-def make_learner(library: str, config: PPOConfig, env: BounceBall, seed: int) -> Learner:
+def make_learner(library: str, config: PPOConfig, env: Env, seed: int) -> Learner:
     """The PPO of a library.
 
     Raises:
@@ -107,7 +107,7 @@ def make_learner(library: str, config: PPOConfig, env: BounceBall, seed: int) ->
     return _learner_class(library)(config, make_vector_env(config, env, seed), seed)
 
 
-def make_vector_env(config: PPOConfig, env: BounceBall, seed: int) -> TorchVectorEnv:
+def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
     """The environments of a learner."""
     return TorchVectorEnv(
         env,

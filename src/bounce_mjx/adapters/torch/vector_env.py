@@ -1,4 +1,4 @@
-"""Batched environments for PyTorch: `task/vector.py` with tensors.
+"""Batched environments for PyTorch: `env/vector.py` with tensors.
 
 Tensors and arrays share their memory through DLPack, on the CPU and on CUDA. The host never waits
 for the device, because DLPack makes each library's stream wait for the other's. The state is
@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.env import vector
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import matching_metrics, step_metrics
-from bounce_mjx.task import vector
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 class StepResult(NamedTuple):
@@ -51,11 +52,11 @@ class TorchVectorEnv:
 
     def __init__(
         self,
-        env: BounceBall | None = None,
+        env: Env | None = None,
         num_envs: int = 4096,
         *,
         seed: int = 0,
-        critic_metrics: tuple[str, ...] = ("n_bounces",),
+        critic_metrics: tuple[str, ...] | None = None,
         reward_scale: float = 1.0,
         device: torch.device | str | None = None,
     ):
@@ -65,14 +66,14 @@ class TorchVectorEnv:
           env: the task; None for the default one.
           seed: seed of all resets.
           critic_metrics: names of the metrics that are additional inputs of the value network;
-            a pattern such as world/* names many.
+            a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
           device: the device of the tensors, which must be JAX's default device; None accepts it.
 
         Raises:
           UserError: torch cannot use JAX's device, `device` is another one, or a metric is unknown.
         """
-        self.env = env or BounceBall()
+        self.env = env or Env(task_config(DEFAULT)())
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size
@@ -84,7 +85,10 @@ class TorchVectorEnv:
         self._template = jax.eval_shape(
             lambda key: vector.reset(self.env, key, num_envs), self._key
         )
-        self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
+        self.critic_metrics = matching_metrics(
+            self.env.task.critic_metrics if critic_metrics is None else critic_metrics,
+            self._template.env.metrics,
+        )
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
         _, result = jax.eval_shape(self._advance, carried, action)

@@ -1,0 +1,137 @@
+"""Dribbling as a task of one's own (docs/write-a-task.md): many low bounces.
+
+bounce-mjx train --task examples/dribble_task.py:Dribble
+"""
+
+import math
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx import task
+
+
+class ApexReward(task.RewardTerm):
+    """Apex: the ball's energy is that of a bounce to the wished height."""
+
+    weight: float = 4.0
+    """Weight of the term."""
+    scale: float = 0.02
+    """Width of the Gaussian of the height that the ball can reach, m."""
+
+    def value(self, inputs: "Inputs") -> jax.Array:
+        return task.gaussian(inputs.reach - inputs.target, self.scale)
+
+
+class CentreReward(task.RewardTerm):
+    """Centre: the ball stays over the point where it started."""
+
+    weight: float = 2.0
+    """Weight of the term."""
+    scale: float = 0.05
+    """Width of the Gaussian of the horizontal distance, m."""
+
+    def value(self, inputs: "Inputs") -> jax.Array:
+        return task.gaussian(inputs.distance, self.scale)
+
+
+class Rewards(task.StrictModel):
+    """The reward terms."""
+
+    apex: ApexReward = ApexReward()
+    centre: CentreReward = CentreReward()
+
+
+class Observation(task.ObservationConfig):
+    """The world's quantities, and the wished apex."""
+
+    apex: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    """Wished height of the apexes over the paddle."""
+
+
+class Config(task.WorldConfig):
+    """The world, with a ball that starts low, and the task of dribbling."""
+
+    ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.15)
+    """Ball position at a reset, before noise, m."""
+    apex_range: tuple[float, float] = (0.065, 0.085)
+    """Range of the wished height of the apexes over the paddle, m."""
+    observation: Observation = Observation()
+    """The quantities that the policy sees."""
+    reward: Rewards = Rewards()
+    """The reward terms."""
+
+    @property
+    def commands(self) -> dict[str, task.Command]:
+        return {"apex": task.Command(*self.apex_range, "m", least=0.01, span=(0.05, 0.1))}
+
+
+class State(NamedTuple):
+    """What is kept of an episode."""
+
+    rising: jax.Array
+    """Whether the ball rose after the last step [], bool."""
+
+
+class Inputs(NamedTuple):
+    """What the reward terms depend on."""
+
+    reach: jax.Array
+    """Height over the paddle that the ball's energy allows [], m."""
+    target: jax.Array
+    """Wished height [], m."""
+    distance: jax.Array
+    """Horizontal distance of the ball from its start [], m."""
+
+
+class Dribble(task.Task):
+    """Many low bounces: apexes 5 to 10 cm over the paddle, more than three a second, for 20 s."""
+
+    Config = Config
+    curves = (task.Curve("task/apex_error", "apex_error", "apexes", "|apex − wish|, cm", 100.0),)
+    rest = 0.0225
+    """Height of the ball's centre over the paddle's while they touch, m."""
+
+    def reset(self, start: task.Start) -> State:
+        return State(jnp.zeros((), bool))
+
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
+        ball, velocity = step.truth.ball_position, step.truth.ball_velocity
+        height = ball[2] - step.truth.paddle_position[2] - self.rest
+        rising = velocity[2] > 0.0
+        apexes = state.rising & ~rising
+        distance = task.horizontal_distance(ball, self.config.ball_init_pos)
+        reach = height + jnp.square(velocity[2]) / (2.0 * 9.81)
+        inputs = Inputs(reach, step.command["apex"], distance)
+        error = jnp.abs(height - step.command["apex"])
+        return task.TaskStep(
+            state=State(rising),
+            reward=task.weighted_terms(self.config.reward, inputs),
+            ended=(height < -0.03) | (height > 0.5) | (distance > 0.2),
+            metrics={
+                "apexes": apexes,
+                "apex_error": jnp.where(apexes, error, 0.0),
+                "low_apexes": apexes & (height > 0.05) & (height < 0.1),
+            },
+        )
+
+    def tally(self, moment: task.Moment) -> task.Tally:
+        settled = moment.seconds > 2.0
+        counted = {name: moment.metrics[name] * settled for name in ("apexes", "low_apexes")}
+        return task.Tally({**counted, "seconds": settled * self.config.control_dt})
+
+    def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
+        sums = episodes.sums
+        return (
+            task.share_of_events(
+                "height", "apexes 5 to 10 cm high", sums["low_apexes"], sums["apexes"], 0.95
+            ),
+            task.mean_of_events(
+                "rate", "apexes a second", sums["apexes"], sums["seconds"], (3.0, math.inf)
+            ),
+            task.share_of_episodes("stable", "episodes that last 20 s", episodes.lasted, 0.99),
+        )
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"apex": f"{100.0 * command['apex']:.1f} cm"}
