@@ -6,7 +6,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from bounce_mjx.adapters.gymnasium.batch import Batch, action_space, observation_space
+from bounce_mjx.adapters.gymnasium.batch import (
+    Batch,
+    action_space,
+    checked_commands,
+    observation_space,
+)
 from bounce_mjx.adapters.gymnasium.environments import (
     EpisodeStatistics,
     TaskEnv,
@@ -15,6 +20,8 @@ from bounce_mjx.adapters.gymnasium.environments import (
 from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
 from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT
 
 try:
     from stable_baselines3.common.monitor import Monitor

@@ -88,8 +88,8 @@ def _from_file(name: str) -> type[Task]:
             ]
             line = getattr(error, "lineno", None) or (frames[-1].lineno if frames else 1)
             raise UserError(
-                f"the task's file {path} cannot be imported ({type(error).__name__} in line {line}: "
-                f"{shorten(str(error), 300)}); correct it"
+                f"the task's file {path} cannot be imported ({type(error).__name__} in "
+                f"line {line}: {shorten(str(error), 300)}); correct it"
             ) from error
     found = getattr(sys.modules[module_name], attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):

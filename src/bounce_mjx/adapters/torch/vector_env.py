@@ -85,10 +85,9 @@ class TorchVectorEnv:
         self._template = jax.eval_shape(
             lambda key: vector.reset(self.env, key, num_envs), self._key
         )
-        self.critic_metrics = matching_metrics(
-            self.env.task.critic_metrics if critic_metrics is None else critic_metrics,
-            self._template.env.metrics,
-        )
+        if critic_metrics is None:
+            critic_metrics = self.env.task.critic_metrics
+        self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
         _, result = jax.eval_shape(self._advance, carried, action)
