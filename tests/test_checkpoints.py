@@ -275,6 +275,13 @@ def test_links_are_not_followed(run: Path, state: TrainingState, name: str, targ
     assert_refused(run, state, "damaged", "is not a regular file")
 
 
+def test_a_checkpoint_that_is_a_link_is_refused(run: Path, state: TrainingState) -> None:
+    """It may lead to a large tree, of which every file would be hashed."""
+    step_of(run).rename(run.parent / "elsewhere")
+    step_of(run).symlink_to(run.parent / "elsewhere")
+    assert_refused(run, state, "damaged", "64 is not a regular file")
+
+
 def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
     path = step_of(run) / "run.json"
     path.unlink()

@@ -957,10 +957,14 @@ def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> N
     if "CI" not in os.environ and not offscreen.works(backend):
         pytest.skip(f"{backend} is not installed")
     flags = f"--video {name} --size 320 240 --seconds 0.6".split()
+    mine, planted = tmp_path / "mine", tmp_path / f".unfinished-{name}"
+    mine.write_text("mine")
+    planted.symlink_to(mine)
     done = run([*command.split(), *flags], tmp_path, MUJOCO_GL=backend)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    assert os.listdir(tmp_path) == [name]
+    assert mine.read_text() == "mine"
+    assert set(os.listdir(tmp_path)) == {name, mine.name, planted.name}
     rate, frames = read_video(tmp_path / name)
     assert rate == fps
     assert frames.shape == (round(0.6 * fps), 240, 320, 3)

@@ -69,7 +69,7 @@ def main(args: Sequence[str] | None = None) -> None:
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table
             from bounce_mjx.runs.config import load_run_config
-            from bounce_mjx.runs.files import to_json
+            from bounce_mjx.runs.files import to_json, write_output
             from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
@@ -106,7 +106,7 @@ def main(args: Sequence[str] | None = None) -> None:
             plain |= {"seed": command.seed, "target_height": command.target_height}
             plain |= {"nominal": command.nominal}
             try:
-                command.json_file.write_text(to_json(plain), encoding="utf-8")
+                write_output(command.json_file, to_json(plain))
             except OSError as error:
                 raise UserError(
                     f"--json {command.json_file} cannot be written ({error.strerror}); give "

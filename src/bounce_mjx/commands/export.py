@@ -43,6 +43,7 @@ def main(args: Sequence[str] | None = None) -> None:
             raise UserError("there is no file to write; give --onnx FILE or --jax FILE")
         with interruptible_imports():
             from bounce_mjx.deploy.export import export_jax, export_onnx
+            from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.training.setup import set_up_jax
 
@@ -63,7 +64,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 continue
             content = run_interruptible(export, checkpoint)
             try:
-                path.write_bytes(content)
+                write_output(path, content)
             except OSError as error:
                 raise UserError(
                     f"{flag} {path} cannot be written ({error.strerror}); give another file"

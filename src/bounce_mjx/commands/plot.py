@@ -48,6 +48,7 @@ def main(args: Sequence[str] | None = None) -> None:
             )
             from bounce_mjx.reports.page import record_checkpoint
             from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
             from bounce_mjx.task.env import BounceBall
 
@@ -66,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 path = command.out / f"{name}.{suffix}"
                 try:
                     command.out.mkdir(parents=True, exist_ok=True)
-                    path.write_bytes(image(figure, suffix))
+                    write_output(path, image(figure, suffix))
                 except OSError as error:
                     raise UserError(
                         f"{path} cannot be written ({error.strerror}); choose another folder with "

@@ -131,7 +131,7 @@ def _write(out: Path, report: "RobustnessReport") -> None:
     try:
         write_atomically(out / ROBUSTNESS_FILE, to_json(report.model_dump()))
         for suffix in ("png", "svg"):
-            (out / f"robustness.{suffix}").write_bytes(image(figure, suffix))
+            write_atomically(out / f"robustness.{suffix}", image(figure, suffix))
     except OSError as error:
         raise _not_writable(out, error) from error
     for suffix in ("json", "png", "svg"):

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import viser
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.task.env import BounceBall
-from bounce_mjx.viewers.files import replace_file
+from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 
@@ -37,16 +36,8 @@ def write_page(
       UserError: the file cannot be written.
     """
     text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
-    unfinished = path.with_name(f".unfinished-{path.name}")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        replace_file(unfinished, path, "--html")
-    except OSError as error:
-        raise UserError(
-            f"--html {path} cannot be written ({error.strerror}); give another file"
-        ) from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with new_output(path, "--html") as new:
+        new.write_text(text, encoding="utf-8")
 
 
 def replay(
