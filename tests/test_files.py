@@ -3,10 +3,12 @@
 import os
 from pathlib import Path
 
+import jax
 import pytest
 
 from bounce_mjx.files import new_file, private_folder, read_regular
 from bounce_mjx.runs.files import write_atomically, write_output
+from bounce_mjx.training.setup import cache_compilations
 
 
 @pytest.fixture
@@ -71,3 +73,33 @@ def test_a_private_folder_is_for_its_user_alone(tmp_path: Path, monkeypatch) -> 
     with pytest.raises(OSError, match="it is another user's"):
         private_folder(folder)
     assert folder.stat().st_mode & 0o777 == 0o755
+
+
+@pytest.mark.parametrize("linked", [None, "bounce_mjx", "bounce_mjx/jax"])
+def test_compiled_programs_are_kept_in_a_private_folder(
+    linked: str | None, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """A link in its place is left alone: a warning tells that nothing is kept."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder, target = tmp_path / "cache/bounce_mjx/jax", tmp_path / "target"
+    if linked is not None:
+        target.mkdir(mode=0o755)
+        (tmp_path / "cache" / linked).parent.mkdir(parents=True)
+        (tmp_path / "cache" / linked).symlink_to(target)
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        cache_compilations()
+        used = jax.config.jax_compilation_cache_dir
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    said = capsys.readouterr().err
+    if linked is None:
+        assert (used, said) == (str(folder), "")
+        assert {p.stat().st_mode & 0o777 for p in (folder, folder.parent)} == {0o700}
+    else:
+        assert used is None
+        assert said.startswith("warning: compiled programs are not kept, as ")
+        assert said.count("\n") == 1 and f"{tmp_path}/cache/{linked}" in said
+        assert not list(target.iterdir()) and target.stat().st_mode & 0o777 == 0o755

@@ -4,6 +4,7 @@ ones."""
 import copy
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import warnings
@@ -369,8 +370,8 @@ def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
 def test_async_environments_run_after_jax_ran_in_the_parent(tmp_path):
     """Gymnasium's processes start from a server by default; a fork would hang. The compiled
     programs are cached where the commands cache them."""
-    (tmp_path / "bounce_mjx").mkdir()
-    (tmp_path / "bounce_mjx/jax").symlink_to(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    kept = tmp_path / "bounce_mjx/jax"
+    shutil.copytree(os.environ["JAX_COMPILATION_CACHE_DIR"], kept, copy_function=os.link)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     script = f"""
 import gymnasium, jax, numpy as np, bounce_mjx

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bounce_mjx
+from bounce_mjx.files import private_folder
 
 if TYPE_CHECKING:
     from bounce_mjx.gpu.kernel_calls import Attributes
@@ -51,10 +52,15 @@ NOT_COMPILED = ("seed", "eval_seed", "total_steps", "eval_every", "stop_when_sol
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled programs: the one that the user chose, or one in the user's cache."""
+    """Folder of the compiled programs: the one that the user chose, or one in the user's cache,
+    which is made; compiled programs are code, which no other user may write.
+
+    Raises:
+      OSError: the folder in the cache cannot be made, or is a link or another user's.
+    """
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(chosen) if chosen else caches / "bounce_mjx" / "jax"
+    return Path(chosen) if chosen else private_folder(private_folder(caches / "bounce_mjx") / "jax")
 
 
 def start_helpers(args: Sequence[str]) -> "Helpers | None":

@@ -24,7 +24,14 @@ def cache_compilations() -> None:
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        try:
+            jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        except OSError as error:
+            print(
+                f"warning: compiled programs are not kept, as {error.filename} cannot be used "
+                f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to a folder of yours",
+                file=sys.stderr,
+            )
 
 
 def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
