@@ -21,6 +21,7 @@ from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.reports.figures import image
 from bounce_mjx.reports.page import write_report
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure, robustness_table
 from bounce_mjx.resources import resource_path
@@ -402,10 +403,15 @@ def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
 
 def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
+    out, mine = tmp_path / "robustness", tmp_path / "mine"
+    out.mkdir()
+    mine.write_text("mine")
+    for suffix in ("json", "png", "svg"):
+        (out / f"robustness.{suffix}").symlink_to(mine)
     with pytest.raises(SystemExit) as exit_info:
         robustness_command.main(["--episodes", "4", "--seed", "3"])
     assert exit_info.value.code == 1
-    out = tmp_path / "robustness"
+    assert mine.read_text() == "mine"
     assert {p.name for p in out.iterdir()} == {f"robustness.{s}" for s in ("json", "png", "svg")}
     written = load_robustness(out)
     assert written.outcomes == measured.outcomes
@@ -417,6 +423,30 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
         robustness_command.main(["--out", str(tmp_path / "other")])
     assert exit_info.value.code == 0
     assert json.loads((tmp_path / "other" / "robustness.json").read_text())["outcomes"]
+
+
+CRAFTED_OUTCOMES = {
+    "no outcomes": None,
+    "unknown engine": {"physics": "other"},
+    "no results": {"values": {}},
+}
+
+
+@pytest.mark.parametrize("change", CRAFTED_OUTCOMES.values(), ids=CRAFTED_OUTCOMES)
+def test_a_crafted_report_is_refused(report: RobustnessReport, tmp_path: Path, change) -> None:
+    plain = report.model_dump()
+    plain["outcomes"] = [] if change is None else [plain["outcomes"][0] | change]
+    (tmp_path / "robustness.json").write_text(json.dumps(plain))
+    with pytest.raises(UserError, match="robustness.json cannot be read"):
+        load_robustness(tmp_path)
+
+
+def test_names_are_not_read_as_formulas(report: RobustnessReport) -> None:
+    name = r"$\frac$, \$5"
+    changes = {"perturbation": name, "group": name, "unit": name}
+    outcomes = [outcome.model_copy(update=changes) for outcome in report.outcomes]
+    outcomes[0].values["stable"] = None
+    image(robustness_figure(report.model_copy(update={"outcomes": outcomes})), "svg")
 
 
 def test_command_does_not_begin_what_it_cannot_write(tmp_path: Path, capsys) -> None:
