@@ -22,6 +22,7 @@ import contextlib
 import datetime
 import itertools
 import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -103,7 +104,23 @@ def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
 
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds; the run itself if it has one seed."""
-    return sorted(run.glob("seed_*")) or [run]
+    seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
+    return sorted(path for path in seeds if not path.is_symlink()) or [run]
+
+
+def check_links(run: Path) -> None:
+    """Checks that a run's folder holds no links, through which a training would write elsewhere;
+    those of Weights & Biases do not count, as it makes them anew.
+
+    Raises:
+      UserError: there is one, as there may be in a run from someone else.
+    """
+    for path in run.rglob("*"):
+        if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
+            raise UserError(
+                f"{path} is a link, and a training writes only into the folder of its run; remove "
+                "it, or put in its place what it leads to"
+            )
 
 
 def find_run(path: Path) -> Path:

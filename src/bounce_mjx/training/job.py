@@ -28,6 +28,7 @@ from bounce_mjx.runs.folders import (
     CHECKPOINTS,
     Checkpoint,
     best_checkpoint,
+    check_links,
     create_run,
     find_run,
     latest_checkpoint,
@@ -256,6 +257,7 @@ class _Job:
     def _resume(self, path: Path) -> None:
         self.run = find_run(path)
         self._lock()
+        check_links(self.run)
         latest = latest_checkpoint(self.run)
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
