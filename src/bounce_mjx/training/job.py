@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.gpu.kernel_calls import lower_elsewhere
@@ -592,7 +592,9 @@ def check_library(checkpoint: Checkpoint, library: str) -> None:
     """
     began = library_of(checkpoint)
     if began != library:
-        command = "train" if began == JAX else f"train-torch --library {began}"
+        # The name is from a file, and the command is to be copied into a shell.
+        began = shorten(began)
+        command = "train" if began == JAX else f"train-torch --library {shlex.quote(began)}"
         raise UserError(
             f"{checkpoint.run} was trained with {began}, not with {library}; go on with: "
             f"bounce-mjx {command} --resume {shlex.quote(str(checkpoint.run))}"
