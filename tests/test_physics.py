@@ -388,6 +388,12 @@ SUPPORTED = {
     "spring": ("<joint ", '<joint stiffness="500" springref="0.3" '),
     "joint force range": ("<joint ", '<joint actuatorfrcrange="-40 60" '),
     "gravity compensation of a link": ('<body name="Link3"', '<body name="Link3" gravcomp="2"'),
+    "gravity compensation of either sign": (
+        ARM_BODY,
+        ARM_BODY.replace('<body name="Link3"', '<body name="Link3" gravcomp="2"').replace(
+            '<body name="Link5"', '<body name="Link5" gravcomp="-1"'
+        ),
+    ),
     "gravity compensation": (ARM_BODY, ARM_BODY.replace("<body ", '<body gravcomp="0.7" ')),
     "gravity compensation by actuators": (
         ARM_BODY,
@@ -421,6 +427,14 @@ SUPPORTED = {
 }
 # Models that move like the shipped one.
 EQUIVALENT = {
+    "negative gravity compensation of a link": (
+        '<body name="Link3"',
+        '<body name="Link3" gravcomp="-1"',
+    ),
+    "negative gravity compensation": (
+        ARM_BODY + BALL_BODY,
+        (ARM_BODY + BALL_BODY).replace("<body ", '<body gravcomp="-1" '),
+    ),
     "static body": ("  </worldbody>", f"{WELDED}</body></worldbody>"),
     "springs disabled": (
         OPTIONS,
