@@ -11,7 +11,7 @@ import numpy as np
 from mujoco import mjx
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.control import Control, servo_target
+from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, find_addresses
@@ -121,20 +121,22 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps."""
     addresses = constants.addresses
+    ball_velocity = np.array(addresses.ball_qvel[:3])
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
+        if control.air_drag is not None:
+            acceleration = jnp.stack(drag(control.air_drag, data.qvel[ball_velocity]))
+            force = model.body_mass[addresses.ball_body] * acceleration
+            applied = data.xfrc_applied.at[addresses.ball_body, :3].set(force)
+            data = data.replace(xfrc_applied=applied)
         return mjx.step(_with_saturated_servos(model, constants, data), data)
 
     with _full_precision():
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
-            velocity = np.array(addresses.ball_qvel[:3])
-            data = data.replace(qvel=data.qvel.at[velocity].add(control.ball_push))
-        if control.ball_force is not None:
-            force = data.xfrc_applied.at[addresses.ball_body, :3].set(control.ball_force)
-            data = data.replace(xfrc_applied=force)
+            data = data.replace(qvel=data.qvel.at[ball_velocity].add(control.ball_push))
         if state.act is not None:
             data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)

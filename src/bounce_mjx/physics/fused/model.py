@@ -91,8 +91,8 @@ class FusedModel:
     """Whether the integrator is implicit in the joints' damping."""
     dry_friction: bool = True
     """Whether the joints' dry friction acts (the flag `frictionloss`)."""
-    ball_force: Vec3 = ZERO3
-    """External force on the ball, N."""
+    air_drag: Scalar = 0.0
+    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
