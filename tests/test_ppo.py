@@ -391,6 +391,17 @@ def test_run_returns_the_same_types_as_its_input(trainer, init):
     assert types[0] == types[1]
 
 
+@pytest.mark.usefixtures("float64")
+def test_learning_is_in_float32_with_physics_in_float64(tiny):
+    env = BounceBall()
+    trainer = ppo.make_trainer(tiny, env, env.config.episode_steps)
+    start = jax.eval_shape(trainer.init, jax.random.key(0))
+    state, _ = jax.eval_shape(lambda s: trainer.run(s, 1), start)
+    assert state.env.env.pipeline_state.physics.qpos.dtype == jnp.float64
+    learned = state.params, state.optimizer[1].nu, state.statistics, state.learning_rate
+    assert {x.dtype for x in jax.tree.leaves(learned)} == {jnp.dtype(jnp.float32)}
+
+
 def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
     """The state stays in float32, and the update has the same direction as in float32."""
     config = tiny.model_copy(update={"compute_dtype": "bfloat16"})

@@ -236,9 +236,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         )
 
     def make_inputs(observation: jax.Array, metrics: Metrics) -> jax.Array:
-        """Inputs of the networks before normalisation [B, N + K]."""
+        """Inputs of the networks before normalisation [B, N + K]; the learning is in float32, also
+        with physics in float64."""
         columns = [metrics[name][:, None] for name in critic_metrics]
-        return jnp.concatenate([observation, *columns], axis=-1)
+        return jnp.concatenate([observation, *columns], axis=-1, dtype=jnp.float32)
 
     def init(key: jax.Array) -> TrainingState:
         key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
@@ -285,7 +286,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 raw_inputs=raw_inputs.T,
                 action=action.T,
                 log_prob=distribution.log_prob(action),
-                reward=config.reward_scale * result.reward,
+                reward=(config.reward_scale * result.reward).astype(jnp.float32),
                 terminated=result.terminated,
                 truncated=result.truncated,
             )
@@ -298,7 +299,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         noise_key, reset_key = jax.random.split(key)
         # All numbers are drawn at once, because on a GPU each draw costs a kernel or two.
         shape = (config.rollout_length, config.num_envs, env.action_size)
-        noise = jax.random.normal(noise_key, shape)
+        noise = jax.random.normal(noise_key, shape, jnp.float32)
         ranges = vector.ranges_after(env, state.iteration, config.batch_steps)
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
