@@ -59,6 +59,14 @@ def test_the_model_without_visuals_moves_the_same():
         mujoco.mj_step(model, data, nstep=100)
         after.append(np.concatenate([data.qpos, data.qvel]))
     np.testing.assert_array_equal(*after)
+def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
+    """MuJoCo refuses to drop such geoms."""
+    text = XML.replace('autolimits="true"', 'inertiafromgeom="true"').replace(' mass="0" ', " ")
+    (tmp_path / "robot.xml").write_text(text)
+    pictured, plain = (load_model(tmp_path / "robot.xml", 0.001, visual=v) for v in (True, False))
+    np.testing.assert_array_equal(plain.body_mass, pictured.body_mass)
+
+
 
 
 def test_an_edited_model_is_an_error():

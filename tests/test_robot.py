@@ -19,7 +19,7 @@ from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt
-from bounce_mjx.robot.arm import compile_spec, locate
+from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
@@ -303,6 +303,80 @@ def test_the_small_arm_has_servos_instead_of_motors(written) -> None:
     # Critical damping at 1 / control_dt: kp = kv^2 / (4 M), with kv = 2 M / control_dt.
     kp, kv = (np.array(values["robot"][f"servo_{key}"]) for key in ("stiffness", "damping"))
     np.testing.assert_allclose(kp / kv, 50.0, rtol=1e-3)
+
+
+def styled(compiler: str = "", servo: str = 'kv="20"', names: str = "abcde") -> str:
+    """An arm in degrees with classes; each link has a shape that touches and one for pictures, and
+    the last joint has a range, but no limit."""
+    body = '<site name="tool" pos="0 0 0.1"/>'
+    axes = "0 0 1", "0 1 0", "0 1 0", "0 1 0", "1 0 0"
+    for name, axis in reversed([*zip(names, axes, strict=True)]):
+        own = 'range="-90 120" ref="10" springref="20" stiffness="3"' if name == "b" else ""
+        own = 'limited="false"' if name == "e" else own
+        body = (
+            f'<body pos="0 0 {0.2 if name == "a" else 0.3}" euler="0 0 {5 if name == "d" else 0}">'
+            f'<joint name="{name}" axis="{axis}" {own}/><geom class="touching"/>'
+            f'<geom class="pictured"/>{body}</body>'
+        )
+    servos = "".join(f'<position name="{name}" joint="{name}"/>' for name in names)
+    return (
+        f'<mujoco><compiler {compiler}/><default><joint limited="true" range="-170 170" '
+        'damping="0.1" armature="0.01"/><default class="touching"><geom type="capsule" '
+        'fromto="0 0 0 0 0 0.3" size="0.03" group="1"/></default><default class="pictured"><geom '
+        'type="box" size="0.03 0.04 0.05" pos="0.01 0 0.1" contype="0" conaffinity="0" group="2"/>'
+        f'</default><position kp="300" {servo} forcelimited="true" forcerange="-90 90"/></default>'
+        f'<worldbody><body childclass="main">{body}</body></worldbody><actuator>{servos}'
+        "</actuator></mujoco>"
+    ).replace(' childclass="main"', "")
+
+
+STYLES = {
+    "degrees": styled(),
+    "radians": styled('angle="radian"').replace("-170 170", "-3 3").replace("-90 120", "-1.6 2"),
+    "autolimits false": styled('autolimits="false"'),
+    "total mass": styled('settotalmass="7" boundmass="0.1" boundinertia="0.01"'),
+    "shapes that touch": styled('inertiagrouprange="1 1"'),
+    "shapes for pictures": styled('inertiagrouprange="2 2"'),
+    "inertia from geoms": styled('inertiafromgeom="true"'),
+    "pictures discarded": styled('discardvisual="true"'),
+    "welded bodies fused": styled('fusestatic="true"'),
+    "damping ratio": styled(servo='dampratio="1"'),
+    "rotor": styled(servo='kv="20" armature="0.2" damping="0.3"'),
+    "inherited range": styled(servo='kv="20" inheritrange="1"').replace('limited="false"', ""),
+    "spring and damper": styled().replace('stiffness="3"', 'springdamper="0.5 1"'),
+}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
+    """Limits, inertia, springs and servos are those of the file compiled as it is, to the limit of
+    a paddle without mass; also without the geoms that only pictures need."""
+    path, names = tmp_path / "arm.xml", "abcde"
+    path.write_text(STYLES[style])
+    config = RobotConfig.model_validate({"site": "tool", "paddle": {"mass": 1e-12}})
+    found = build_arm(path, config)
+    found.spec.compiler.discardvisual = True
+    model, plain = compile_spec(found.spec, path), compile_spec(read_spec(path), path)
+    limits, expected = (np.array([m.joint(n).range for n in names]) for m in (model, plain))
+    limited = plain.jnt_limited.astype(bool)
+    np.testing.assert_allclose(limits[limited], expected[limited])
+    assert not np.any(limits[~limited]) and not np.any(model.jnt_limited)
+    ignored = any("ignored the range of e" in change for change in found.changes)
+    assert ignored == (not limited[4])
+
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-0.8, 0.8, (3, 5)), rng.uniform(-1.0, 1.0, (3, 5))
+    for qpos, qvel in zip(*states, strict=True):
+        accelerations = []
+        for m in (model, plain):
+            data = mujoco.MjData(m)
+            for i, name in enumerate(names):
+                data.joint(name).qpos[0], data.joint(name).qvel[0] = qpos[i], qvel[i]
+                data.actuator(name).ctrl[0] = qpos[i] + 0.01
+            m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+            mujoco.mj_forward(m, data)
+            accelerations.append([data.joint(name).qacc[0] for name in names])
+        np.testing.assert_allclose(*accelerations, rtol=1e-7)
 
 
 LIFT = link(

@@ -197,6 +197,7 @@ class _Builder:
         names = self._name(joints, end)
         gripper = self._check_other_joints(chain, joints)
         self._check_loops(joints)
+        self._freeze(joints, actuators)
         self._strip(joints, gripper, actuators)
         scene = self._attach(names, end, position, quaternion)
         replaced = self._replace_servos(scene, names, servos)
@@ -329,6 +330,44 @@ class _Builder:
                     "it, or give a serial arm"
                 )
 
+    def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
+        """Gives the spec the numbers of the compiled model.
+
+        MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
+        again in another scene, without its limits and with fewer parts, they would be others.
+        """
+        arm, model = self._arm, self._model
+        # Each access to a list of a spec walks through the whole spec.
+        bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
+        for i, body in enumerate(bodies[1:], start=1):
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[i], model.body_inertia[i]
+            body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
+            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.fullinertia[0] = np.nan
+        arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
+        for i in joints:
+            joint, dof = parts[i], model.jnt_dofadr[i]
+            if np.any(joint.range) and not model.jnt_limited[i]:
+                self._changes.append(
+                    f"ignored the range of {_name(model, i)}, which is not limited"
+                )
+            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            joint.range = model.jnt_range[i] if model.jnt_limited[i] else np.zeros(2)
+            joint.springdamper = np.zeros(2)
+            joint.stiffness[0], joint.damping[0] = model.jnt_stiffness[i], model.dof_damping[dof]
+            joint.armature = model.dof_armature[dof]
+            for a in actuators[i]:
+                # The rotor moves with the joint, also where another servo replaces the actuator.
+                gear, drive = model.actuator_gear[a, 0], drives[a]
+                joint.armature += gear**2 * model.actuator_armature[a]
+                joint.damping[0] += gear**2 * model.actuator_damping[a]
+                drive.armature, drive.damping[0] = 0.0, 0.0
+                drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
+                control = model.actuator_ctrladr[a]
+                drive.inheritrange, drive.ctrlrange = 0.0, model.actuator_ctrlrange[control]
+
     def _strip(
         self, joints: list[int], gripper: list[int], actuators: dict[int, list[int]]
     ) -> None:
@@ -337,16 +376,15 @@ class _Builder:
         own = {a for actuators_of_joint in actuators.values() for a in actuators_of_joint}
         others = [a for i, a in enumerate(arm.actuators) if i not in own]
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        self._remove("keyframe", arm.keys)
-        self._remove("sensor", arm.sensors)
-        self._remove("actuator beside the arm's", others)
-        self._remove("tendon", arm.tendons)
-        self._remove("equality constraint", arm.equalities)
-        self._remove("contact pair or exclusion", [*arm.pairs, *arm.excludes])
-        self._remove("light or camera", [*arm.lights, *arm.cameras])
-        self._remove("floor", [g for g in arm.geoms if g.type in floors])
-        bodies = {i: arm.bodies[i] for i in range(model.nbody)}
-        parts = {i: arm.joints[i] for i in range(model.njnt)}
+        self._remove("keyframes", arm.keys)
+        self._remove("sensors", arm.sensors)
+        self._remove("actuators beside the arm's", others)
+        self._remove("tendons", arm.tendons)
+        self._remove("equality constraints", arm.equalities)
+        self._remove("contact pairs and exclusions", [*arm.pairs, *arm.excludes])
+        self._remove("lights and cameras", [*arm.lights, *arm.cameras])
+        self._remove("floors", [g for g in arm.geoms if g.type in floors])
+        bodies, parts = list(arm.bodies), list(arm.joints)
         loose = {
             int(model.jnt_bodyid[j]): j
             for j in range(model.njnt)
@@ -374,7 +412,7 @@ class _Builder:
         for body in (*gripper, *objects):
             if not _is_below(model, int(model.body_parentid[body]), gripper + objects):
                 arm.delete(bodies[body])
-        self._disable_contacts_and_limits(joints, parts)
+        self._disable_contacts_and_limits(joints)
 
     def _remove(self, noun: str, elements: Iterable) -> None:
         elements = list(elements)
@@ -387,7 +425,7 @@ class _Builder:
             plural = plural if " " in noun or len(elements) == 1 else f"{noun}s"
             self._changes.append(f"removed {len(elements)} {plural}{named}")
 
-    def _disable_contacts_and_limits(self, joints: list[int], parts: dict) -> None:
+    def _disable_contacts_and_limits(self, joints: list[int]) -> None:
         model = self._model
         touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
         if touching:
@@ -397,8 +435,6 @@ class _Builder:
             geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
-        for joint in joints:
-            parts[joint].limited = mujoco.mjtLimited.mjLIMITED_FALSE
 
     def _hide_contact_shapes(self) -> None:
         """Leaves only the pictured geoms of a body visible, where it has both kinds."""

@@ -89,7 +89,10 @@ def load_model(
         without a position servo, or has a number that cannot be simulated.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
-    spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+    # MuJoCo does not drop geoms that make the bodies' inertia.
+    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if not visual and spec.compiler.inertiafromgeom != from_geoms:
+        spec.compiler.discardvisual = True
     mj_model = compile_spec(spec, path)
     try:
         check_numbers(mj_model)
