@@ -379,6 +379,14 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
 
 
+def test_a_joint_with_a_pid_actuator_gets_a_servo(tmp_path) -> None:
+    """A <pid> has several controls, which shift those of the motors after it."""
+    pid = '<pid joint="j1" kp="10" forcerange="-70 70"/>'
+    (tmp_path / "arm.xml").write_text(mjcf(arm(), pid + motors(ARM_JOINTS[3:], 50.0)))
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
+    assert [servo.force_limit for servo in found.servos] == [70.0] + [50.0] * 5
+
+
 LIFT = link(
     SLIDE.format("lift", "0 0 1"),
     "0 0 0.3",

@@ -245,14 +245,14 @@ class _Builder:
     def _actuators(self, joints: list[int]) -> dict[int, list[int]]:
         """Actuators of each acting joint."""
         model = self._model
-        if model.nu == 0:
+        if model.nactuator == 0:
             raise UserError(
                 "no actuators; add a <position> or <motor> with a force limit for each joint"
             )
         actuators = {
             joint: [
                 a
-                for a in range(model.nu)
+                for a in range(model.nactuator)
                 if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
                 and model.actuator_trnid[a, 0] == joint
             ]
@@ -288,7 +288,7 @@ class _Builder:
         last = int(model.jnt_bodyid[joints[-1]])
         driven = {
             int(model.actuator_trnid[a, 0])
-            for a in range(model.nu)
+            for a in range(model.nactuator)
             if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
         }
         beside, gripper = [], []
@@ -582,8 +582,10 @@ def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> flo
         if model.actuator_forcelimited[actuator]:
             limit = float(np.min(np.abs(model.actuator_forcerange[actuator])))
         is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-        if model.actuator_ctrllimited[actuator] and is_motor:
-            largest = float(np.min(np.abs(model.actuator_ctrlrange[actuator])))
+        # A <pid> has several controls; the other arrays have one row for each actuator.
+        control = model.actuator_ctrladr[actuator]
+        if is_motor and model.actuator_ctrllimited[control]:
+            largest = float(np.min(np.abs(model.actuator_ctrlrange[control])))
             limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
         total = max(total, limit * gear)
     if model.jnt_actfrclimited[joint]:
