@@ -17,6 +17,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.limits import check_files
 from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
@@ -132,13 +133,19 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     """The spec of an MJCF file.
 
     Raises:
-      UserError: the file is no MJCF.
+      UserError: the file is no MJCF, or is too large.
     """
+    check_files(path)
     try:
         with _silent():
-            return mujoco.MjSpec.from_file(str(path))
+            spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise _not_compiled(path, error) from error
+    # The task needs no user data, and the memory that MuJoCo chooses.
+    spec.memory, spec.nuserdata, spec.nkey = -1, 0, 0
+    for name in [name for name in dir(spec) if name.startswith("nuser_")]:
+        setattr(spec, name, -1)
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
