@@ -379,6 +379,29 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
 
 
+def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
+    """By the noise of a reset at least; of an arm in degrees, and of one that turns one way."""
+    (tmp_path / "degrees.xml").write_text(styled())
+    (tmp_path / "one_way.xml").write_text(mjcf(arm(limits="0 3"), motors(ARM_JOINTS)))
+    for name in ("degrees", "one_way"):
+        path = tmp_path / f"{name}.xml"
+        pose = adopt(path, RobotConfig(site="tool"), 0.01, is_mount_given=False).pose
+        plain = mujoco.MjModel.from_xml_path(str(path))
+        low, high = plain.jnt_range[plain.jnt_limited == 1].T
+        angles = np.array(pose.angles)[plain.jnt_limited == 1]
+        noise = EnvConfig().joint_angle_noise - 1e-9
+        assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
+
+
+def test_the_start_pose_follows_the_height_of_the_base(tmp_path) -> None:
+    """Far above the floor an arm finds the same posture at every height."""
+    poses = []
+    for height in (1.0, 2.0):
+        (tmp_path / "arm.xml").write_text(mjcf(arm(base=f"0 0 {height}"), motors(ARM_JOINTS)))
+        poses.append(adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, False).pose)
+    np.testing.assert_allclose(poses[0].angles, poses[1].angles, atol=1e-6)
+
+
 def test_a_joint_with_a_pid_actuator_gets_a_servo(tmp_path) -> None:
     """A <pid> has several controls, which shift those of the motors after it."""
     pid = '<pid joint="j1" kp="10" forcerange="-70 70"/>'
