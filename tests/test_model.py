@@ -40,6 +40,8 @@ REFUSED = {
         'biasprm="0 -20000 -200"/>',
         "Joint2",
     ),
+    "damping negative": ('armature="0.02"', 'damping="-1"', "-1 in dof_damping"),
+    "armature negative": ('armature="0.02"', 'armature="-0.1"', "-0.1 in dof_armature"),
 }
 
 
@@ -66,6 +68,8 @@ def test_the_model_without_visuals_moves_the_same():
         mujoco.mj_step(model, data, nstep=100)
         after.append(np.concatenate([data.qpos, data.qvel]))
     np.testing.assert_array_equal(*after)
+
+
 def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
     """MuJoCo refuses to drop such geoms."""
     text = XML.replace('autolimits="true"', 'inertiafromgeom="true"').replace(' mass="0" ', " ")

@@ -1,6 +1,7 @@
 """Adoption of arms: unsuitable models are refused in one sentence, suitable ones become the task's
 scene with a level paddle and stable servos."""
 
+import os
 import re
 from pathlib import Path
 
@@ -147,7 +148,46 @@ BROKEN = {
     "text": ("hello", "tool", "does not compile", "correct it"),
     "massless link": (ARM.replace('mass="0.5"', 'mass="0"'), "tool", "does not compile", "mass"),
     "nan": (ARM.replace('pos="0 0 0.2"', 'pos="0 0 nan"'), "tool", "nan in body_pos"),
-    "empty": (mjcf("", ""), "tool", "no site or body named tool", "none"),
+    "empty": (mjcf("", ""), "tool", "no site or body named tool", "beyond at least 3 joints"),
+    "wrong site of many": (
+        mjcf(
+            "".join(f'<site name="mark{i}"/>' for i in range(20))
+            + arm(tip='<site name="flange"/>'),
+            motors(ARM_JOINTS),
+        ),
+        "attachment_site",
+        "one of the sites (tool, flange) or bodies",
+    ),
+    "site too low": (
+        mjcf('<site name="base"/>' + arm(), motors(ARM_JOINTS)),
+        "base",
+        "too few joints",
+        "one of the sites (tool)",
+    ),
+    "negative damping": (
+        ARM.replace('damping="0.1"', 'damping="-0.1"', 1),
+        "tool",
+        "-0.1 in dof_damping",
+    ),
+    "many bodies": (
+        mjcf(
+            arm() + '<replicate count="50"><replicate count="100"><body><geom size=".1"/></body>'
+            "</replicate></replicate>",
+            motors(ARM_JOINTS),
+        ),
+        "tool",
+        "10012 bodies and geoms",
+    ),
+    "device for a mesh": (
+        mjcf(arm(), motors(ARM_JOINTS), assets='<asset><mesh name="m" file="/dev/null"/></asset>'),
+        "tool",
+        "/dev/null, which is a pipe, a device",
+    ),
+    "device for an included file": (
+        mjcf(arm(), motors(ARM_JOINTS), '<include file="/dev/null"/>'),
+        "tool",
+        "/dev/null, which is a pipe, a device",
+    ),
 }
 
 
@@ -175,6 +215,13 @@ def test_a_file_of_a_package_is_found_by_name() -> None:
         locate(Path("package:no_such_arm/arm.xml"))
     with pytest.raises(UserError, match="gone.xml does not exist"):
         locate(Path("package:bounce_mjx/gone.xml"))
+
+
+def test_a_folder_or_a_pipe_is_no_mjcf_file(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe.xml")
+    for path in (tmp_path, tmp_path / "pipe.xml"):
+        with pytest.raises(UserError, match=f"{path} is no file; give the path"):
+            locate(path)
 
 
 # Adopted arms
@@ -305,6 +352,9 @@ def test_the_small_arm_has_servos_instead_of_motors(written) -> None:
     np.testing.assert_allclose(kp / kv, 50.0, rtol=1e-3)
 
 
+# Models in other people's styles, as MuJoCo compiles them
+
+
 def styled(compiler: str = "", servo: str = 'kv="20"', names: str = "abcde") -> str:
     """An arm in degrees with classes; each link has a shape that touches and one for pictures, and
     the last joint has a range, but no limit."""
@@ -408,6 +458,29 @@ def test_a_joint_with_a_pid_actuator_gets_a_servo(tmp_path) -> None:
     (tmp_path / "arm.xml").write_text(mjcf(arm(), pid + motors(ARM_JOINTS[3:], 50.0)))
     found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
     assert [servo.force_limit for servo in found.servos] == [70.0] + [50.0] * 5
+
+
+def test_lines_about_an_adopted_arm_are_words(tmp_path) -> None:
+    """Servos without damping or limits, on an arm with lights and constraints."""
+    world = '<light/><camera/><body name="post"><geom size=".1"/></body>' + arm()
+    servos = "".join(f'<position joint="{name}" kp="4000"/>' for name in ARM_JOINTS.split())
+    joined = '<connect body1="world" body2="post" anchor="0 0 0"/>'
+    text = mjcf(world, servos, f"<equality>{5 * joined}</equality>")
+    (tmp_path / "arm.xml").write_text(text.replace('damping="0.1"', 'damping="200"'))
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
+    lines = "\n".join(adopt_command.described(found))
+    assert "strength: no force limit" in lines and "inf" not in lines.replace("inertia", "")
+    assert found.are_kept and "kv 0," in lines
+    assert "removed the lights and cameras (2)" in lines
+    assert "removed the equality constraints (5)" in lines
+
+
+def test_a_name_with_a_line_break_stays_in_the_configs_comment(tmp_path) -> None:
+    mjcf_file = tmp_path / "my\narm.xml"
+    mjcf_file.write_text(ARM)
+    out = tmp_path / "arm.yaml"
+    adopt_command.main([str(mjcf_file), "--site", "tool", "--out", str(out), "--no-view"])
+    assert load_config(out).env.mjcf == mjcf_file
 
 
 LIFT = link(

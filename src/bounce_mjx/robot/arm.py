@@ -76,7 +76,8 @@ def locate(mjcf: Path) -> Path:
     else:
         path = mjcf
     if not path.is_file():
-        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+        wrong = "is no file" if path.exists() else "does not exist"
+        raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
     return path
 
 
@@ -173,12 +174,22 @@ def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarr
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, config.site)
     if body > 0:
         return body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    sites = _listed(model.site(i).name for i in range(model.nsite))
-    bodies = _listed(model.body(i).name for i in range(1, model.nbody))
-    raise UserError(
-        f"no site or body named {shorten(config.site)}; give --site one of the sites ({sites}) or "
-        f"bodies ({bodies})"
-    )
+    raise UserError(f"no site or body named {shorten(config.site)}; {_other_sites(model)}")
+
+
+def _other_sites(model: mujoco.MjModel) -> str:
+    """The remedy for a wrong site: the sites and bodies that enough joints lead to."""
+    joints = np.zeros(model.nbody, int)
+    for body in range(1, model.nbody):
+        own = model.jnt_type[_joints_of(model, body)]
+        joints[body] = joints[model.body_parentid[body]] + np.isin(own, (_HINGE, _SLIDE)).sum()
+    sites = [
+        model.site(i).name for i in range(model.nsite) if joints[model.site_bodyid[i]] >= MIN_JOINTS
+    ]
+    bodies = [model.body(i).name for i in np.flatnonzero(joints >= MIN_JOINTS)]
+    if not any(sites + bodies):
+        return f"give an arm with a named site or body beyond at least {MIN_JOINTS} joints"
+    return f"give --site one of the sites ({_listed(sites, 40)}) or bodies ({_listed(bodies, 40)})"
 
 
 class _Builder:
@@ -242,10 +253,10 @@ class _Builder:
             acting = [j for j in hinges if _name(model, j) in wanted]
         if len(acting) < MIN_JOINTS:
             have = _listed(_name(model, j) for j in acting) if acting else "none"
+            remedy = _other_sites(model) if wanted is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
-                f"the way to {site}, where at least {MIN_JOINTS} must act; give an arm with more, "
-                "or another --site"
+                f"the way to {site}, where at least {MIN_JOINTS} must act; {remedy}"
             )
         return acting
 
@@ -421,16 +432,14 @@ class _Builder:
                 arm.delete(bodies[body])
         self._disable_contacts_and_limits(joints)
 
-    def _remove(self, noun: str, elements: Iterable) -> None:
+    def _remove(self, nouns: str, elements: Iterable) -> None:
         elements = list(elements)
         names = [element.name for element in elements]
         for element in elements:
             self._arm.delete(element)
         if elements:
-            named = f" ({_listed(name for name in names if name)})" if any(names) else ""
-            plural = noun if len(elements) == 1 else noun.replace(" ", "s ", 1)
-            plural = plural if " " in noun or len(elements) == 1 else f"{noun}s"
-            self._changes.append(f"removed {len(elements)} {plural}{named}")
+            named = f": {_listed(names)}" if any(names) else ""
+            self._changes.append(f"removed the {nouns} ({len(elements)}{named})")
 
     def _disable_contacts_and_limits(self, joints: list[int]) -> None:
         model = self._model
@@ -575,7 +584,7 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
     joint = int(model.actuator_trnid[actuator, 0])
     return Servo(
         float(model.actuator_gainprm[actuator, 0] * gear**2),
-        float(-model.actuator_biasprm[actuator, 2] * gear**2),
+        float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
         _force_limit(model, actuators, joint),
     )
 
