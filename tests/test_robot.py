@@ -3,6 +3,7 @@ scene with a level paddle and stable servos."""
 
 import os
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -481,6 +482,18 @@ def test_a_name_with_a_line_break_stays_in_the_configs_comment(tmp_path) -> None
     out = tmp_path / "arm.yaml"
     adopt_command.main([str(mjcf_file), "--site", "tool", "--out", str(out), "--no-view"])
     assert load_config(out).env.mjcf == mjcf_file
+
+
+def test_compiling_leaves_the_standard_output_to_other_threads() -> None:
+    """A redirection belongs to the process: the lines of other threads would be lost."""
+    outputs = []
+
+    class Spec:
+        def compile(self) -> None:
+            outputs.append(sys.stdout)
+
+    compile_spec(Spec(), Path("arm.xml"))
+    assert outputs == [sys.stdout]
 
 
 LIFT = link(

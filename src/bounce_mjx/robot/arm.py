@@ -5,7 +5,7 @@ Every change to the user's model is collected as one sentence.
 
 import contextlib
 import importlib.util
-import io
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -31,6 +31,7 @@ _HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "target_height")
 _RESERVED += ("paddle_home",)
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
@@ -661,8 +662,11 @@ def _not_compiled(path: Path, error: ValueError) -> UserError:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes.
+
+    Both switches belong to the process, so one thread at a time uses them.
+    """
+    with _SILENCE, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         earlier = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(lambda text: None)
