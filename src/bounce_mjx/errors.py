@@ -19,7 +19,7 @@ def exit_on_user_error() -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
+        print(f"error: {on_one_line(str(error))}", file=sys.stderr)
         sys.exit(2)
     except Interrupted:
         leave()
@@ -27,7 +27,7 @@ def exit_on_user_error() -> Iterator[None]:
         sys.exit(INTERRUPTED)
 
 
-def _on_one_line(text: str) -> str:
+def on_one_line(text: str) -> str:
     """A text without the line breaks and terminal codes that a file or a flag may hold."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return shorten(line, 3000)
