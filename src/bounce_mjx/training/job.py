@@ -185,7 +185,7 @@ class _Job:
         self.modules: Sequence[str] | None = None
         self.helpers: Helpers | None = None
         self.clock = Clock()
-        hosts.connect(self._advice)
+        hosts.advise(self._advice)
         self.env = BounceBall(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
