@@ -26,7 +26,6 @@ import pytest
 from jax.sharding import Mesh
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboardX import SummaryWriter
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.files import differing_keys
@@ -54,6 +53,7 @@ from bounce_mjx.training.command import config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.setup import imported_modules
@@ -700,13 +700,16 @@ def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> No
 
     def save_and_look(writer, names, steps, *rest, **named):
         if "latest" in names:
-            points = EventAccumulator(str(run)).Reload().Scalars("loss/value")
-            logged.append((steps, points[-1].step))
+            log = EventAccumulator(str(run)).Reload()
+            scalars = [log.Scalars(tag) for tag in ("loss/value", "results/mean_length_s")]
+            # The last that an evaluation adds.
+            points = [*scalars, log.Tensors("results/text_summary")]
+            logged.append((steps, *(tag[-1].step for tag in points)))
         save(writer, names, steps, *rest, **named)
 
     monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
     resume(run, "--total-steps", str(2 * STEPS))
-    assert logged == [(256, 256), (384, 384), (512, 512)]
+    assert logged == [(steps,) * 4 for steps in (256, 384, 512)]
 
 
 # Full disks
@@ -790,7 +793,7 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
         said.append(line)
         os.kill(os.getpid(), signal.SIGINT)
 
-    log = SummaryWriter(tmp_path)
+    log = open_log(tmp_path)
     reporter = Reporter(lambda: [log], Console(file=io.StringIO()), TrainConfig(), 0)
     monkeypatch.setattr(reporter, "say", say)
     writer = CheckpointWriter(blocked, TrainConfig())

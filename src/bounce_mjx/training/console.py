@@ -2,7 +2,6 @@
 
 import math
 import time
-import typing
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -12,11 +11,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.log import Logs
+from bounce_mjx.training.log import Logs, TensorBoardLog
 from bounce_mjx.training.trainer import Watcher
-
-if typing.TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 
 class Reporter:
@@ -25,7 +21,7 @@ class Reporter:
 
     def __init__(
         self,
-        logs: Callable[[], Sequence["SummaryWriter | Logs"]],
+        logs: Callable[[], Sequence[TensorBoardLog | Logs]],
         console: Console,
         config: TrainConfig,
         first_step: int,
@@ -57,7 +53,7 @@ class Reporter:
         self._saving_problem: str | None = None
 
     @property
-    def _logs(self) -> Sequence["SummaryWriter | Logs"]:
+    def _logs(self) -> Sequence[TensorBoardLog | Logs]:
         return self._open_logs()
 
     def __enter__(self) -> "Reporter":

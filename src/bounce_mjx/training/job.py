@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -44,13 +44,10 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.helpers import Helpers
-from bounce_mjx.training.log import Logs, WandbLog, open_log
+from bounce_mjx.training.log import Logs, TensorBoardLog, WandbLog, open_log
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.signals import StopRequest
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
-
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 Tree = TypeVar("Tree")
 
@@ -329,7 +326,7 @@ class _Job:
         compiling.result()
         return opening
 
-    def _open_logs(self, first_step: int | None) -> list["SummaryWriter | Logs"]:
+    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog | Logs]:
         if not hosts.is_leader():
             return []
         logs = [open_log(m.run, first_step, config=m.config) for m in self.members]
