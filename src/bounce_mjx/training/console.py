@@ -154,9 +154,16 @@ class Reporter:
                 f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
             )
             line = f"{report.summary} ({figures})"
+            if report.passed and not report.passed_with_margin:
+                line += ", not yet with a margin"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
             line = f"{solved} of {len(reports)} seeds meet all results"
+            sure = sum(
+                r.passed_with_margin and sound for r, sound in zip(reports, healthy, strict=True)
+            )
+            if sure < solved:
+                line += f", {sure} with a margin"
         kind = "evaluation"
         if reports[0].screening:
             kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"

@@ -399,7 +399,7 @@ class _Job:
         return [member for member in self.members if member.progress.fault is None]
 
     def _is_solved(self) -> bool:
-        return all(member.progress.solved_steps is not None for member in self._healthy())
+        return all(member.progress.solved for member in self._healthy())
 
     def _evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())
@@ -420,9 +420,9 @@ class _Job:
         self.reporter.evaluation(self.steps, reports, healthy)
         if self.watcher is not None:
             self.watcher.evaluation(self.steps, reports[0], self._of_seed(snapshot.policy, 0))
-        best = []
+        best, seconds = [], sum(self.clock.seconds.values())
         for i, member in enumerate(self.members):
-            if healthy[i] and member.progress.improves(reports[i], self.steps):
+            if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
                 member.best_policy = self._of_seed(snapshot.policy, i)
                 best.append(i)
         self._save(best, snapshot)
