@@ -4,12 +4,15 @@
 
 A cold start has an empty compilation cache; each second start uses the cache of the cold start
 before it. Each is a process of `bounce-mjx train --stop-when-solved`, as a user starts it, with
-the flags that follow `--`. The benchmark also times `import bounce_mjx`, the import of the
-environment, and `--help`. Python keeps its bytecode, as it does by default: the benchmark unsets
-PYTHONDONTWRITEBYTECODE, and imports the modules of a training once before.
+the flags that follow `--`. "results" is the end of the first evaluation that meets all five; the
+training, and its phases, go on until they have a margin. (Code without a margin ended there, and
+its "results" include the final evaluation.) The benchmark also times `import bounce_mjx`, the
+import of the environment, and `--help`. Python keeps its bytecode, as it does by default: the
+benchmark unsets PYTHONDONTWRITEBYTECODE, and imports the modules of a training once before.
 """
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -108,14 +111,15 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
         run = next((folder / "runs").iterdir())
         results = json.loads((run / "results.json").read_text(encoding="utf-8"))
         events = json.loads((folder / "events.json").read_text(encoding="utf-8"))
-    seconds = results["seconds"]
+    seconds, solved = results["seconds"], results["solved_seconds"]
+    imports = printed["time"] - sum(seconds.values())
     return {
         "seed": seed,
         "passed": results["passed"],
         "solved_steps": results["solved_steps"],
-        "import": printed["time"] - sum(seconds.values()),
+        "import": imports,
         **{phase: seconds[phase] for phase in PHASES},
-        "results": printed["time"],
+        "results": math.nan if solved is None else imports + solved,
         "total": total,
         "tracing": covered(events, TRACE),
         "lowering": covered(events, LOWER),

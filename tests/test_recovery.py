@@ -3,6 +3,7 @@ not finite. The resumed training reaches exactly the state of an undisturbed one
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import io
 import json
 import multiprocessing
@@ -26,7 +27,6 @@ import pytest
 from jax.sharding import Mesh
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboardX import SummaryWriter
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.files import differing_keys
@@ -54,6 +54,7 @@ from bounce_mjx.training.command import config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.setup import imported_modules
@@ -628,14 +629,56 @@ def test_a_screening_is_never_better_than_a_full_evaluation() -> None:
         return Report((result,), details, screening=screening)
 
     progress = Progress()
-    assert progress.improves(report(False, 5.0, True), 1)
-    assert progress.improves(report(False, 1.0, False), 2)
-    assert not progress.improves(report(False, 9.0, True), 3)
+    assert progress.improves(report(False, 5.0, True), 1, 0.0)
+    assert progress.improves(report(False, 1.0, False), 2, 0.0)
+    assert not progress.improves(report(False, 9.0, True), 3, 0.0)
     stored = Progress.from_dict(
         json.loads(json.dumps(progress.model_dump())) | {"best": None}, Path()
     )
     assert progress.best_steps == 2
     assert [e.screening for e in stored.evaluations] == [True, False, True]
+
+
+def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path, monkeypatch) -> None:
+    """It tells the first evaluation that met all results, and the end."""
+    margins = iter([None, 0.5, 1.0])
+    select = Evaluators.select
+
+    def passing(evaluators: Evaluators, policy) -> list[Report]:
+        margin = next(margins)
+        (report,) = select(evaluators, policy)
+        met = {"passed": margin is not None, "margin": margin}
+        results = tuple(dataclasses.replace(result, **met) for result in report.results)
+        return [dataclasses.replace(report, results=results)]
+
+    monkeypatch.setattr(Evaluators, "select", passing)
+    run = train(tmp_path, STEPS, "--eval-every", "64", "--stop-when-solved")
+    results = json.loads((run / "results.json").read_text())
+    steps = [results[name] for name in ("solved_steps", "margin_steps", "trained_steps")]
+    assert steps == [128, 192, 192]
+    assert 0.0 < results["solved_seconds"] < sum(results["seconds"].values())
+    assert best_checkpoint(run).steps == 192
+
+
+@pytest.mark.parametrize(
+    ("evaluations", "solved"),
+    [
+        ([(64, None)], False),
+        ([(64, None), (128, 1.0)], True),
+        ([(128, 0.5)], False),
+        # Half as many steps again.
+        ([(128, 0.5), (191, 0.5)], False),
+        ([(128, 0.5), (192, 0.5)], True),
+        ([(128, 0.5), (192, None)], True),
+        ([(128, 0.5), (160, 1.0)], True),
+    ],
+)
+def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -> None:
+    progress = Progress()
+    for steps, margin in evaluations:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
+        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
+    assert progress.solved is solved
 
 
 @pytest.mark.parametrize(
@@ -662,7 +705,8 @@ def solved(run: Path) -> Path:
     """A run of 128 steps that ended because it met all results."""
     for path in [run / "results.json", *run.glob("checkpoints/*/128/run.json")]:
         plain = json.loads(path.read_text())
-        (plain if path.name == "results.json" else plain["progress"])["solved_steps"] = 128
+        progress = plain if path.name == "results.json" else plain["progress"]
+        progress |= {"solved_steps": 128, "margin_steps": 128}
         if path.name == "run.json":
             plain["config"] |= {"stop_when_solved": True, "total_steps": 10**6}
         path.write_text(json.dumps(plain))
@@ -700,13 +744,16 @@ def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> No
 
     def save_and_look(writer, names, steps, *rest, **named):
         if "latest" in names:
-            points = EventAccumulator(str(run)).Reload().Scalars("loss/value")
-            logged.append((steps, points[-1].step))
+            log = EventAccumulator(str(run)).Reload()
+            scalars = [log.Scalars(tag) for tag in ("loss/value", "results/mean_length_s")]
+            # The last that an evaluation adds.
+            points = [*scalars, log.Tensors("results/text_summary")]
+            logged.append((steps, *(tag[-1].step for tag in points)))
         save(writer, names, steps, *rest, **named)
 
     monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
     resume(run, "--total-steps", str(2 * STEPS))
-    assert logged == [(256, 256), (384, 384), (512, 512)]
+    assert logged == [(steps,) * 4 for steps in (256, 384, 512)]
 
 
 # Full disks
@@ -790,7 +837,7 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
         said.append(line)
         os.kill(os.getpid(), signal.SIGINT)
 
-    log = SummaryWriter(tmp_path)
+    log = open_log(tmp_path)
     reporter = Reporter(lambda: [log], Console(file=io.StringIO()), TrainConfig(), 0)
     monkeypatch.setattr(reporter, "say", say)
     writer = CheckpointWriter(blocked, TrainConfig())

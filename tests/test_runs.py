@@ -65,7 +65,7 @@ def results_of(progress: Progress) -> dict:
 @pytest.fixture
 def progress() -> Progress:
     progress = Progress()
-    assert progress.improves(report_of([1.0, 2.0, None, 4.0, 5.0]), 64)
+    assert progress.improves(report_of([1.0, 2.0, None, 4.0, 5.0]), 64, 0.0)
     return progress
 
 
@@ -410,7 +410,7 @@ def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> No
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
 
-    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128)
+    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128, 0.0)
     text = to_json(results_of(progress) | {"numpy": np.float64(math.nan), "tuple": (math.nan, 1)})
     plain = json.loads(text, parse_constant=refuse)
     assert [plain["evaluations"][1][name] for name in NAMES] == [None, None, None, None, 5.0]

@@ -77,6 +77,7 @@ def main(args: Sequence[str] | None = None) -> None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
         command = read_command(args)
+        hosts.agree(config_of(command), command.resume)
         if helpers is not None:
             helpers.begin(config_of(command))
         if not command.watch or not hosts.is_leader():

@@ -1,9 +1,11 @@
 """The five expected results: their bounds, and the report that compares an evaluation with them."""
 
 import dataclasses
+import math
 from typing import Annotated, Any
 
 import jax
+import numpy as np
 import pydantic
 from pydantic import Field, InstanceOf
 
@@ -27,6 +29,17 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 
 HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
+
+MARGIN_EPISODES = 64
+"""Number of episodes in a quick evaluation, which a policy should pass as well."""
+
+MARGIN_ERRORS = 2.0
+"""Distance from the bound of a result that is met with a margin, for means and shares over steps
+and bounces, in standard errors of `MARGIN_EPISODES` episodes."""
+
+MARGIN_FAILURES = 0.5
+"""Largest number of failed episodes, as a share of those that the bound allows, in a result that is
+met with a margin."""
 
 
 Figure = Annotated[float, Field(allow_inf_nan=False)] | None
@@ -53,6 +66,9 @@ class Result:
     """The bound in words."""
     passed: bool | None
     """Whether the value meets the bound; None where the bound does not apply."""
+    margin: Figure = None
+    """How clearly the value meets the bound: 0 at the bound or beyond it, 1 where `MARGIN_EPISODES`
+    other episodes should meet it too; None where the bound does not apply."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +90,17 @@ class Report:
         return all(result.passed is not False for result in self.results)
 
     @property
+    def margin(self) -> float:
+        """The smallest margin of a judged result, from 0 to 1."""
+        margins = [result.margin or 0.0 for result in self.results if result.passed is not None]
+        return min(margins, default=1.0)
+
+    @property
+    def passed_with_margin(self) -> bool:
+        """Whether `MARGIN_EPISODES` other episodes should pass as well."""
+        return self.margin == 1.0
+
+    @property
     def summary(self) -> str:
         """The number of results that are met, such as "4 of 5 results met". A result that is not
         judged does not count."""
@@ -82,11 +109,11 @@ class Report:
         return f"{sum(judged)} of {len(judged)} {kind} met"
 
     @property
-    def score(self) -> tuple[bool, int, float]:
+    def score(self) -> tuple[bool, int, float, float]:
         """Sort key of quality: a full evaluation ranks above a screening, then the number of
-        results met counts, then the mean return."""
+        results met counts, then the smallest margin, then the mean return."""
         met = sum(result.passed is not False for result in self.results)
-        return not self.screening, met, self.details["mean_return"]
+        return not self.screening, met, self.margin, self.details["mean_return"]
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> "Report":
@@ -116,34 +143,36 @@ def judge(
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     episodes = len(s.running)
     enough_bounces = float((s.max_bounces >= MIN_CONSECUTIVE_BOUNCES).mean())
-    centred = _ratio(s.centred_steps.sum(), s.settled_steps.sum())
-    accurate = _ratio(s.accurate_bounces.sum(), s.settled_bounces.sum())
     stable = float(s.running.mean())
+    episode_margin = MARGIN_FAILURES * (1.0 - MIN_EPISODE_SHARE)
     results = (
         _share_result(
             "consecutive bounces",
             f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
-            enough_bounces,
+            (enough_bounces, episode_margin),
             MIN_EPISODE_SHARE,
         ),
         _share_result(
             "horizontal position",
             f"steps with |x error| <= {MAX_X_ERROR} m",
-            centred,
+            _mean_and_margin(s.centred_steps, s.settled_steps),
             MIN_STEP_SHARE,
         ),
         _share_result(
-            "height", f"bounces with |apex error| <= {MAX_APEX_ERROR} m", accurate, MIN_STEP_SHARE
+            "height",
+            f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
+            _mean_and_margin(s.accurate_bounces, s.settled_bounces),
+            MIN_STEP_SHARE,
         ),
         _speed_result(
-            _ratio(s.rising_speed.sum(), s.rising_steps.sum()),
+            _mean_and_margin(s.rising_speed, s.rising_steps),
             target_heights or env.config.target_heights,
             env.config.reward.paddle_home_height,
         ),
         _share_result(
             "stable",
             f"episodes that last the full {env.config.episode_seconds:g} s",
-            stable,
+            (stable, episode_margin),
             MIN_EPISODE_SHARE,
         ),
     )
@@ -157,19 +186,25 @@ def judge(
     return Report(results, details)
 
 
-def _share_result(name: str, measured: str, share: float | None, minimum: float) -> Result:
+def _share_result(
+    name: str, measured: str, share_and_margin: tuple[float, float] | None, minimum: float
+) -> Result:
     """The result for a share of all episodes, steps or bounces; without any of them it fails."""
+    share, margin = share_and_margin or (None, 0.0)
     return Result(
         name,
         f"{measured}, %",
         None if share is None else 100.0 * share,
         f">= {100 * minimum:g}",
         share is not None and share >= minimum,
+        0.0 if share is None else _clearness(share - minimum, margin),
     )
 
 
 def _speed_result(
-    speed: float | None, target_heights: tuple[float, float], home_height: float
+    speed_and_margin: tuple[float, float] | None,
+    target_heights: tuple[float, float],
+    home_height: float,
 ) -> Result:
     """The upward speed, which is judged only if all targets are as high above the paddle's home as
     `UPWARD_SPEED_TARGETS`."""
@@ -178,14 +213,42 @@ def _speed_result(
     # Rounded, as a config has the heights of another arm with four digits.
     lowest, highest = (round(h + home_height - HOME_HEIGHT, 4) for h in UPWARD_SPEED_TARGETS)
     judged = lowest <= target_heights[0] and target_heights[1] <= highest
+    speed, margin = speed_and_margin or (None, 0.0)
     passed = speed is not None and low <= speed <= high
+    distance = 0.0 if speed is None else min(speed - low, high - speed)
     return Result(
         "upward speed",
         "mean velocity of the rising ball, m/s",
         speed,
         bound if judged else f"{bound} (targets {lowest} to {highest} only)",
         passed if judged else None,
+        _clearness(distance, margin) if judged else None,
     )
+
+
+def _clearness(distance: float, margin: float) -> float:
+    """`Result.margin` of a value at a distance inside its bound."""
+    if distance <= 0.0:
+        return 0.0
+    # Rounded, as a number of failed episodes may lie exactly at the margin.
+    return min(1.0, round(distance / margin, 9)) if margin else 1.0
+
+
+def _mean_and_margin(totals: np.ndarray, counts: np.ndarray) -> tuple[float, float] | None:
+    """The mean over all steps or bounces of E episodes, and its margin; None without any of them.
+
+    The steps of one episode are alike, so the margin comes from the spread between episodes: the
+    standard error of a ratio estimator (W. G. Cochran, Sampling Techniques, 1977, section 2.11).
+
+    Args:
+      totals: sum of the quantity in each episode [E].
+      counts: number of steps or bounces in each episode [E].
+    """
+    mean = _ratio(totals.sum(), counts.sum())
+    if mean is None:
+        return None
+    spread = float((totals - mean * counts).std() / counts.mean())
+    return mean, MARGIN_ERRORS * spread / math.sqrt(MARGIN_EPISODES)
 
 
 def _ratio(total: float, count: float) -> float | None:

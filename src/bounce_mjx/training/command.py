@@ -98,12 +98,12 @@ def read_command(
 
 
 def _is_solved(run: Path) -> bool:
-    """Whether every seed of a run has met all five results."""
+    """Whether `stop_when_solved` has ended a run."""
     from bounce_mjx.runs.folders import runs_of_seeds
     from bounce_mjx.runs.progress import load_results
 
     results = [load_results(seed) for seed in runs_of_seeds(run)]
-    return all(found is not None and found.solved_steps is not None for found in results)
+    return all(found is not None and found.solved for found in results)
 
 
 def run_command(

@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -45,13 +45,10 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.helpers import Helpers
-from bounce_mjx.training.log import Logs, WandbLog, open_log
+from bounce_mjx.training.log import Logs, TensorBoardLog, WandbLog, open_log
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.signals import StopRequest
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
-
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 Tree = TypeVar("Tree")
 
@@ -186,7 +183,7 @@ class _Job:
         self.modules: Sequence[str] | None = None
         self.helpers: Helpers | None = None
         self.clock = Clock()
-        hosts.connect(self._advice)
+        hosts.advise(self._advice)
         self.env = BounceBall(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
@@ -331,7 +328,7 @@ class _Job:
         compiling.result()
         return opening
 
-    def _open_logs(self, first_step: int | None) -> list["SummaryWriter | Logs"]:
+    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog | Logs]:
         if not hosts.is_leader():
             return []
         logs = [open_log(m.run, first_step, config=m.config) for m in self.members]
@@ -404,7 +401,7 @@ class _Job:
         return [member for member in self.members if member.progress.fault is None]
 
     def _is_solved(self) -> bool:
-        return all(member.progress.solved_steps is not None for member in self._healthy())
+        return all(member.progress.solved for member in self._healthy())
 
     def _evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())
@@ -425,9 +422,9 @@ class _Job:
         self.reporter.evaluation(self.steps, reports, healthy)
         if self.watcher is not None:
             self.watcher.evaluation(self.steps, reports[0], self._of_seed(snapshot.policy, 0))
-        best = []
+        best, seconds = [], sum(self.clock.seconds.values())
         for i, member in enumerate(self.members):
-            if healthy[i] and member.progress.improves(reports[i], self.steps):
+            if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
                 member.best_policy = self._of_seed(snapshot.policy, i)
                 best.append(i)
         self._save(best, snapshot)
