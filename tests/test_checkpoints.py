@@ -11,11 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tensorstore
 
 import bounce_mjx
+from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
@@ -100,6 +102,31 @@ def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -
     assert_identical(load_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
     with pytest.raises(UserError, match="holds no training state to go on from"):
         load_training_state(checkpoint, state)
+
+
+@pytest.mark.parametrize("part", ["mean", "std", "weight"])
+def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state) -> None:
+    """By everything that acts with it: evaluation, viewers, export and `bounce_mjx.load_policy`."""
+    policy = policy_of(state, OBSERVATION.size)
+    if part == "weight":
+        leaves, tree = jax.tree.flatten(policy.params)
+        leaves[-1] = leaves[-1].at[0].set(jnp.inf)
+        policy = policy._replace(params=jax.tree.unflatten(tree, leaves))
+    else:
+        wrong = getattr(policy.normalizer, part).at[3].set(jnp.nan)
+        policy = policy._replace(normalizer=policy.normalizer._replace(**{part: wrong}))
+    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
+    writer = CheckpointWriter(run, CONFIG)
+    writer.save(["best"], 64, policy)
+    writer.close()
+    name = "in params." if part == "weight" else f"in normalizer.{part};"
+    for reads in (
+        lambda: load_policy(find_checkpoint(run), CONFIG),
+        lambda: export_onnx(find_checkpoint(run)),
+        lambda: bounce_mjx.load_policy(run),
+    ):
+        with pytest.raises(UserError, match=f"not finite, {name}.*give another checkpoint"):
+            reads()
 
 
 def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingState) -> None:

@@ -101,6 +101,25 @@ def test_settings_change_the_task_and_drop_the_training_world(tmp_path: Path) ->
     assert not slow.trained
 
 
+def test_a_list_and_a_group_are_settings_too(tmp_path: Path) -> None:
+    one, other = suite(
+        tmp_path,
+        dict(
+            name="dropped",
+            unit="cm",
+            strengths=[50, 60],
+            settings={
+                "ball_init_pos": [0.6, 0.0, "strength"],
+                "reward": {"target_y": "-strength", "target_x": 0.6},
+            },
+        ),
+    )
+    assert one.env.ball_init_pos == (0.6, 0.0, 0.5) and other.env.ball_init_pos == (0.6, 0.0, 0.6)
+    assert (one.env.reward.target_x, one.env.reward.target_y) == (0.6, -0.5)
+    with pytest.raises(UserError, match="ball_init_pos is .*, but must"):
+        suite(tmp_path, dict(name="short", settings={"ball_init_pos": [0.6]}))
+
+
 def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     trained = EnvConfig(
         randomization={"action_latency": (0.0, 0.02), "gravity_tilt": (-0.02, 0.02)},

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.settings import whole_number
+from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
 from bounce_mjx.training.command import (
@@ -42,6 +42,8 @@ class TrainCommand(TrainingCommand):
     """Serve a page beside the training, with the newest policy, the curves and the five results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
+    watch_allow_host: tuple[HostName, ...] = ()
+    """Other names under which a browser may open that page, such as a proxy's."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""
     host_timeout: Annotated[int, Field(ge=1, le=10**6)] = DEFAULT_TIMEOUT
@@ -86,7 +88,8 @@ def main(args: Sequence[str] | None = None) -> None:
         # Only a training that is watched pays for this import.
         from bounce_mjx.viewers.watch import TrainingPage
 
-        page = TrainingPage(config_of(command), command.watch_host, command.watch_port, Console())
+        address = command.watch_host, command.watch_port
+        page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
         run_command(command, PPOTrainer, PROG, page, modules=modules, helpers=helpers)
         page.wait()
         # A thread that simulates cannot be stopped.

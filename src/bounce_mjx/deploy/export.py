@@ -111,7 +111,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         observation=_parts(env),
         position=env.observation.position,
         velocity=env.observation.velocity,
-        estimator=filter_constants(env, m)._asdict() if filtered else None,
+        estimator=filter_constants(env, m) if filtered else None,
         memory_size=_memory_size(config),
         control_dt=env.control_dt,
         action=_ACTION,

@@ -6,7 +6,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import viser
@@ -48,6 +48,7 @@ def run_browser(
     title: str,
     console: Console,
     names: Sequence[str] | None = None,
+    allowed: Collection[str] = (),
 ) -> None:
     """Serves the page until the simulated `seconds` are over (None: until Ctrl-C).
 
@@ -55,8 +56,9 @@ def run_browser(
       num_shown: environments shown at first; the page's slider goes up to all of the simulation.
       port: a free port of this machine.
       names: see `Scene`.
+      allowed: see `start_server`.
     """
-    with open_server(host, port) as server:
+    with open_server(host, port, allowed) as server:
         page = LivePage(
             server, simulation, num_shown=num_shown, speed=speed, title=title, names=names
         )

@@ -133,4 +133,5 @@ def show(
                 title=title,
                 console=console,
                 names=names,
+                allowed=options.allow_host,
             )

@@ -5,7 +5,7 @@ import contextlib
 import html
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import jax
 import numpy as np
@@ -35,14 +35,24 @@ class TrainingPage:
     """A `training.trainer.Watcher` that serves a page from a thread of its own. The simulation runs
     on the CPU, so that a training on a GPU keeps its speed."""
 
-    def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
+    def __init__(
+        self,
+        config: TrainConfig,
+        host: str,
+        port: int,
+        console: Console,
+        allowed: Collection[str] = (),
+    ):
         """Starts the thread, which first compiles the simulation.
+
+        Args:
+          allowed: see `start_server`.
 
         Raises:
           UserError: the page cannot be served there.
         """
         self._config, self._host, self._port = config, host, free_port(host, port)
-        self._console = console
+        self._console, self._allowed = console, allowed
         self._news: queue.SimpleQueue = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -73,7 +83,7 @@ class TrainingPage:
         try:
             with _on_cpu():
                 simulation = self._simulate()
-                with open_server(self._host, self._port) as server:
+                with open_server(self._host, self._port, self._allowed) as server:
                     side = server.gui.add_panel()
                     panel = _Panel(server.gui, side, self._config.total_steps)
                     page = LivePage(
