@@ -29,6 +29,7 @@ from websockets.typing import Subprotocol
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, train, view
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -528,6 +529,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
             run_browser(
                 simulation, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
                 host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
+                stop=StopRequest(),
             )  # fmt: skip
         except BaseException as error:
             failures.append(error)
