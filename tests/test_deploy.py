@@ -488,14 +488,15 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
         load_policy("robust")
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "flatbuffers"])
 def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     use = {
         "onnx": lambda: export_onnx(pretrained_checkpoint()),
         "onnxruntime": lambda: load_policy("pretrained"),
+        "flatbuffers": lambda: export_jax(pretrained_checkpoint()),
     }
-    with pytest.raises(UserError, match=f"the package {package} is missing.*pip install"):
+    with pytest.raises(UserError, match=f"^{package} cannot be imported.*pip install"):
         use[package]()
 
 
