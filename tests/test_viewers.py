@@ -893,6 +893,22 @@ def test_another_robot_has_no_slider_for_the_restitution() -> None:
     assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
 
 
+def test_a_server_prints_nothing_and_hides_no_output(capsys, monkeypatch) -> None:
+    """Another thread prints while the server starts."""
+    make_server = viser.ViserServer
+
+    def make_beside_output(**named) -> viser.ViserServer:
+        thread = threading.Thread(target=print, args=("meanwhile",))
+        thread.start()
+        thread.join()
+        return make_server(**named)
+
+    monkeypatch.setattr(viser, "ViserServer", make_beside_output)
+    with open_server("127.0.0.1", 0):
+        pass
+    assert capsys.readouterr().out == "meanwhile\n"
+
+
 def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
     """A page that is stopped in a debugger never answers when the server closes the connection."""
     with contextlib.ExitStack() as servers, contextlib.ExitStack() as stack:

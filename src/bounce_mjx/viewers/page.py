@@ -1,11 +1,11 @@
 """The replay page: episodes in one HTML file, for any browser, offline."""
 
 import contextlib
-import io
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import rich
 import viser
 
 from bounce_mjx.errors import UserError
@@ -69,12 +69,12 @@ def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
 
     Closing it takes at most a second: a background thread waits for clients that do not answer.
     """
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+    # viser prints to rich's shared console even if it is not verbose; the commands have their own.
+    rich.get_console().quiet = True
+    server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
         yield server
     finally:
         stopping = threading.Thread(target=server.stop, daemon=True)
-        with contextlib.redirect_stdout(io.StringIO()):
-            stopping.start()
-            stopping.join(_STOP_SECONDS)
+        stopping.start()
+        stopping.join(_STOP_SECONDS)
