@@ -20,11 +20,15 @@ def set_up_jax() -> None:
 def cache_compilations() -> None:
     """Caches compiled programs in the user's cache folder, so that a second start is quick; a
     folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority. JAX's default is to cache
-    only programs that take a second to compile."""
+    only programs that take a second to compile.
+
+    A user without a home, such as a number without a name in a container, has no cache.
+    """
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
 
 
 def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
