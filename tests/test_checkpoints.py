@@ -7,6 +7,8 @@ import random
 import re
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,7 +24,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
-from bounce_mjx.runs import files
+from bounce_mjx.runs import files, writing
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.reading import load_policy, load_training_state
@@ -138,6 +140,58 @@ def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingStat
     writer.close()
     assert [p.name for p in (run / "checkpoints/latest").iterdir()] == ["128"]
     assert load_training_state(find_checkpoint(run), state)[0].iteration == 128
+
+
+@pytest.mark.parametrize("while_writing", [False, True], ids=["between saves", "in a save"])
+def test_a_folder_that_was_moved_is_made_again(
+    tmp_path: Path, state: TrainingState, monkeypatch, while_writing: bool
+) -> None:
+    run, moved = write_run(tmp_path, state), tmp_path / "moved"
+    write_arrays = writing._save_arrays
+
+    def move_and_write(*args) -> None:
+        if run.exists() and not moved.exists():
+            run.rename(moved)
+        write_arrays(*args)
+
+    if while_writing:
+        monkeypatch.setattr(writing, "_save_arrays", move_and_write)
+    else:
+        run.rename(moved)
+    writer = CheckpointWriter(run, CONFIG)
+    changed = state._replace(iteration=state.iteration + 128)
+    writer.save(["latest"], 128, policy_of(changed, OBSERVATION.size), changed, {})
+    while writer.problem() is not None:
+        writer.retry()
+    writer.close()
+    assert find_checkpoint(moved).steps == 64
+    assert load_run_config(run) == CONFIG
+    assert load_training_state(find_checkpoint(run), state)[0].iteration == 128
+
+
+def test_a_failed_write_prints_no_traceback(tmp_path: Path) -> None:
+    """The disk gets full after the check for room."""
+    script = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from bounce_mjx.runs import writing
+from bounce_mjx.runs.config import TrainConfig
+writing._check_room = lambda *_: None
+writer = writing.CheckpointWriter(Path(sys.argv[1]), TrainConfig())
+writer.save(["latest"], 1, {"small": np.zeros(3)})
+print(writer.problem())
+resource.setrlimit(resource.RLIMIT_FSIZE, (2**18, 2**18))
+writer.save(["latest"], 2, {name: np.random.rand(2**17) for name in "abcd"})
+print(writer.problem())
+writer.close()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True
+    )
+    said = done.stdout.splitlines()
+    assert said == ["None", f"{tmp_path} cannot be written (File too large)"], done.stderr
+    assert done.stderr == ""
 
 
 # Damage

@@ -619,14 +619,15 @@ def test_no_servo_targets_for_a_wrong_action(action, policies) -> None:
         policy.servo_targets(action)
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "flatbuffers"])
 def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     use = {
         "onnx": lambda: export_onnx(pretrained_checkpoint()),
         "onnxruntime": lambda: load_policy("pretrained"),
+        "flatbuffers": lambda: export_jax(pretrained_checkpoint()),
     }
-    with pytest.raises(UserError, match=f"the package {package} is missing.*pip install"):
+    with pytest.raises(UserError, match=f"^{package} cannot be imported.*pip install"):
         use[package]()
 
 

@@ -10,6 +10,8 @@ import sys
 import warnings
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
@@ -282,6 +284,16 @@ def test_arrays_become_tensors(need):
     following, reward, *_ = env.step(torch.zeros(NUM_ENVS, 6))
     assert all(isinstance(x, torch.Tensor) for x in (observation, following, reward))
     assert following.shape == (NUM_ENVS, 29)
+
+
+def test_arrays_become_those_of_jax(need):
+    need("array_api_compat")
+    env = gymnasium.wrappers.vector.ArrayConversion(make_vec(), np, jnp)
+    env.reset(seed=0)
+    following, reward, *_, info = env.step(jnp.zeros((NUM_ENVS, 6)))
+    for array, shape in ((following, (NUM_ENVS, 29)), (reward, (NUM_ENVS,))):
+        assert isinstance(array, jax.Array) and array.shape == shape
+    assert isinstance(info["ball_xy_error"], jax.Array)
 
 
 def test_torchrl_wraps_single_and_vectorised_environments(need):

@@ -33,6 +33,7 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, Result, judge
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -58,7 +59,6 @@ from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.programs import Programs, kept_programs
 from bounce_mjx.training.setup import imported_modules
-from bounce_mjx.training.signals import StopRequest
 from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
 
@@ -333,7 +333,7 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
         "import time\n"
-        "from bounce_mjx.training.signals import StopRequest\n"
+        "from bounce_mjx.interrupt import StopRequest\n"
         "with StopRequest() as stop:\n"
         "    print('ready', flush=True)\n"
         "    while not stop.requested: time.sleep(0.01)\n"

@@ -33,6 +33,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, train, view
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -539,6 +540,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
             run_browser(
                 simulation, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
                 host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
+                stop=StopRequest(),
             )  # fmt: skip
         except BaseException as error:
             failures.append(error)
@@ -1043,6 +1045,22 @@ def test_another_robot_has_no_slider_for_the_restitution() -> None:
     config = EnvConfig(mjcf=resource_path("mjcf/bounce_ball.xml"))
     labels = [slider.term for slider in sliders_for(with_sliders(config).randomization)]
     assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
+
+
+def test_a_server_prints_nothing_and_hides_no_output(capsys, monkeypatch) -> None:
+    """Another thread prints while the server starts."""
+    make_server = viser.ViserServer
+
+    def make_beside_output(**named) -> viser.ViserServer:
+        thread = threading.Thread(target=print, args=("meanwhile",))
+        thread.start()
+        thread.join()
+        return make_server(**named)
+
+    monkeypatch.setattr(viser, "ViserServer", make_beside_output)
+    with open_server("127.0.0.1", 0):
+        pass
+    assert capsys.readouterr().out == "meanwhile\n"
 
 
 def test_a_client_that_does_not_answer_does_not_delay_the_end(capfd) -> None:

@@ -14,7 +14,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error, on_one_line
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.config import EnvConfig
@@ -43,6 +44,7 @@ class AdoptCommand(StrictModel):
     """Show the arm afterwards."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
@@ -52,7 +54,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx adopt",
             description="Finds the start pose and the servos of an arm, and writes its config.",
         )
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.robot.adopt import adopt
             from bounce_mjx.task.env import BounceBall
             from bounce_mjx.training.setup import set_up_jax

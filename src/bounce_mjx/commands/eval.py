@@ -22,7 +22,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.training.loop_fusion import join_loops
 
 # An evaluation that is not slower needs no lines about its progress.
@@ -52,6 +53,7 @@ class EvalCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     with exit_on_user_error():
@@ -65,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if command.json_file is not None:
             _check_writable(command.json_file)
         join_loops(command.physics)
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table
             from bounce_mjx.runs.config import load_run_config
@@ -84,8 +86,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
         with _Progress(console) as progress:
-            report, engine, warnings = run_interruptible(
-                evaluate_policy,
+            report, engine, warnings = evaluate_policy(
                 policy,
                 config.env,
                 config.ppo,

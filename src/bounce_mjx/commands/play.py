@@ -12,7 +12,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.training.loop_fusion import join_loops
@@ -42,6 +43,7 @@ class PlayCommand(StrictModel):
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
@@ -56,7 +58,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
             )
         join_loops()
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.show import show
 

@@ -13,7 +13,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import resource_path
 from bounce_mjx.training.loop_fusion import join_loops
 
@@ -45,6 +46,7 @@ class RobustnessCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
@@ -57,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Measures the five results of a trained policy in perturbed worlds.",
         )
         join_loops(command.physics)
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.evaluation.robustness import RobustnessReport
             from bounce_mjx.reports.robustness import robustness_table
             from bounce_mjx.runs.config import load_run_config
@@ -80,7 +82,7 @@ def main(args: Sequence[str] | None = None) -> None:
             suite=str(suite),
             episodes=command.episodes,
             seed=command.seed,
-            outcomes=run_interruptible(_measure, command, config, policy, suite, console),
+            outcomes=_measure(command, config, policy, suite, console),
         )
         console.print(robustness_table(report))
         _write(out, report)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.command import (
@@ -64,11 +64,8 @@ def main(args: Sequence[str] | None = None) -> None:
         command = read_command(
             TorchTrainCommand, args, prog=PROG, description=description, **defaults
         )
-        try:
-            # PyTorch takes seconds to import, and is optional.
-            trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
-        except ImportError as error:
-            raise UserError(str(error)) from error
+        # PyTorch takes seconds to import, and is optional.
+        trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         made = []
 
         def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":

@@ -14,7 +14,7 @@ import numpy as np
 
 from bounce_mjx.deploy import metadata as metadata_module
 from bounce_mjx.deploy.metadata import FORMAT, Link, Metadata, Part
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import Policy, act_with_memory, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD
 from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
@@ -27,6 +27,8 @@ from bounce_mjx.task.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
+
+_EXTRA = "'bounce_mjx[export]'"
 
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
@@ -63,8 +65,11 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
     memory.
 
     Raises:
-      UserError: the checkpoint is damaged.
+      UserError: the checkpoint is damaged, or flatbuffers is not installed.
     """
+    with needed("flatbuffers", _EXTRA):
+        # JAX serialises with it.
+        import flatbuffers  # noqa: F401
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     parts = _parts(config.env)
@@ -207,13 +212,9 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> Any:
     """ONNX model of a policy network; flax names the layers MLP_0/hidden_i and Dense_0."""
-    try:
+    with needed("onnx", _EXTRA):
         import onnx
         from onnx import helper, numpy_helper
-    except ImportError as error:
-        raise UserError(
-            "the package onnx is missing, which writes ONNX files; pip install 'bounce_mjx[export]'"
-        ) from error
 
     nodes, constants = [], []
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
 from bounce_mjx.deploy.metadata import Metadata, from_entries
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, needed
 
 _MAX_PAUSE = 1.0
 # Measurements beyond it are not of a robot.
@@ -45,12 +45,8 @@ class DeployedPolicy:
         Raises:
           UserError: the file is not a policy from `bounce-mjx export`, or onnxruntime is missing.
         """
-        try:
+        with needed("onnxruntime", "onnxruntime"):
             import onnxruntime
-        except ImportError as error:
-            raise UserError(
-                "the package onnxruntime is missing, which runs a policy; pip install onnxruntime"
-            ) from error
         options = onnxruntime.SessionOptions()
         # The network is too small to share between threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1

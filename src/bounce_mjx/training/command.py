@@ -13,7 +13,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError, reason_of
-from bounce_mjx.interrupt import leave
+from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
 from bounce_mjx.task.config import EnvConfig
@@ -156,7 +156,7 @@ def run_command(
         leave(0)
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
-        leave_report(best, console)
+        run_interruptible(leave_report, best, console)
     run = shlex.quote(str(best.run))
     say(console, f"measure it: bounce-mjx eval {run}")
     say(console, f"watch it: bounce-mjx play {run}")

@@ -22,6 +22,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.gpu.kernel_calls import lower_elsewhere
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
@@ -47,7 +48,6 @@ from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.helpers import Helpers
 from bounce_mjx.training.log import Logs, TensorBoardLog, WandbLog, open_log
 from bounce_mjx.training.programs import Programs, kept_programs
-from bounce_mjx.training.signals import StopRequest
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
 
 Tree = TypeVar("Tree")

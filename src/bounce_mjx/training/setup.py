@@ -20,7 +20,10 @@ def set_up_jax() -> None:
 def cache_compilations() -> None:
     """Caches compiled programs in the user's cache folder, so that a second start is quick; a
     folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority. JAX's default is to cache
-    only programs that take a second to compile."""
+    only programs that take a second to compile.
+
+    A user without a home, such as a number without a name in a container, has no cache.
+    """
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
@@ -32,6 +35,9 @@ def cache_compilations() -> None:
                 f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to a folder of yours",
                 file=sys.stderr,
             )
+        except RuntimeError:
+            # No home.
+            pass
 
 
 def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
@@ -63,6 +64,7 @@ class VideoWriter:
 
         Raises:
           UserError: the file cannot be written.
+          Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, simulation.env.dt, self.fps)
         with new_output(self._path, "--video") as new:
@@ -71,8 +73,9 @@ class VideoWriter:
             )
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
-                with contextlib.suppress(BrokenPipeError):
+                with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
                     for picture in self._pictures(simulation.env, frames):
+                        stop.check()
                         encoder.stdin.write(picture.tobytes())
                 _, errors = encoder.communicate()
                 if encoder.returncode:

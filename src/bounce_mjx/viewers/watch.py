@@ -4,6 +4,7 @@ import collections
 import contextlib
 import html
 import queue
+import signal
 import threading
 from collections.abc import Collection, Iterator
 
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
@@ -75,8 +77,8 @@ class TrainingPage:
         self._news.put(lambda _, panel: panel.end())
         if self._thread.is_alive():
             self._say(f"the page stays at {address(self._host, self._port)} until Ctrl-C")
-        with contextlib.suppress(KeyboardInterrupt):
-            while self._thread.is_alive():
+        with StopRequest(signal.SIGINT) as stop:
+            while self._thread.is_alive() and not stop.requested:
                 self._thread.join(0.2)
 
     def _serve(self) -> None:

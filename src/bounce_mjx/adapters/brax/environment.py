@@ -1,6 +1,7 @@
 """The environment for brax, with this project's physics."""
 
 import copy
+import dataclasses
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -17,6 +18,7 @@ from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
+from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
 from bounce_mjx.task.state import State
@@ -24,6 +26,8 @@ from bounce_mjx.task.state import State
 ENV_NAME = "bounce_ball"
 
 
+# A dataclass without fields, because TorchRL turns the fields of a state into tensors.
+@dataclasses.dataclass(init=False, eq=False)
 class _Model:
     """A model as a static field of a state; equal only to itself."""
 
@@ -112,7 +116,11 @@ class BraxBounceBall(brax.envs.Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
-        plain = state.replace(pipeline_state=state.pipeline_state.task)
+        task_state = state.pipeline_state.task
+        if task_state.parameters is None:
+            # TorchRL drops the parts of a state that hold no arrays.
+            task_state = task_state._replace(parameters=PhysicsParameters())
+        plain = state.replace(pipeline_state=task_state)
         return self._to_brax(self.task.step(plain, action))
 
     def _to_brax(self, state: State) -> State:

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from ml_collections import config_dict
-from mujoco import mjx
 
 from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import needed
+from bounce_mjx.lazy import silence_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
@@ -23,12 +22,11 @@ from bounce_mjx.task import state as core
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall, BounceState
 
-try:
+with needed("MuJoCo Playground", "playground"):
+    silence_mjx()
+    from ml_collections import config_dict
+    from mujoco import mjx
     from mujoco_playground import MjxEnv, State
-except ImportError as error:
-    raise UserError(
-        f"MuJoCo Playground cannot be imported ({error}); install it with pip install playground"
-    ) from error
 
 ENV_NAME = "BounceBall"
 
