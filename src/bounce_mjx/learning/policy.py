@@ -56,16 +56,6 @@ class Networks(NamedTuple):
     """Its inputs are the observation and the critic metrics, its output the values [...]."""
 
 
-class Outputs(NamedTuple):
-    """Both networks with their parameters, for T steps of B environments; without derivatives."""
-
-    distribution: Callable[[jax.Array, Memory], tuple[Gaussian, Memory]]
-    """(normalised inputs of both networks [B, N], memory) -> distribution of the actions [B, A],
-    next memory."""
-    values: Callable[[jax.Array], jax.Array]
-    """Normalised inputs [T, B, N] -> values [T, B]."""
-
-
 def make_networks(
     config: PPOConfig, observation_size: int, action_size: int, num_critic_metrics: int = 0
 ) -> Networks:

@@ -16,14 +16,12 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.batches import outer_axis
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
-from bounce_mjx.learning import forward_kernel, minibatch_kernel, statistics
+from bounce_mjx.learning import statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
-from bounce_mjx.learning.gradients import MinibatchGradients
 from bounce_mjx.learning.metrics import (
     Metrics,
     matching_metrics,
@@ -32,7 +30,6 @@ from bounce_mjx.learning.metrics import (
 )
 from bounce_mjx.learning.policy import (
     Memory,
-    Outputs,
     Policy,
     cast_hidden_layers,
     forget,
@@ -168,8 +165,6 @@ class Trainer(NamedTuple):
     run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
     """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is the
     result of `first_fault`."""
-    has_products: bool
-    """Whether XLA computes the networks' matrix products in `run`, and not the GPU kernels."""
 
 
 def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
@@ -188,9 +183,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     num_inputs = env.observation_size + len(critic_metrics)
     networks = make_networks(config, env.observation_size, env.action_size, len(critic_metrics))
     groups = num_groups(config)
-    optimizer = optax.chain(_clip_by_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
-
-    kernel_sizes = minibatch_kernel.Sizes(env.observation_size, env.action_size)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
+    )
     casts = config.compute_dtype != "float32"
 
     def cast_inputs(inputs: jax.Array) -> jax.Array:
@@ -220,21 +215,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
     def value_apply(params: Params, inputs: jax.Array) -> jax.Array:
         return networks.value_network.apply(params.value, inputs)
 
-    def has_gradient_kernel() -> bool:
-        return has_kernels() and minibatch_kernel.supports(config, num_inputs, env.action_size)
-
-    def has_output_kernel() -> bool:
-        return has_gradient_kernel() and forward_kernel.supports(config.num_envs)
-
-    def outputs_of(params: Params) -> Outputs:
-        if has_output_kernel():
-            return forward_kernel.kernel_outputs(kernel_sizes, params)
-        params = cast_params(params)
-        return Outputs(
-            lambda inputs, memory: policy_apply(params, cast_inputs(inputs), memory),
-            lambda inputs: value_apply(params, cast_inputs(inputs)),
-        )
-
     def make_inputs(observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before normalisation [B, N + K]."""
         columns = [metrics[name][:, None] for name in critic_metrics]
@@ -262,7 +242,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
 
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
         """Runs the policy for T steps."""
-        respond_to, normalizer = outputs_of(state.params).distribution, state.statistics.normalizer
+        params, normalizer = cast_params(state.params), state.statistics.normalizer
 
         first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
 
@@ -271,7 +251,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
             inputs = normalize(raw_inputs, normalizer)
-            distribution, memory = respond_to(inputs, _transposed(memory))
+            distribution, memory = policy_apply(params, cast_inputs(inputs), _transposed(memory))
             action = distribution.mean + distribution.std * noise
             env_state, result = vector.step_with(
                 env, env_state, action, unpack(fresh), episode_steps
@@ -333,7 +313,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         """Computes values and advantages of the rollout, and groups its samples."""
         rollout = collection.rollout
         ends = jnp.stack([collection.last_inputs, collection.timeout_inputs])
-        values = outputs_of(params).values(jnp.concatenate([rollout.inputs, ends]))
+        inputs = jnp.concatenate([rollout.inputs, ends])
+        values = value_apply(cast_params(params), cast_inputs(inputs))
         values, timeout_values = values[:-1], values[-1]
         advantage = generalized_advantages(
             rollout.reward,
@@ -388,38 +369,10 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             "policy/action_std": jnp.mean(distribution.std),
         }
 
-    def xla_gradients(unravel: Callable[[jax.Array], Params]) -> MinibatchGradients:
-        """Gradients by XLA, with the parameters in one array, so that one kernel clips the gradient
-        and one takes the step."""
-
-        def shuffle(samples: Samples, order: jax.Array, mean: jax.Array, deviation: jax.Array):
-            return samples, (jnp.moveaxis(order, 1, 0), mean, deviation)
-
-        def gradient(flat_params: jax.Array, _, shuffled, index: jax.Array):
-            samples, minibatches = shuffled
-            order, mean, deviation = (x[index] for x in minibatches)
-            batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, order), samples)
-            batch = batch._replace(advantage=(batch.advantage - mean) / (deviation + 1e-8))
-            # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
-            batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
-            gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
-                flat_params
-            )
-            return gradient, metrics | {"loss/gradient_norm": optax.tree.norm(gradient)}
-
-        return MinibatchGradients(
-            lambda x: ravel_pytree(x)[0], unravel, lambda _: (), shuffle, gradient
-        )
-
-    def make_gradients(params: Params) -> MinibatchGradients:
-        if has_gradient_kernel():
-            return minibatch_kernel.kernel_gradients(config, kernel_sizes, params)
-        return xla_gradients(ravel_pytree(params)[1])
-
     def update(state: TrainingState, samples: Samples, key: jax.Array):
-        """Several epochs of minibatch steps."""
+        """Several epochs of minibatch steps, with the parameters in one array."""
         limit = max_learning_rate(config, state.iteration)
-        gradients, unravel = make_gradients(state.params), ravel_pytree(state.params)[1]
+        flat_params, unravel = ravel_pytree(state.params)
 
         def epoch(carry, epoch_key):
             keys = jax.random.split(epoch_key, groups)
@@ -431,46 +384,43 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
             axes = (0, *range(2, advantage.ndim))
             mean, deviation = jnp.mean(advantage, axis=axes), jnp.std(advantage, axis=axes)
-            shuffled = gradients.shuffle(samples, order, mean, deviation)
+            order = jnp.moveaxis(order, 1, 0)
 
             def step(index, carry):
-                (params, copies, optimizer_state, learning_rate), all_metrics = carry
-                gradient, metrics = gradients.gradient(params, copies, shuffled, index)
-                direction, optimizer_state = optimizer.update(
-                    gradient, optimizer_state, params, norm=metrics["loss/gradient_norm"]
+                (params, optimizer_state, learning_rate), all_metrics = carry
+                chosen = order[index]
+                batch = jax.tree.map(lambda x: jax.vmap(lambda x, i: x[i])(x, chosen), samples)
+                batch = batch._replace(
+                    advantage=(batch.advantage - mean[index]) / (deviation[index] + 1e-8)
                 )
-                params = jax.tree.map(lambda x, d: x - learning_rate * d, params, direction)
+                # With the groups as an axis of their own, XLA transposes the layers' outputs on a
+                # CPU.
+                batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
+                gradient, metrics = jax.grad(lambda flat: loss(unravel(flat), batch), has_aux=True)(
+                    params
+                )
+                metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
+                direction, optimizer_state = optimizer.update(gradient, optimizer_state)
+                params = params - learning_rate * direction
                 learning_rate = adapt_learning_rate(
                     config, learning_rate, metrics["policy/kl"], limit
                 )
                 row = jnp.stack([metrics[name] for name in _MINIBATCH_METRICS])
-                carry = params, gradients.copy(params), optimizer_state, learning_rate
-                return carry, all_metrics.at[index].set(row)
+                return (params, optimizer_state, learning_rate), all_metrics.at[index].set(row)
 
             # Not `scan`: on a GPU each slice of its inputs and each result costs a kernel.
             shape = (config.num_minibatches, len(_MINIBATCH_METRICS))
             all_metrics = jnp.zeros(shape, advantage.dtype)
             return jax.lax.fori_loop(0, config.num_minibatches, step, (carry, all_metrics))
 
-        # Between updates the optimizer's moments are one flat array, whichever implementation
-        # computes the gradients.
-        moments = jax.tree.map(
-            lambda x: gradients.pack(unravel(x)) if x.ndim else x, state.optimizer
-        )
-        params = gradients.pack(state.params)
-        carry = (params, gradients.copy(params), moments, state.learning_rate)
-        (params, _, moments, learning_rate), all_metrics = jax.lax.scan(
+        carry = (flat_params, state.optimizer, state.learning_rate)
+        (flat_params, optimizer_state, learning_rate), all_metrics = jax.lax.scan(
             epoch, carry, jax.random.split(key, config.num_epochs)
-        )
-        optimizer_state = jax.tree.map(
-            lambda x, packed: ravel_pytree(gradients.unpack(packed))[0] if x.ndim else packed,
-            state.optimizer,
-            moments,
         )
         metrics = dict(zip(_MINIBATCH_METRICS, jnp.moveaxis(all_metrics, -1, 0), strict=True))
         means = {name: jnp.mean(value) for name, value in metrics.items()}
         means["policy/kl"] = jnp.mean(metrics["policy/kl"][-1])
-        return (gradients.unpack(params), optimizer_state, learning_rate), means, metrics
+        return (unravel(flat_params), optimizer_state, learning_rate), means, metrics
 
     def iteration(state: TrainingState) -> tuple[TrainingState, Metrics]:
         key, collect_key, update_key = jax.random.split(state.key, 3)
@@ -498,13 +448,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             state, metrics = iteration(state._replace(env=unpack(state.env)))
             return state._replace(env=pack(state.env)), pack(metrics)
 
-        if has_gradient_kernel():
-            minibatch_kernel.compile_ahead(config, kernel_sizes, state.iteration)
         state = state._replace(env=pack(state.env))
         state, metrics = jax.lax.scan(packed_iteration, state, length=num_iterations)
         return state._replace(env=unpack(state.env)), unpack(metrics)
 
-    return Trainer(init, run, not has_output_kernel())
+    return Trainer(init, run)
 
 
 def population(trainer: Trainer) -> Trainer:
@@ -515,7 +463,7 @@ def population(trainer: Trainer) -> Trainer:
         with outer_axis(len(states.iteration)):
             return jax.vmap(lambda state: trainer.run(state, num_iterations))(states)
 
-    return Trainer(jax.vmap(trainer.init), run, trainer.has_products)
+    return Trainer(jax.vmap(trainer.init), run)
 
 
 def num_groups(config: PPOConfig) -> int:
@@ -556,19 +504,6 @@ def group_sequences(x: jax.Array, groups: int) -> jax.Array:
     """Deals the steps [T, B, ...] of environments into groups of sequences [G, B / G, T, ...]."""
     length, batch, *rest = x.shape
     return jnp.moveaxis(x, 0, 1).reshape((groups, batch // groups, length, *rest))
-
-
-def _clip_by_norm(max_norm: float) -> optax.GradientTransformationExtraArgs:
-    """`optax.clip_by_global_norm` for a norm that is already known, with the same state."""
-
-    def update(gradient: Any, state: Any, params: Any = None, *, norm: jax.Array):
-        del params
-        clipped = jax.tree.map(
-            lambda x: jnp.where(norm < max_norm, x, x / norm * max_norm), gradient
-        )
-        return clipped, state
-
-    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
 
 
 def _transposed(memory: Memory) -> Memory:

@@ -76,7 +76,7 @@ class PPOTrainer:
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,
-            compiler_options=compiler_options(tunes_products=self._trainer.has_products),
+            compiler_options=compiler_options(tunes_products=True),
         )
         return run.lower(self._shapes)
 
