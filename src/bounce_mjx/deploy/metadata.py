@@ -57,8 +57,6 @@ class Metadata(NamedTuple):
     """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
     estimator: dict[str, Any] | None
     """Constants of the Kalman filter by the names in `ball_filter.Constants`; None without one."""
-    memory_size: int
-    """Size H of the input `memory` and of the output `next_memory` [N, H]; 0 without a memory."""
     control_dt: float
     """Time between two actions, s."""
     action: str
@@ -105,6 +103,9 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
+    # An entry of older versions.
+    if json.loads(entries.get("memory_size", "0")):
+        raise ValueError("its network has a memory, which this version does not run")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
     plain = {name: json.loads(entries[name]) for name in Metadata._fields}

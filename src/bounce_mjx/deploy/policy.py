@@ -78,7 +78,6 @@ class DeployedPolicy:
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
-        self._memory = np.zeros((1, self.metadata.memory_size), np.float32)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -111,7 +110,6 @@ class DeployedPolicy:
             return self._action.copy()
         if self._histories is None:
             self._histories = Histories(self.metadata, measured)
-            action = self._respond()
         else:
             for i in range(1, steps + 1):
                 share = i / steps
@@ -122,10 +120,7 @@ class DeployedPolicy:
                 }
                 last = i == steps
                 self._histories.add(measured if last else measured | between, self._action, last)
-                # A memory needs every step.
-                if last or self.metadata.memory_size:
-                    action = self._respond()
-        self._measured, self._time, self._action = measured, time, action
+        self._measured, self._time, self._action = measured, time, self._respond()
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
@@ -147,16 +142,11 @@ class DeployedPolicy:
         return np.clip(targets, low, high)
 
     def _respond(self) -> np.ndarray:
-        """Action [J] of the network for the histories; updates its memory."""
+        """Action [J] of the network for the histories."""
         inputs = {
             name: values[None].astype(np.float32) for name, values in self._histories.values.items()
         }
-        if not self.metadata.memory_size:
-            (actions,) = self._session.run(["action"], inputs)
-        else:
-            actions, self._memory = self._session.run(
-                ["action", "next_memory"], inputs | {"memory": self._memory}
-            )
+        (actions,) = self._session.run(["action"], inputs)
         return actions[0].astype(float)
 
     @property
@@ -175,8 +165,6 @@ class DeployedPolicy:
         if unknown := stated.keys() - known:
             raise ValueError(f"its input {min(unknown)} is unknown here")
         expected = {"action": [len(self.metadata.joint_names)]}
-        if size := self.metadata.memory_size:
-            stated["memory"] = expected["next_memory"] = [size]
         if stated != actual or outputs != expected:
             raise ValueError("its inputs or outputs are not as its metadata states")
 

@@ -1,5 +1,4 @@
-"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights, and a
-policy with a gated recurrent unit.
+"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights.
 
 A policy's file stores the parameters under the names of these modules, so the names must not
 change.
@@ -94,25 +93,3 @@ class PolicyNetwork(nn.Module):
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
         return Gaussian(mean, jnp.broadcast_to(std, mean.shape))
-
-
-class RecurrentPolicyNetwork(nn.Module):
-    """A `PolicyNetwork` with a gated recurrent unit (Cho et al. 2014) behind the hidden layers."""
-
-    hidden_layers: tuple[int, ...]
-    gru_size: int
-    action_size: int
-    init_noise_std: float
-
-    @nn.compact
-    def __call__(self, observation: jax.Array, memory: jax.Array) -> tuple[Gaussian, jax.Array]:
-        """Distribution of the action [..., A] and the next memory [..., H], for normalised
-        observations [..., N] and the memory [..., H] of the observations before."""
-        hidden = MLP(self.hidden_layers, activate_final=True)(observation)
-        memory, output = nn.GRUCell(
-            self.gru_size, recurrent_kernel_init=orthogonal(1.0), name="gru"
-        )(memory, hidden)
-        mean_init = orthogonal(_MEAN_GAIN)
-        mean = nn.Dense(self.action_size, kernel_init=mean_init)(output)
-        std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
-        return Gaussian(mean, jnp.broadcast_to(std, mean.shape)), memory

@@ -2,8 +2,6 @@
 
 `make_trainer` gives two pure functions over one pytree of state: `init(key)` and
 `run(state, num_iterations)`. Inside `run` everything is a `scan`; nothing returns to Python.
-With a gru, the update unrolls the policy over the rollout of each environment, from its memory
-before the rollout.
 Source: Schulman et al., Proximal Policy Optimization Algorithms (2017).
 """
 
@@ -29,13 +27,9 @@ from bounce_mjx.learning.metrics import (
     step_metrics,
 )
 from bounce_mjx.learning.policy import (
-    Memory,
     Policy,
     cast_hidden_layers,
-    forget,
     make_networks,
-    respond,
-    respond_in_sequence,
 )
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
 from bounce_mjx.task import vector
@@ -82,8 +76,6 @@ class TrainingState(NamedTuple):
     """Random key of the next iteration."""
     iteration: jax.Array
     """Iterations done [], int."""
-    memory: Memory = ()
-    """Memory of the policy network, each array [H, B]."""
 
 
 class Rollout(NamedTuple):
@@ -131,15 +123,10 @@ class Collection(NamedTuple):
     timeout_inputs: jax.Array
     """Normalised inputs at each environment's time-out, before its reset [B, N + K]; unused for an
     environment that did not time out."""
-    first_memory: Memory
-    """Memory of the policy network before the first step, each array [H, B]."""
-    last_memory: Memory
-    """Memory after the last step."""
 
 
 class Samples(NamedTuple):
-    """Data of an update: G groups of M samples (`num_groups`). With a gru a sample is a sequence,
-    the whole rollout of one environment, and arrays have the T steps as third axis."""
+    """Data of an update: G groups of M samples (`num_groups`)."""
 
     inputs: jax.Array
     """Normalised observation and critic metrics [G, M, N + K]."""
@@ -151,10 +138,6 @@ class Samples(NamedTuple):
     """[G, M]."""
     value_target: jax.Array
     """[G, M]."""
-    memory: Memory = ()
-    """Memory of the policy network before each sequence, each array [G, M, H]."""
-    starts: jax.Array | None = None
-    """Whether a step of a sequence is the first one of an episode [G, M, T], bool."""
 
 
 class Trainer(NamedTuple):
@@ -199,18 +182,8 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         dtype = jnp.dtype(config.compute_dtype)
         return Params(*(cast_hidden_layers(config, network, dtype) for network in params))
 
-    def policy_apply(params: Params, inputs: jax.Array, memory: Memory) -> tuple[Gaussian, Memory]:
-        observation = inputs[..., : env.observation_size]
-        return respond(networks.policy_network, params.policy, observation, memory)
-
-    def distribution_of(params: Params, samples: Samples) -> Gaussian:
-        """Distributions of the samples' actions."""
-        if samples.starts is None:
-            return policy_apply(params, samples.inputs, ())[0]
-        observation = samples.inputs[..., : env.observation_size]
-        return respond_in_sequence(
-            networks.policy_network, params.policy, observation, samples.memory, samples.starts
-        )
+    def policy_apply(params: Params, inputs: jax.Array) -> Gaussian:
+        return networks.policy_network.apply(params.policy, inputs[..., : env.observation_size])
 
     def value_apply(params: Params, inputs: jax.Array) -> jax.Array:
         return networks.value_network.apply(params.value, inputs)
@@ -237,7 +210,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             env=env_state._replace(clock=clock),
             key=key,
             iteration=jnp.int32(0),
-            memory=_transposed(networks.policy_network.start_memory((config.num_envs,))),
         )
 
     def collect(state: TrainingState, key: jax.Array) -> tuple[Collection, Metrics]:
@@ -247,11 +219,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         first_inputs = make_inputs(vector.observe(state.env), state.env.env.metrics)
 
         def one_step(carry, draws):
-            env_state, timeout_inputs, memory = unpack(carry)
+            env_state, timeout_inputs = unpack(carry)
             noise, fresh = draws
             raw_inputs = make_inputs(vector.observe(env_state), env_state.env.metrics)
             inputs = normalize(raw_inputs, normalizer)
-            distribution, memory = policy_apply(params, cast_inputs(inputs), _transposed(memory))
+            distribution = policy_apply(params, cast_inputs(inputs))
             action = distribution.mean + distribution.std * noise
             env_state, result = vector.step_with(
                 env, env_state, action, unpack(fresh), episode_steps
@@ -270,8 +242,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
                 truncated=result.truncated,
             )
             metrics = step_metrics(result, groups)
-            memory = _transposed(forget(memory, result.terminated | result.truncated))
-            return pack((env_state, timeout_inputs, memory)), (pack(step_of_rollout), pack(metrics))
+            return pack((env_state, timeout_inputs)), (pack(step_of_rollout), pack(metrics))
 
         # An environment times out at most once in a rollout, because no time limit is shorter than
         # a rollout.
@@ -283,9 +254,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
         fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
             jax.random.split(reset_key, config.rollout_length)
         )
-        carry = pack((state.env, first_inputs.T, state.memory))
+        carry = pack((state.env, first_inputs.T))
         carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, pack_steps(fresh)))
-        env_state, timeout_inputs, memory = unpack(carry)
+        env_state, timeout_inputs = unpack(carry)
         steps = unpack(steps)
         raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)
         rollout = Rollout(
@@ -304,8 +275,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             statistics=statistics.update(state.statistics, raw_inputs),
             last_inputs=normalize(last_inputs, normalizer),
             timeout_inputs=normalize(timeout_inputs.T, normalizer),
-            first_memory=state.memory,
-            last_memory=memory,
         )
         return collection, rollout_metrics(unpack(metrics))
 
@@ -335,22 +304,11 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             advantage=advantage,
             value_target=advantage + values[:-1],
         )
-        if config.network == "mlp":
-            return jax.tree.map(lambda x: group(x, groups), samples)
-        ended = rollout.terminated | rollout.truncated
-        # The memory before the first step is already empty where an episode starts there.
-        starts = jnp.concatenate([jnp.zeros_like(ended[:1]), ended[:-1]])
-        samples = jax.tree.map(
-            lambda x: group_sequences(x, groups), samples._replace(starts=starts)
-        )
-        first_memory = _transposed(collection.first_memory)
-        return samples._replace(
-            memory=jax.tree.map(lambda x: x.reshape(groups, -1, x.shape[-1]), first_memory)
-        )
+        return jax.tree.map(lambda x: group(x, groups), samples)
 
     def loss(params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         params = cast_params(params)
-        distribution = distribution_of(params, samples)
+        distribution = policy_apply(params, samples.inputs)
         log_ratio = distribution.log_prob(samples.action) - samples.log_prob
         ratio = jnp.exp(log_ratio)
         advantage = samples.advantage
@@ -382,8 +340,7 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             # Mean and deviation of all minibatches at once: on several devices each reduction is a
             # message, and every minibatch already has one for its gradient.
             advantage = jax.vmap(lambda x, i: x[i])(samples.advantage, order)
-            axes = (0, *range(2, advantage.ndim))
-            mean, deviation = jnp.mean(advantage, axis=axes), jnp.std(advantage, axis=axes)
+            mean, deviation = jnp.mean(advantage, axis=(0, 2)), jnp.std(advantage, axis=(0, 2))
             order = jnp.moveaxis(order, 1, 0)
 
             def step(index, carry):
@@ -438,7 +395,6 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             env=collection.env,
             key=key,
             iteration=state.iteration + 1,
-            memory=collection.last_memory,
         )
         metrics |= losses | {"policy/learning_rate": learning_rate, "fault": fault}
         return state, metrics
@@ -473,9 +429,8 @@ def num_groups(config: PPOConfig) -> int:
     A device that holds whole groups therefore shuffles only its own samples, and the training does
     not depend on the number of devices.
     """
-    samples = config.num_envs if config.network == "gru" else config.batch_steps
     groups = max(_MIN_GROUPS, 1 << (config.num_envs // _GROUP_ENVS).bit_length() >> 1)
-    while config.num_envs % groups or (samples // groups) % config.num_minibatches:
+    while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
         groups //= 2
     return groups
 
@@ -498,16 +453,6 @@ def group(x: jax.Array, groups: int) -> jax.Array:
     length, batch, *rest = x.shape
     x = jnp.moveaxis(x.reshape((length, groups, batch // groups, *rest)), 1, 0)
     return x.reshape((groups, length * batch // groups, *rest))
-
-
-def group_sequences(x: jax.Array, groups: int) -> jax.Array:
-    """Deals the steps [T, B, ...] of environments into groups of sequences [G, B / G, T, ...]."""
-    length, batch, *rest = x.shape
-    return jnp.moveaxis(x, 0, 1).reshape((groups, batch // groups, length, *rest))
-
-
-def _transposed(memory: Memory) -> Memory:
-    return jax.tree.map(jnp.transpose, memory)
 
 
 def policy_of(state: TrainingState, observation_size: int) -> Policy:
