@@ -464,6 +464,18 @@ def test_random_orders_are_uniform(size):
         assert np.abs(rises - 0.5).max() <= 5 * 0.5 / np.sqrt(2000)
 
 
+def test_equal_random_numbers_leave_a_long_order_random():
+    """With 18 random bits, 512 pairs of neighbours would have equal numbers, and the smaller index
+    first."""
+    size, count = 2**14, 20
+    keys = jax.random.split(jax.random.PRNGKey(0), count)
+    orders = np.asarray(jax.vmap(lambda key: ppo.random_order(key, size))(keys))
+    np.testing.assert_array_equal(np.sort(orders), np.tile(np.arange(size), (count, 1)))
+    # The variance of the number of rises in a permutation is (size + 1) / 12.
+    rises = np.mean(orders[:, 1:] > orders[:, :-1])
+    assert np.abs(rises - 0.5) <= 5 / np.sqrt(12 * count * size)
+
+
 class FaultyBall(BounceBall):
     """An environment whose physics fails in about half of the instances as soon as the ball
     falls."""
