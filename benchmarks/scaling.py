@@ -57,7 +57,8 @@ def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
     config = PPOConfig(**preset)
     mesh = make_mesh(num_devices, config, num_seeds)
     env = BounceBall()
-    trainer = make_trainer(config, env, env.config.episode_steps)
+    sharing = num_devices if num_seeds == 1 else 1
+    trainer = make_trainer(config, env, env.config.episode_steps, sharing)
     key = jax.random.PRNGKey(0)
     if num_seeds > 1:
         trainer, key = population(trainer), jax.random.split(key, num_seeds)

@@ -53,14 +53,18 @@ class MLP(nn.Module):
     """Width of each layer."""
     activate_final: bool
     """Whether SiLU follows the last layer too."""
+    dtype: Any = None
+    """Type in which layers with SiLU are computed; None for that of inputs and parameters."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs [..., widths[-1]] for inputs [..., N]."""
         for i, width in enumerate(self.widths):
-            x = nn.Dense(width, kernel_init=orthogonal(_GAIN), name=f"hidden_{i}")(x)
-            if self.activate_final or i + 1 < len(self.widths):
-                x = nn.silu(x)
+            is_hidden = self.activate_final or i + 1 < len(self.widths)
+            dtype = self.dtype if is_hidden else None
+            init, name = orthogonal(_GAIN), f"hidden_{i}"
+            dense = nn.Dense(width, dtype=dtype, kernel_init=init, name=name)
+            x = nn.silu(dense(x)) if is_hidden else dense(x)
         return x
 
 
@@ -84,11 +88,13 @@ class PolicyNetwork(nn.Module):
     hidden_layers: tuple[int, ...]
     action_size: int
     init_noise_std: float
+    dtype: Any = None
+    """Type in which the hidden layers are computed; None for that of inputs and parameters."""
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
         """Distribution of the action [..., A] for normalised observations [..., N]."""
-        hidden = MLP(self.hidden_layers, activate_final=True)(observation)
+        hidden = MLP(self.hidden_layers, activate_final=True, dtype=self.dtype)(observation)
         mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()

@@ -20,7 +20,7 @@ class Policy(NamedTuple):
     """Parameters of the policy network."""
 
 
-class Network(NamedTuple):
+class NetworkFunctions(NamedTuple):
     """A network as two pure functions."""
 
     init: Callable[[jax.Array], Any]
@@ -32,26 +32,36 @@ class Network(NamedTuple):
 class Networks(NamedTuple):
     """The two networks of a training."""
 
-    policy_network: Network
+    policy_network: NetworkFunctions
     """Its inputs are observations, its output is a `Gaussian` over actions [..., A]."""
-    value_network: Network
+    value_network: NetworkFunctions
     """Its inputs are the observation and the critic metrics, its output the values [...]."""
 
 
 def make_networks(
-    config: PPOConfig, observation_size: int, action_size: int, num_critic_metrics: int = 0
+    config: PPOConfig,
+    observation_size: int,
+    action_size: int,
+    num_critic_metrics: int = 0,
+    dtype: Any = None,
 ) -> Networks:
-    """The networks of a config for an environment with these sizes; the critic is not needed to
-    act."""
-    policy = PolicyNetwork(config.hidden_layers, action_size, config.init_noise_std)
-    value = MLP((*config.hidden_layers, 1), activate_final=False)
+    """The networks of a config for an environment with these sizes.
+
+    Args:
+      num_critic_metrics: metrics that the critic sees; to act, it is not needed.
+      dtype: type in which the hidden layers are computed; by default, that of their inputs and
+        parameters.
+    """
+    sizes = action_size, config.init_noise_std
+    policy = PolicyNetwork(config.hidden_layers, *sizes, dtype)
+    value = MLP((*config.hidden_layers, 1), activate_final=False, dtype=dtype)
     critic_size = observation_size + num_critic_metrics
     return Networks(
-        policy_network=Network(
+        policy_network=NetworkFunctions(
             init=lambda key: policy.init(key, jnp.zeros((1, observation_size))),
             apply=policy.apply,
         ),
-        value_network=Network(
+        value_network=NetworkFunctions(
             init=lambda key: value.init(key, jnp.zeros((1, critic_size))),
             apply=lambda params, inputs: value.apply(params, inputs)[..., 0],
         ),
@@ -61,20 +71,6 @@ def make_networks(
 def untrained_policy(networks: Networks, observation_size: int, key: jax.Array) -> Policy:
     """A policy before the first update; consumes the key."""
     return Policy(init_normalizer(observation_size), networks.policy_network.init(key))
-
-
-def cast_hidden_layers(config: PPOConfig, params: Any, dtype: jnp.dtype) -> Any:
-    """Parameters of one network of `make_networks` with its hidden layers in another type.
-
-    The output layer and the noise keep theirs, so the outputs stay as precise: flax computes a
-    layer in the wider one of the types of its parameters and its input.
-    """
-    hidden = {f"hidden_{i}" for i in range(len(config.hidden_layers))}
-
-    def cast(path: tuple, x: jax.Array) -> jax.Array:
-        return x.astype(dtype) if any(getattr(k, "key", None) in hidden for k in path) else x
-
-    return jax.tree_util.tree_map_with_path(cast, params)
 
 
 def act(networks: Networks, policy: Policy, observation: jax.Array) -> jax.Array:
