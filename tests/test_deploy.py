@@ -475,7 +475,10 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     unknown = onnx.load_from_string(shipped)
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
+    recurrent = onnx.load_from_string(shipped)
+    recurrent.metadata_props.add(key="memory_size", value="128")
     broken = {
+        "its network has a memory": recurrent.SerializeToString(),
         "its input ball_colour is unknown": unknown.SerializeToString(),
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
@@ -509,7 +512,6 @@ WRONG_ENTRIES = {
     "velocity": ["guessed", ["filter"], None],
     "position": ["differences", 3],
     "estimator": [None, {}, []],
-    "memory_size": [3, -1, 1e6],
     "paddle": [[0.0, 0.0], [1e300, 0.0, 0.0]],
     "paddle_normal": [[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
     "chain": [[], {}, [{"joint": 0}], None],

@@ -16,12 +16,12 @@ from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, kernel_calls, rows
 from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.gpu.scalars import as_scalars
-from bounce_mjx.learning import forward_kernel, minibatch_kernel, ppo
+from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 
 SIZE = 256
 RESULTS = [jax.ShapeDtypeStruct((SIZE,), jnp.float32), jax.ShapeDtypeStruct((2,), jnp.int32)]
-CONFIG = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(64, 64), compute_dtype="bfloat16")
+CONFIG = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(8,))
 
 
 def doubling(factor: float = 2.0):
@@ -63,10 +63,8 @@ def lowered_kernels(monkeypatch) -> list:
 
 
 def trainer_with_kernels(monkeypatch, num_seeds: int = 1):
-    """A trainer as on a GPU, and the shapes of its state, as if nothing had been traced before."""
-    for module in (minibatch_kernel, forward_kernel):
-        module._batched_call.cache_clear()
-    for module in (elementwise, rows, ppo):
+    """A trainer as on a GPU, and the shapes of its state."""
+    for module in (elementwise, rows):
         monkeypatch.setattr(module, "has_kernels", lambda: True)
     env = BounceBall()
     trainer = ppo.make_trainer(CONFIG, env, env.config.episode_steps)
@@ -101,21 +99,12 @@ def test_a_kernel_is_lowered_again_unless_its_key_is_known(lowered_kernels):
 
 
 @pytest.mark.parametrize("num_seeds", [1, 2])
-def test_a_training_on_a_gpu_starts_with_its_longest_kernel(
-    lowered_kernels, monkeypatch, num_seeds: int
-):
-    """The kernel of a minibatch has three results. It is lowered before the others, and leaves no
-    matrix products to XLA. Every kernel is lowered once."""
+def test_a_training_on_a_gpu_lowers_each_kernel_once(lowered_kernels, monkeypatch, num_seeds: int):
+    """The kernels of the first states and of the control step."""
     trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
     assert not lowered_kernels
     text = training_text(trainer, state)
-    num_results = [len(jax.tree.leaves(program.out_info)) for _, program in lowered_kernels]
-    assert num_results[0] == 3
-    assert len(num_results) == 6 and num_results.count(3) == 1
-    # First states, policy, control step, values, gradient, and sums.
-    assert text.count("custom_call @mosaic_gpu") == 6
-    assert "dot_general" not in text
-    assert not trainer.has_products
+    assert len(lowered_kernels) == text.count("custom_call @mosaic_gpu") == 2
 
 
 class Elsewhere:
@@ -133,7 +122,7 @@ class Elsewhere:
         return self.kernels.get(name)
 
 
-KINDS = ("minibatch", "sums", "elementwise", "outputs")
+KINDS = ("elementwise",)
 
 
 @pytest.mark.parametrize("num_seeds", [1, 2])
@@ -155,14 +144,14 @@ def test_another_process_can_lower_the_kernels_of_a_training(
     lowered_kernels.clear()
     monkeypatch.setattr(kernel_calls, "_helper", helper)
     text = training_text(trainer, state)
-    assert len(given) == 5 and sorted(helper.wanted) == sorted(helper.kernels)
+    assert len(given) == 1 and sorted(helper.wanted) == sorted(helper.kernels)
     assert len(lowered_kernels) == 1
-    assert text.count("custom_call @mosaic_gpu") == 6
+    assert text.count("custom_call @mosaic_gpu") == 2
 
     # Without the other process's kernels, the same program lowers all of them.
     helper.kernels = {}
     other = training_text(trainer, state)
-    assert len(lowered_kernels) == 1 + 1 + 5
+    assert len(lowered_kernels) == 1 + 1 + 1
 
     def without_kernels(text: str) -> str:
         return re.sub(r'(kernel_hash|module) = "(?:[^"\\]|\\.)*"', "", text)
@@ -195,7 +184,7 @@ def test_a_kernel_has_the_same_name_in_every_process():
         ).stdout.splitlines()
 
     first = names("1")
-    assert len(first) == 5 and first == names("2")
+    assert len(first) == 1 and first == names("2")
 
 
 def test_functions_with_other_numbers_are_other_kernels():

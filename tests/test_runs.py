@@ -369,6 +369,15 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
             load_config(path)
 
 
+def test_a_config_of_an_older_version_may_name_its_network(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("ppo: {network: mlp, gru_size: 64, num_envs: 8}")
+    assert load_config(file) == TrainConfig(ppo={"num_envs": 8})
+    file.write_text("ppo: {network: gru, gru_size: 64}")
+    with pytest.raises(UserError, match="network is gru, .* no recurrent policies; train a policy"):
+        load_config(file)
+
+
 def test_pipe_in_place_of_a_config_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "my.yaml")
     with pytest.raises(UserError, match="my.yaml cannot be read .it is not a regular file"):

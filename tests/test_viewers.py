@@ -44,7 +44,6 @@ from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
-    Controller,
     make_policy_controller,
     make_random_controller,
     make_scripted_controller,
@@ -206,10 +205,9 @@ def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
 def exchangeable(env: BounceBall) -> Simulation:
     """One robot under a policy that is one constant action for all joints."""
 
-    def control(policy, states, key, memory):
-        return policy + jnp.zeros_like(states.obs[: env.action_size]), memory
+    def controller(policy, states, key):
+        return policy + jnp.zeros_like(states.obs[: env.action_size])
 
-    controller = Controller(control, start_memory=lambda batch: ())
     return Simulation(env, controller, 1, seed=0, policy=np.float32(0.0))
 
 

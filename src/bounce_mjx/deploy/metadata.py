@@ -61,8 +61,6 @@ class Metadata(NamedTuple):
     """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
     estimator: Constants | None
     """Constants of the Kalman filter; None without one."""
-    memory_size: Annotated[int, (0, 100_000)]
-    """Size H of the input `memory` and of the output `next_memory` [N, H]; 0 without a memory."""
     control_dt: Annotated[float, (1e-3, 1.0)]
     """Time between two actions, s."""
     action: str
@@ -105,6 +103,9 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
+    # An entry of older versions.
+    if json.loads(entries.get("memory_size", "0")):
+        raise ValueError("its network has a memory, which this version does not run")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
     kinds = get_type_hints(Metadata, include_extras=True)

@@ -79,7 +79,6 @@ class DeployedPolicy:
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
-        self._memory = np.zeros((1, self.metadata.memory_size), np.float32)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -112,7 +111,6 @@ class DeployedPolicy:
             return self._action.copy()
         if self._histories is None:
             self._histories = Histories(self.metadata, measured)
-            action = self._act(self._histories.values)
         else:
             for i in range(1, steps + 1):
                 share = i / steps
@@ -123,9 +121,7 @@ class DeployedPolicy:
                 }
                 last = i == steps
                 self._histories.add(measured if last else measured | between, self._action, last)
-                # A memory needs every step.
-                if last or self.metadata.memory_size:
-                    action = self._act(self._histories.values)
+        action = self._act(self._histories.values)
         self._measured, self._time, self._action = measured, time, action
         return self._action.copy()
 
@@ -150,14 +146,9 @@ class DeployedPolicy:
         return np.clip(targets, low, high)
 
     def _act(self, values: dict[str, np.ndarray]) -> np.ndarray:
-        """Action [J] of the network for values [history, size] by name; updates its memory."""
+        """Action [J] of the network for values [history, size] by name."""
         inputs = {name: value[None].astype(np.float32) for name, value in values.items()}
-        if not self.metadata.memory_size:
-            (actions,) = self._session.run(["action"], inputs)
-        else:
-            actions, self._memory = self._session.run(
-                ["action", "next_memory"], inputs | {"memory": self._memory}
-            )
+        (actions,) = self._session.run(["action"], inputs)
         if not np.all(np.isfinite(actions)):
             raise UserError("the network gives an action that is not finite; stop the robot")
         return actions[0].astype(float)
@@ -180,8 +171,6 @@ class DeployedPolicy:
         if wrong := [name for name, (_, size) in stated.items() if size != sizes[name]]:
             raise ValueError(f"its input {wrong[0]} must have the size {sizes[wrong[0]]}")
         expected = {"action": [len(self.metadata.joint_names)]}
-        if size := self.metadata.memory_size:
-            stated["memory"] = expected["next_memory"] = [size]
         if stated != actual or outputs != expected or len(stated) < len(self.metadata.observation):
             raise ValueError("its inputs or outputs are not as its metadata states")
 

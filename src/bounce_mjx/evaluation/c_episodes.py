@@ -12,7 +12,7 @@ from mujoco import rollout
 
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -49,11 +49,10 @@ def make_mujoco_evaluator(
         return reset_episodes(env, key, episodes, ranges)
 
     @jax.jit
-    def decide(policy, states, memory):
-        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
-        actions = actions.T
+    def decide(policy, states):
+        actions = act(networks, policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
-        return actions, memory, states, _inputs(env, control)
+        return actions, states, _inputs(env, control)
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -62,7 +61,6 @@ def make_mujoco_evaluator(
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         states = start(key, ranges)
-        memory = networks.policy_network.start_memory((episodes,))
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
         ball_velocity = _ball_velocity(env.mj_model)
         models = episode_models(env, states.pipeline_state.parameters)
@@ -70,7 +68,7 @@ def make_mujoco_evaluator(
         statistics = empty_statistics(episodes)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, memory, states, inputs = decide(policy, states, memory)
+                actions, states, inputs = decide(policy, states)
                 inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
                 simulated[:, ball_velocity] += inputs.ball_push
                 simulated = _simulate(pool, models, data, simulated, inputs)

@@ -31,7 +31,8 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self._compiled_iterations = _iterations_at_once(config, env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        trainer = make_trainer(config.ppo, env, episode_steps(config))
+        sharing = self.mesh.size if config.num_seeds == 1 else 1
+        trainer = make_trainer(config.ppo, env, episode_steps(config), sharing)
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self._seeds = seeds[0] if config.num_seeds == 1 else seeds
@@ -76,7 +77,7 @@ class PPOTrainer:
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,
-            compiler_options=compiler_options(tunes_products=self._trainer.has_products),
+            compiler_options=compiler_options(tunes_products=True),
         )
         return run.lower(self._shapes)
 

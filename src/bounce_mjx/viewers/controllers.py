@@ -1,26 +1,18 @@
 """Controllers of the arm: random, zero or scripted actions, or a trained policy."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Memory, Networks, Policy, act_with_memory
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.state import State
 
-
-class Controller(NamedTuple):
-    """A controller of N environments."""
-
-    act: Callable[[Policy | None, State, jax.Array, Memory], tuple[jax.Array, Memory]]
-    """(policy if it is exchangeable; states, batch last; key, which is consumed; memory) ->
-    actions [n, N], memory."""
-    start_memory: Callable[[tuple[int, ...]], Memory]
-    """Shape of the batch -> memory at the start of an episode."""
-
+Controller = Callable[[Policy | None, State, jax.Array], jax.Array]
+"""A controller of N environments: (policy if it is exchangeable; states, batch last; key, which is
+consumed) -> actions [n, N]."""
 
 # Gains of the scripted controller, found by a scan: it keeps 64 of 64 balls up for 10 s, with
 # a mean apex error of 8 cm.
@@ -36,34 +28,24 @@ _FALLING_WIDTH = 0.2
 
 def make_policy_controller(networks: Networks, policy: Policy) -> Controller:
     """The policy's most likely action."""
-    exchangeable = make_exchangeable_controller(networks)
-    return exchangeable._replace(act=lambda _, *args: exchangeable.act(policy, *args))
+    return lambda _, states, key: act(networks, policy, states.obs.T).T
 
 
 def make_exchangeable_controller(networks: Networks) -> Controller:
     """The most likely action of a policy that is an argument."""
-
-    def control(
-        policy: Policy, states: State, key: jax.Array, memory: Memory
-    ) -> tuple[jax.Array, Memory]:
-        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
-        return actions.T, memory
-
-    return Controller(control, networks.policy_network.start_memory)
+    return lambda policy, states, key: act(networks, policy, states.obs.T).T
 
 
 def make_random_controller(env: BounceBall) -> Controller:
     """Uniform in [-1, 1]."""
-    return _without_memory(
-        lambda states, key: jax.random.uniform(
-            key, (env.action_size, states.obs.shape[-1]), minval=-1.0, maxval=1.0
-        )
+    return lambda _, states, key: jax.random.uniform(
+        key, (env.action_size, states.obs.shape[-1]), minval=-1.0, maxval=1.0
     )
 
 
 def make_zero_controller(env: BounceBall) -> Controller:
     """Zero: the servos hold the measured angles."""
-    return _without_memory(lambda states, key: jnp.zeros((env.action_size, states.obs.shape[-1])))
+    return lambda _, states, key: jnp.zeros((env.action_size, states.obs.shape[-1]))
 
 
 def make_scripted_controller(env: BounceBall) -> Controller:
@@ -84,7 +66,7 @@ def make_scripted_controller(env: BounceBall) -> Controller:
         )
     home = jnp.array(config.default_joint_angles)[:, None]
 
-    def control(states: State, key: jax.Array) -> jax.Array:
+    def control(_: Policy | None, states: State, key: jax.Array) -> jax.Array:
         kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(states.pipeline_state)
         x, y, z = kinematics.ball_position
         vx, vy, vz = kinematics.ball_velocity
@@ -101,11 +83,4 @@ def make_scripted_controller(env: BounceBall) -> Controller:
         posture = home + jnp.stack([zero, zero, -lift, zero, lift - pitch, roll])
         return jnp.clip((posture - kinematics.joint_angles) / config.action_scale, -1.0, 1.0)
 
-    return _without_memory(control)
-
-
-def _without_memory(control: Callable[[State, jax.Array], jax.Array]) -> Controller:
-    return Controller(
-        act=lambda _, states, key, memory: (control(states, key), memory),
-        start_memory=lambda batch: (),
-    )
+    return control
