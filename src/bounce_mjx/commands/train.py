@@ -18,7 +18,6 @@ from bounce_mjx.training.command import (
     run_command,
 )
 from bounce_mjx.training.command import read_command as read
-from bounce_mjx.training.helpers import start_helpers
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
@@ -56,16 +55,13 @@ def main(args: Sequence[str] | None = None) -> None:
         if asks_for_help(args):
             read_command(args)
     several_hosts = _hosts(args)
-    helpers = None
     if several_hosts is None:
         # A process of several hosts also aborts when another one is lost.
         join_loops(early_flag(args, "--physics"))
-        helpers = start_helpers(args)
     with interruptible_imports():
-        from bounce_mjx.training.setup import find_devices, imported_modules, set_up_jax
+        from bounce_mjx.training.setup import find_devices, set_up_jax
 
         set_up_jax()
-        modules = imported_modules(args)
         if several_hosts is None:
             # CUDA starts beside the imports.
             find_devices()
@@ -77,16 +73,14 @@ def main(args: Sequence[str] | None = None) -> None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
         command = read_command(args)
-        if helpers is not None:
-            helpers.begin(config_of(command))
         if not command.watch or not hosts.is_leader():
-            run_command(command, PPOTrainer, PROG, modules=modules, helpers=helpers)
+            run_command(command, PPOTrainer, PROG)
             return
         # Only a training that is watched pays for this import.
         from bounce_mjx.viewers.watch import TrainingPage
 
         page = TrainingPage(config_of(command), command.watch_host, command.watch_port, Console())
-        run_command(command, PPOTrainer, PROG, page, modules=modules, helpers=helpers)
+        run_command(command, PPOTrainer, PROG, page)
         page.wait()
         # A thread that simulates cannot be stopped.
         leave(0)

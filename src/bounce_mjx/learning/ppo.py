@@ -17,7 +17,6 @@ from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.batches import outer_axis
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
 from bounce_mjx.learning import forward_kernel, minibatch_kernel, statistics
 from bounce_mjx.learning.advantages import generalized_advantages
@@ -172,8 +171,11 @@ class Trainer(NamedTuple):
     """Whether XLA computes the networks' matrix products in `run`, and not the GPU kernels."""
 
 
-def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
+def make_trainer(config: PPOConfig, env: Env, episode_steps: int, num_devices: int = 1) -> Trainer:
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
+
+    Args:
+      num_devices: devices that share the environments.
 
     Raises:
       UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
@@ -304,7 +306,9 @@ def make_trainer(config: PPOConfig, env: Env, episode_steps: int) -> Trainer:
             jax.random.split(reset_key, config.rollout_length)
         )
         carry = pack((state.env, first_inputs.T, state.memory))
-        carry, (steps, metrics) = jax.lax.scan(one_step, carry, (noise, pack_steps(fresh)))
+        carry, (steps, metrics) = jax.lax.scan(
+            one_step, carry, (noise, pack_steps(fresh, num_devices))
+        )
         env_state, timeout_inputs, memory = unpack(carry)
         steps = unpack(steps)
         raw_inputs = jnp.swapaxes(steps.raw_inputs, 1, 2)
@@ -512,8 +516,7 @@ def population(trainer: Trainer) -> Trainer:
     array; metrics are [S, I]."""
 
     def run(states: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
-        with outer_axis(len(states.iteration)):
-            return jax.vmap(lambda state: trainer.run(state, num_iterations))(states)
+        return jax.vmap(lambda state: trainer.run(state, num_iterations))(states)
 
     return Trainer(jax.vmap(trainer.init), run, trainer.has_products)
 

@@ -2,13 +2,10 @@
 
 import contextlib
 import os
-import sys
 import threading
-from collections.abc import Sequence
+from pathlib import Path
 
 import jax
-
-from bounce_mjx.training.helpers import cache_folder, module_files
 
 
 def set_up_jax() -> None:
@@ -27,26 +24,10 @@ def cache_compilations() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
 
 
-def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
-    """The modules imported so far, with the sizes and times of their files: a user's module that
-    adds a reward term, for example, makes other programs.
-
-    Args:
-      args: the command's arguments.
-
-    Returns:
-      None if the process is not this command alone, such as a notebook or a test, whose own code
-      may have changed the package in memory.
-    """
-    main = getattr(sys.modules["__main__"], "__file__", None)
-    if main is None or sys.argv[1:] not in ([*args], ["train", *args]):
-        return None
-    described = []
-    for name in sorted({main, *module_files()}):
-        with contextlib.suppress(OSError):
-            status = os.stat(name)
-            described.append(f"{name} {status.st_size} {status.st_mtime_ns}")
-    return tuple(described)
+def cache_folder() -> Path:
+    """Folder of the compiled programs in the user's cache."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return caches / "bounce_mjx" / "jax"
 
 
 def find_devices() -> None:
