@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
@@ -10,6 +11,7 @@ from rich.console import Console
 from bounce_mjx.config.settings import whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
@@ -51,13 +53,11 @@ class TrainCommand(TrainingCommand):
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     args = sys.argv[1:] if args is None else args
-    with exit_on_user_error():
-        if asks_for_help(args):
-            read_command(args)
     several_hosts = _hosts(args)
-    if several_hosts is None:
-        # A process of several hosts also aborts when another one is lost.
-        join_loops(early_flag(args, "--physics"))
+    with exit_on_user_error(), interruptible_imports():
+        if several_hosts is None or asks_for_help(args):
+            command = read_command(args, default_preset(has_plugin()))
+            join_loops(command.env)
     with interruptible_imports():
         from bounce_mjx.training.setup import find_devices, set_up_jax
 
@@ -72,7 +72,8 @@ def main(args: Sequence[str] | None = None) -> None:
         if several_hosts is not None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
-        command = read_command(args)
+        if several_hosts is not None or has_plugin() != has_accelerator():
+            command = read_command(args)
         if not command.watch or not hosts.is_leader():
             run_command(command, PPOTrainer, PROG)
             return
@@ -86,10 +87,10 @@ def main(args: Sequence[str] | None = None) -> None:
         leave(0)
 
 
-def read_command(args: Sequence[str]) -> TrainCommand:
+def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
     description = "Trains a policy that keeps the ball bouncing."
-    return read(TrainCommand, args, prog=PROG, description=description)
+    return read(TrainCommand, args, prog=PROG, description=description, preset=preset)
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:
