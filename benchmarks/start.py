@@ -31,7 +31,6 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 
 PHASES = ("setup", "compile", "train", "evaluate", "save")
 
-# A program of its own, because a training keeps its programs only for such a process.
 TIMED = Path(__file__).with_name("timed_train.py")
 TRACE = "/jax/core/compile/jaxpr_trace_duration"
 LOWER = "/jax/core/compile/jaxpr_to_mlir_module_duration"
@@ -43,8 +42,8 @@ QUICK = {
     "python": ["-c", ""],
     "import bounce_mjx": ["-c", "import bounce_mjx"],
     "from bounce_mjx import BounceBall": ["-c", "from bounce_mjx import BounceBall"],
-    "bounce-mjx train --help": ["-m", "bounce_mjx.train", "--help"],
-    "bounce-mjx plot --help": ["-m", "bounce_mjx.plot", "--help"],
+    "bounce-mjx train --help": ["-m", "bounce_mjx", "train", "--help"],
+    "bounce-mjx plot --help": ["-m", "bounce_mjx", "plot", "--help"],
 }
 
 
@@ -54,7 +53,6 @@ MODULES = (
     "bounce_mjx.training.ppo_trainer",
     "bounce_mjx.training.report",
     "jax.experimental.pallas.mosaic_gpu",
-    "jax.experimental.serialize_executable",
     "orbax.checkpoint",
     "tensorboardX",
 )
@@ -94,8 +92,6 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
                 "JAX_COMPILATION_CACHE_DIR": str(cache),
                 "PYTHONUNBUFFERED": "1",
                 "TIMED_TRAIN_EVENTS": str(folder / "events.json"),
-                # The timed program only listens.
-                "BOUNCE_MJX_HELPERS": "on",
             },
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

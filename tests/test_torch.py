@@ -257,7 +257,7 @@ def test_package_works_without_torch():
     script = """
 import sys
 sys.modules["torch"] = None
-import jax, bounce_mjx, bounce_mjx.train, bounce_mjx.eval
+import jax, bounce_mjx, bounce_mjx.commands.train, bounce_mjx.eval
 print(bounce_mjx.BounceBall().reset(jax.random.PRNGKey(0)).obs.shape)
 try:
     import bounce_mjx.adapters.torch

@@ -1097,11 +1097,11 @@ def test_reward_bars_show_every_term() -> None:
 
 
 def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
-    """Runs `python -m bounce_mjx.<command>` in a folder, without a display."""
+    """Runs `python -m bounce_mjx COMMAND` in a folder, without a display."""
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return subprocess.run(
-        [sys.executable, "-m", *command], cwd=cwd, env=env | variables, capture_output=True,
-        text=True, timeout=300,
+        [sys.executable, "-m", "bounce_mjx", *command], cwd=cwd, env=env | variables,
+        capture_output=True, text=True, timeout=300,
     )  # fmt: skip
 
 
@@ -1116,8 +1116,8 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
 
 
 VIDEOS = {
-    "mp4 by EGL": ("egl", "a.mp4", "bounce_mjx.play", 60),
-    "gif by OSMesa": ("osmesa", "a.gif", "bounce_mjx.view --actions scripted", 25),
+    "mp4 by EGL": ("egl", "a.mp4", "play", 60),
+    "gif by OSMesa": ("osmesa", "a.gif", "view --actions scripted", 25),
 }
 
 
@@ -1171,7 +1171,7 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
     try:
         display = f":{int(screen.stdout.readline())}"
         viewer = subprocess.Popen(
-            [sys.executable, "-m", "bounce_mjx.play", "--seconds", "60"],
+            [sys.executable, "-m", "bounce_mjx", "play", "--seconds", "60"],
             cwd=tmp_path,
             env=os.environ | {"DISPLAY": display},
             stdout=log,

@@ -66,7 +66,6 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
-        join_loops(command.physics)
         with no_garbage_collection():
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table
@@ -76,10 +75,12 @@ def main(args: Sequence[str] | None = None) -> None:
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
 
-        set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
+        engine = {"physics": command.physics} if command.physics in ("fused", "mjx") else {}
+        join_loops(config.env.model_copy(update=engine))
+        set_up_jax()
         policy = load_policy(checkpoint, config)
         console.out(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False

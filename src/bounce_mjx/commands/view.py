@@ -46,8 +46,8 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
-        join_loops(command.env.physics)
         with no_garbage_collection():
+            join_loops(command.env)
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.controllers import (
                 make_random_controller,

@@ -34,6 +34,12 @@ class Engine(NamedTuple):
     """Known differences from MuJoCo's C engine, one sentence each, shown to the user."""
 
 
+def is_fused(mj_model: mujoco.MjModel, choice: str) -> bool:
+    """Whether the engine `choice` ("auto", "fused" or "mjx") is fused for a compiled model; this
+    starts no device of JAX's."""
+    return choice == "fused" or (choice == "auto" and fused.unsupported_feature(mj_model) is None)
+
+
 def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     """Builds the engine `choice` ("auto", "fused" or "mjx") for a compiled model.
 
@@ -41,7 +47,7 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
       UserError: the engine does not support the model.
     """
     beyond_fused = fused.unsupported_feature(mj_model)
-    if choice == "fused" or (choice == "auto" and beyond_fused is None):
+    if is_fused(mj_model, choice):
         if beyond_fused is not None:
             raise UserError(_refusal(beyond_fused, _beyond_mjx(mj_model), "fused"))
         reason = "the model qualifies" if choice == "auto" else "chosen by --physics fused"

@@ -12,7 +12,6 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
-from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.setup import compiler_options
 from bounce_mjx.training.trainer import JAX, Metrics, Snapshot, iterations_per_block
 
@@ -61,14 +60,10 @@ class PPOTrainer:
     def state_template(self) -> TrainingState:
         return self._shapes
 
-    def compile(self, programs: Programs) -> concurrent.futures.Future:
-        self._run = programs.get("train", self.mesh, self._lower_run)
-        self._init = programs.get("init", self.mesh, self._lower_init)
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        self._run = pool.submit(self._lower_run().compile)
+        self._init = pool.submit(self._lower_init().compile)
         return self._run
-
-    def trace(self) -> None:
-        """Traces the training's program."""
-        jax.make_jaxpr(self._train_block)(self._shapes)
 
     def _lower_run(self) -> jax.stages.Lowered:
         sharding = self._sharding
