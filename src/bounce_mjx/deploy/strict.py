@@ -8,7 +8,7 @@ _LIMITS = -1e12, 1e12
 
 
 def read(kind: Any, value: Any, name: str) -> Any:
-    """A value from JSON as a type, without any conversion but of lists to tuples.
+    """A value from JSON as a type; only lists become tuples, and whole numbers floats.
 
     Args:
       kind: int, float, str, a `NamedTuple` (a group of exactly its fields), or tuple, dict, Literal
@@ -53,4 +53,5 @@ def _expected(kind: Any, limits: tuple[float, float]) -> str:
         return f"a group of {', '.join(getattr(kind, '_fields', ['ranges']))}"
     if kind is str:
         return "a text"
-    return f"a{'n' if kind is int else ''} {kind.__name__} from {limits[0]:g} to {limits[1]:g}"
+    number = "a whole number" if kind is int else "a number"
+    return f"{number} from {limits[0]:g} to {limits[1]:g}"
