@@ -118,7 +118,8 @@ class CheckpointWriter:
         """Makes the run's folder again if the user has moved or removed it, so that the new state
         is kept, and can be resumed."""
         if not (self._run / CONFIG_FILE).exists():
-            self._run.mkdir(parents=True, exist_ok=True)
+            if not self._run.exists():
+                self._run.mkdir(parents=True)
             # The only copy of the robot may have been in the folder.
             with contextlib.suppress(UserError):
                 save_config(self._run, self._run_config)
