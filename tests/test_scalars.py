@@ -146,9 +146,10 @@ def test_a_loop_unpacks_the_rows_of_its_steps(monkeypatch):
         "int": jnp.arange(15, dtype=jnp.int32).reshape(3, 5),
         "bool": jnp.arange(15).reshape(3, 5) % 4 == 0,
     }
-    assert rows.pack_steps(tree) is tree
+    assert rows.pack_steps(tree, num_devices=1) is tree
     monkeypatch.setattr(rows, "has_kernels", lambda: True)
-    packed = rows.pack_steps(tree)
+    assert rows.pack_steps(tree, num_devices=2) is tree
+    packed = rows.pack_steps(tree, num_devices=1)
     assert packed.rows.shape == (3, 20)
     _, steps = jax.lax.scan(lambda carry, step: (carry, rows.unpack(step)), 0, packed)
     for name, expected in tree.items():
