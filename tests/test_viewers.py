@@ -148,12 +148,12 @@ def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording:
 def test_random_actions_are_uniform(env: BounceBall) -> None:
     states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 500))
     control = make_random_controller(env)
-    actions, _ = control.act(None, states, jax.random.PRNGKey(1), ())
+    actions = control(None, states, jax.random.PRNGKey(1))
     assert actions.shape == (env.action_size, 500)
     np.testing.assert_allclose(
         np.quantile(actions, (0.0, 0.25, 0.75, 1.0)), (-1, -0.5, 0.5, 1), atol=0.05
     )
-    assert np.all(control.act(None, states, jax.random.PRNGKey(2), ())[0] != actions)
+    assert np.all(control(None, states, jax.random.PRNGKey(2)) != actions)
 
 
 def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
