@@ -1,8 +1,6 @@
 """Interface of the physics engines, and the choice of an engine for a model."""
 
 import functools
-import importlib.machinery
-import sys
 from collections.abc import Callable
 from types import ModuleType
 from typing import NamedTuple
@@ -11,6 +9,7 @@ import jax
 import mujoco
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.lazy import silence_mjx
 from bounce_mjx.physics import fused
 from bounce_mjx.physics.control import Control
 from bounce_mjx.physics.convergence import solver_warning
@@ -119,30 +118,10 @@ def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
 
 def _mjx_engine() -> ModuleType:
     # The import is lazy because MJX takes seconds to import.
-    if _SilentWarp not in sys.meta_path:
-        sys.meta_path.insert(0, _SilentWarp)
+    silence_mjx()
     from bounce_mjx.physics import mjx_engine
 
     return mjx_engine
-
-
-class _SilentWarp:
-    """Finder of the module in which MJX prints a line for each optional part that is not installed;
-    there `print` does nothing. Other threads keep their standard output."""
-
-    @staticmethod
-    def find_spec(name: str, path=None, target=None) -> importlib.machinery.ModuleSpec | None:
-        if name != "mujoco.mjx.warp":
-            return None
-        spec = importlib.machinery.PathFinder.find_spec(name, path)
-        execute = spec.loader.exec_module
-
-        def execute_silently(module: ModuleType) -> None:
-            module.print = lambda *_: None
-            execute(module)
-
-        spec.loader.exec_module = execute_silently
-        return spec
 
 
 def _refusal(beyond_fused: str | None, beyond_mjx: str | None, choice: str) -> str:
