@@ -27,7 +27,7 @@ from trainers import OnBlock, block_iterations
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Network, Policy, make_networks
+from bounce_mjx.learning.policy import NetworkFunctions, Policy, make_networks
 from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
@@ -103,7 +103,7 @@ def brax_networks(config: PPOConfig, observation_size: int, action_size: int) ->
     """This project's networks, with its normalisation, for brax's trainer."""
     networks = make_networks(config, observation_size, action_size, len(config.critic_metrics))
 
-    def adapt(network: Network, key: str) -> FeedForwardNetwork:
+    def adapt(network: NetworkFunctions, key: str) -> FeedForwardNetwork:
         return FeedForwardNetwork(
             init=network.init,
             apply=lambda statistics, params, observation: network.apply(

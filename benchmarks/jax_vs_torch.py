@@ -42,7 +42,6 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.gpu.kernel_calls import lower_elsewhere
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
@@ -50,7 +49,6 @@ from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training.command import path_flag
-from bounce_mjx.training.helpers import Helpers
 from bounce_mjx.training.setup import compiler_options
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
@@ -133,8 +131,6 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
             "JAX_COMPILATION_CACHE_DIR": cache,
             # JAX would otherwise reserve most of the memory, and PyTorch needs some of it.
             "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
-            # `one_training.py` does not change the package.
-            "BOUNCE_MJX_HELPERS": "on",
             _STARTED: str(time.time()),
         }
         finished = subprocess.run(
@@ -151,21 +147,12 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
         print(lines[-1], flush=True)
 
 
-def train_here(command: Command, helpers: Helpers | None) -> None:
-    """Trains in this process, and writes each evaluation as it ends.
-
-    Args:
-      helpers: processes that lower the kernels of our trainer, as for our command.
-    """
+def train_here(command: Command) -> None:
+    """Trains in this process, and writes each evaluation as it ends."""
     (method,) = command.methods
     config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
-    if helpers is not None:
-        helpers.begin(config)
-        lower_elsewhere(helpers)
     with (command.out / _RECORDS).open("a", encoding="utf-8") as file:
         TRAINERS[method](config, _Judge(command, config, method, file))
-    if helpers is not None:
-        helpers.close()
 
 
 class _Judge:

@@ -57,7 +57,8 @@ def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
     config = PPOConfig(**preset)
     mesh = make_mesh(num_devices, config, num_seeds)
     env = BounceBall()
-    trainer = make_trainer(config, env, env.config.episode_steps)
+    sharing = num_devices if num_seeds == 1 else 1
+    trainer = make_trainer(config, env, env.config.episode_steps, sharing)
     key = jax.random.PRNGKey(0)
     if num_seeds > 1:
         trainer, key = population(trainer), jax.random.split(key, num_seeds)
@@ -69,7 +70,7 @@ def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
         in_shardings=(sharding,),
         out_shardings=(sharding, replicated(mesh) if num_seeds == 1 else None),
         donate_argnums=0,
-        compiler_options=compiler_options(tunes_products=trainer.has_products),
+        compiler_options=compiler_options(tunes_products=True),
     )
     state, metrics = jax.block_until_ready(run(state))
     compile_seconds = time.perf_counter() - started

@@ -1,9 +1,11 @@
-"""Time from process start to all five results, and the results on every engine, over seeds.
+"""Time of whole trainings, and the five results of their policies on every engine, over seeds.
 
     python benchmarks/train.py --seeds 0 1 2 3 4 --engines fused mjx mujoco
 
 Each training is a separate process with an empty compilation cache. It runs
-`train_jax.py --stop-when-solved` as a user would, with the flags that follow `--`.
+`train_jax.py --stop-when-solved` as a user would, with the flags that follow `--`. "solved" is the
+first evaluation that meets all five results; the training, and its time, go on until they have a
+margin. (Code without a margin ended at that evaluation.) `start.py` measures the time to it.
 """
 
 import json
@@ -34,8 +36,7 @@ class Command(StrictModel):
     engines: tuple[Literal["fused", "mjx", "mujoco"], ...] = ("fused", "mujoco")
     """Engines on which each trained policy is evaluated, 1,024 episodes each."""
     stop_when_solved: bool = True
-    """End a training at its first evaluation that meets all results, or at total_steps if none
-    does."""
+    """End a training once its results have a margin, or at total_steps."""
     out: Path = Path("benchmarks/results")
     """Folder for train.json and train.md."""
 

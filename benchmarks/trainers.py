@@ -47,7 +47,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
         trainer.run,
         static_argnums=1,
         donate_argnums=0,
-        compiler_options=compiler_options(tunes_products=trainer.has_products),
+        compiler_options=compiler_options(tunes_products=True),
     )
     with concurrent.futures.ThreadPoolExecutor() as pool:
         shapes = jax.eval_shape(init, key)

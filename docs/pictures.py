@@ -579,9 +579,12 @@ def page():
 
     from playwright.sync_api import sync_playwright
 
-    command = [sys.executable, "-u", "-m", "bounce_mjx.play", "pretrained", "--viewer", "browser"]
+    command = [sys.executable, "-u", "-m", "bounce_mjx", "play", "pretrained"]
     server = subprocess.Popen(
-        [*command, "--port", "8231"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*command, "--viewer", "browser", "--port", "8231"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
     try:
         address = next(

@@ -166,6 +166,23 @@ def test_step_keeps_what_wrappers_added(env):
     assert after.metrics["reward/height"] > 0.0
 
 
+def test_torchrl_steps_the_environment(need):
+    """Its wrapper turns the state into tensors and back."""
+    torchrl, torch = need("torchrl.envs"), need("torch")
+    bounce_ball = BraxBounceBall()
+    envs = torchrl.BraxWrapper(bounce_ball, batch_size=(2,), device="cpu")
+    envs.set_seed(3)
+    data = envs.reset()
+    # TorchRL's keys.
+    _, *keys = jax.random.split(jax.random.PRNGKey(3), 3)
+    state = jax.vmap(bounce_ball.reset)(jnp.stack(keys))
+    step = jax.jit(jax.vmap(bounce_ball.step))
+    for _ in range(2):
+        data = torchrl.utils.step_mdp(envs.step(data.set("action", torch.full((2, 6), 0.5))))
+        state = step(state, jnp.full((2, 6), 0.5))
+        np.testing.assert_allclose(data["observation"], state.obs, rtol=1e-5, atol=1e-6)
+
+
 # Trainers
 
 

@@ -1,12 +1,16 @@
 """The commands: the files that they write, and their messages after mistakes."""
 
+import io
 import json
+import os
+import pwd
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 import numpy as np
@@ -16,13 +20,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.training.setup import set_up_jax
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents
 
 RESULT_NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
@@ -339,6 +344,46 @@ def test_whole_process_exits_without_a_traceback_on_a_damaged_checkpoint(run: Pa
     )
     assert done.returncode == 2
     assert re.fullmatch(r"error: .+\n", done.stderr), done.stderr
+
+
+def test_platform_that_jax_does_not_have(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "bounce_mjx.eval", "pretrained"],
+        cwd=tmp_path,
+        env=os.environ | {"JAX_PLATFORMS": "nope"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    sentence = r"error: JAX does not start on JAX_PLATFORMS=nope \(.+\); unset it, or .+\n"
+    assert re.fullmatch(sentence, done.stderr), done.stderr
+
+
+def test_path_that_the_output_cannot_encode(monkeypatch) -> None:
+    output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    with exit_on_user_error():
+        print("runs/für_alle")
+    output.flush()
+    assert output.buffer.getvalue() == rb"runs/f\xfcr_alle" + os.linesep.encode()
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch) -> None:
+    """As in a container whose user is a number without a name."""
+
+    def unknown(number: int) -> NoReturn:
+        raise KeyError(number)
+
+    for name in ("HOME", "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    chosen = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        set_up_jax()
+        assert jax.config.jax_compilation_cache_dir is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", chosen)
 
 
 @pytest.mark.parametrize("main", [train_command.main, eval_command.main], ids=["train", "eval"])

@@ -1,5 +1,8 @@
 """Exported policies: the ONNX graph against JAX, the NumPy histories against the environment."""
 
+import json
+import math
+import random
 import runpy
 import subprocess
 import sys
@@ -178,12 +181,12 @@ def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) ->
         input_name(q.name): n for q in QUANTITIES if (n := getattr(config.env.observation, q.name))
     }
     assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
-    assert (metadata.joint_names, metadata.steps) == ([f"Joint{i}" for i in range(1, 7)], 64)
+    assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7)) and metadata.steps == 64
     assert metadata.control_dt == config.env.control_dt
-    assert metadata.randomization["camera_rate"] == [80.0, 130.0]
-    assert metadata.target_height_range == [0.4, 0.6]
-    assert metadata.servo_stiffness == [20000.0] * 6 and metadata.servo_damping == [200.0] * 6
-    assert metadata.torque_limits == [None] * 6
+    assert metadata.randomization["camera_rate"] == (80.0, 130.0)
+    assert metadata.target_height_range == (0.4, 0.6)
+    assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
+    assert metadata.torque_limits == (None,) * 6
     for node in model.graph.input:
         shape = [d.dim_value or d.dim_param for d in node.type.tensor_type.shape.dim]
         (part,) = (p for p in metadata.observation if p.name == node.name)
@@ -415,6 +418,7 @@ WRONG = {
     "words": ({"target_height": "high"}, "target_height is 'high'", "one number (m)"),
     "ragged": ({"ball_velocity": [[0], 1, 2]}, "ball_velocity is", "3 numbers (m/s)"),
     "nan": ({"joint_velocities": [0, 0, np.nan, 0, 0, 0]}, "holds nan", "finite", "rad/s"),
+    "huge": ({"ball_position": [0, 0, 1e300]}, "holds 1e+300", "finite numbers (m)"),
     "infinite": ({"time": np.inf}, "time holds inf", "finite numbers (s)"),
     "a long pause": ({"time": 1003.0}, "1e+03 s after", "call reset", "give seconds"),
     "another clock": ({"time": -5.0}, "call reset"),
@@ -471,7 +475,10 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     unknown = onnx.load_from_string(shipped)
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
+    recurrent = onnx.load_from_string(shipped)
+    recurrent.metadata_props.add(key="memory_size", value="128")
     broken = {
+        "its network has a memory": recurrent.SerializeToString(),
         "its input ball_colour is unknown": unknown.SerializeToString(),
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
@@ -488,14 +495,141 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
         load_policy("robust")
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+WRONG_ENTRIES = {
+    "control_dt": [1e-300, 0.0, -0.01, 1e300, float("nan"), "0.01", None, True, [0.01]],
+    "action_scale": [float("inf"), 1e300, -0.1, {}],
+    "format": [2.0, "2", [2], None],
+    "steps": [-1, 1.5, True],
+    "joint_names": ["Joint1", ["Joint1"] * 5, [1] * 6, {}, []],
+    "joint_ranges": [
+        [[1.0, -1.0]] * 6,
+        [[0.0, float("nan")]] * 6,
+        [[0.0, 1.0, 2.0]] * 6,
+        [0.0] * 6,
+    ],
+    "servo_stiffness": [[1.0] * 5, 3.0],
+    "torque_limits": [[None] * 7],
+    "velocity": ["guessed", ["filter"], None],
+    "position": ["differences", 3],
+    "estimator": [None, {}, []],
+    "paddle": [[0.0, 0.0], [1e300, 0.0, 0.0]],
+    "paddle_normal": [[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
+    "chain": [[], {}, [{"joint": 0}], None],
+    "observation": [[], {}, [["joint_angles", 1, 6, "rad"]]],
+    "randomization": [{"ball_mass": 1.0}, []],
+}
+
+
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory: pytest.TempPathFactory) -> onnx.ModelProto:
+    """A policy that sees every kind of quantity, the ball by the Kalman filter."""
+    observation = ALL | {"position": "filter", "velocity": "filter", "ball_velocity": 2}
+    run = make_run(tmp_path_factory.mktemp("filtered") / "run", {"observation": observation})
+    model = export_onnx(find_checkpoint(run))
+    DeployedPolicy(model, "the file before the edits")
+    return onnx.load_from_string(model)
+
+
+def edited(model: onnx.ModelProto, name: str, text: str) -> bytes:
+    """An ONNX file with another text of an entry."""
+    copy = onnx.ModelProto.FromString(model.SerializeToString())
+    (prop,) = (prop for prop in copy.metadata_props if prop.key == name)
+    prop.value = text
+    return copy.SerializeToString()
+
+
+@pytest.mark.parametrize("name", WRONG_ENTRIES)
+def test_a_wrong_entry_is_refused_by_name(name: str, filtered: onnx.ModelProto) -> None:
+    for value in WRONG_ENTRIES[name]:
+        with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file") as refusal:
+            DeployedPolicy(edited(filtered, name, json.dumps(value)), "a.onnx")
+        reason = str(refusal.value)
+        words = (name, "estimator", "joints", "inputs", "length than 1")
+        assert len(reason) < 400 and any(word in reason for word in words), (value, reason)
+
+
+def nodes(value: object) -> list[tuple[object, object]]:
+    """Every (group or list, key) in JSON."""
+    keys = (
+        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    )
+    return [place for key in keys for place in [(value, key), *nodes(value[key])]]
+
+
+def random_edit(rng: random.Random, text: str) -> str:
+    """JSON with one value replaced, removed, repeated or scaled, or with one character changed."""
+    if rng.random() < 0.1:
+        at = rng.randrange(len(text))
+        return text[:at] + rng.choice('0123456789-.eE"[]{},:nN') + text[at + 1 :]
+    whole = [json.loads(text)]
+    group, key = rng.choice(nodes(whole))
+    value, hostile = group[key], (0, -1, 1e-300, 1e300, 1e30, 10**400, math.nan, math.inf, True)
+    kind = rng.randrange(4)
+    if kind == 0:
+        group[key] = rng.choice([*hostile, None, "", "a", [], {}, [[]], 1, 7, 0.5, 1e-3, 1e4])
+    elif kind == 1 and type(value) in (int, float):
+        group[key] = value * rng.choice((-1, 0.5, 2, 10, 1e3, 1e-3, 1e-6, 1e6))
+    elif kind == 2 and isinstance(group, list):
+        group.insert(key, value)
+    elif group is not whole:
+        del group[key]
+    return json.dumps(whole[0])
+
+
+def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.ModelProto) -> None:
+    rng, acting = random.Random(0), 0
+    entries = {prop.key: prop.value for prop in filtered.metadata_props}
+    for _ in range(500):
+        name = rng.choice(list(entries))
+        text = random_edit(rng, entries[name])
+        try:
+            policy = DeployedPolicy(edited(filtered, name, text), "a.onnx")
+        except UserError as error:
+            assert "a.onnx is no policy" in str(error) and "\n" not in str(error), (name, text)
+            continue
+        ranges = [limits or (-math.inf, math.inf) for limits in policy.metadata.joint_ranges]
+        low, high = np.transpose(ranges)
+        for time in (0.0, 0.01, 0.02, 0.05, 0.06):
+            measured = {k: v for k, v in falling(time).items() if k in (*policy.needs, "time")}
+            action = policy.step(measured)
+            targets = policy.servo_targets(action)
+            assert np.all(np.abs(action) <= 1.0), (name, text)
+            assert np.all(np.isfinite(targets) & (low <= targets) & (targets <= high)), (name, text)
+        acting += 1
+    # Some edits only change a number.
+    assert 20 < acting < 400
+
+
+def test_a_network_that_gives_no_number_is_refused(filtered: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+    (bias,) = (tensor for tensor in copy.graph.initializer if tensor.name == "mean/bias")
+    array = onnx.numpy_helper.to_array(bias).copy()
+    array[0] = np.nan
+    bias.CopyFrom(onnx.numpy_helper.from_array(array, bias.name))
+    with pytest.raises(UserError, match="a.onnx is no policy .*not finite"):
+        DeployedPolicy(copy.SerializeToString(), "a.onnx")
+
+
+@pytest.mark.parametrize(
+    "action", [[np.nan] * 6, [np.inf] * 6, [0.0] * 5, [[0.0] * 6], "up", None, [5.0] * 6]
+)
+def test_no_servo_targets_for_a_wrong_action(action, policies) -> None:
+    policy = policies["all histories"]
+    policy.reset()
+    policy.step(falling(0.0))
+    with pytest.raises(UserError, match="the action .*give .*numbers .*from -1 to 1"):
+        policy.servo_targets(action)
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "flatbuffers"])
 def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     use = {
         "onnx": lambda: export_onnx(pretrained_checkpoint()),
         "onnxruntime": lambda: load_policy("pretrained"),
+        "flatbuffers": lambda: export_jax(pretrained_checkpoint()),
     }
-    with pytest.raises(UserError, match=f"the package {package} is missing.*pip install"):
+    with pytest.raises(UserError, match=f"^{package} cannot be imported.*pip install"):
         use[package]()
 
 

@@ -21,7 +21,6 @@ import yaml
 
 import bounce_mjx
 from bounce_mjx import commands as commands_package
-from bounce_mjx.commands import config_reference
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import plot as plot_command
@@ -38,6 +37,7 @@ from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 
 CHECKOUT = Path(__file__).resolve().parent.parent
+REFERENCE = runpy.run_path(str(CHECKOUT / "docs/config_reference.py"))["reference"]()
 PAGES = [
     CHECKOUT / "README.md",
     CHECKOUT / "CONTRIBUTING.md",
@@ -129,7 +129,7 @@ COMMANDS = sorted({(name, *args) for page in PAGES for name, args in commands(pa
 def test_the_documentation_shows_the_commands() -> None:
     shown = {name for name, *_ in COMMANDS}
     script = {f"bounce-mjx {name}" for name in ("eval", "play", "plot", "report")}
-    scripts = {"train_jax.py", "benchmarks/physics.py", "bounce_mjx.commands.config_reference"}
+    scripts = {"train_jax.py", "benchmarks/physics.py", "docs/config_reference.py"}
     assert shown >= script | scripts
 
 
@@ -172,8 +172,9 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 
 
 def known_flags() -> set[str]:
-    """The flags of every command of the package."""
-    flags = {"--help"}
+    """The flags of every command of the package, and of the maintainers' one."""
+    ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
+    flags = {"--help", *cli._flags(ship["ShipCommand"])}
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
@@ -191,14 +192,12 @@ def test_flags_in_sentences_exist(page: Path) -> None:
 
 def test_config_reference_is_fresh() -> None:
     page = content("config.md")
-    assert page == config_reference.reference(), (
-        "docs/config.md is stale; it names the command that prints it"
-    )
+    assert page == REFERENCE, "docs/config.md is stale; it names the command that prints it"
 
 
 def reference_rows() -> dict[str, list[str]]:
     """For each key of the config reference, the cells that follow the key."""
-    rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", config_reference.reference(), re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", REFERENCE, re.MULTILINE)
     return {key: re.split(r" (?<!\\)\| ", cells) for key, cells in rows}
 
 

@@ -141,10 +141,10 @@ def test_metadata_has_the_constants_of_the_filter() -> None:
     settings = {"restitution": 0.8, "latency": 0.015, "air_drag": 0.1}
     metadata = describe(TrainConfig(env=ENV | {"estimator": settings}), 0)
     assert (metadata.position, metadata.velocity) == ("filter", "filter")
-    assert settings.items() <= metadata.estimator.items()
+    assert settings.items() <= metadata.estimator._asdict().items()
     # Half the paddle's thickness and the ball's radius.
-    assert metadata.estimator["contact_distance"] == pytest.approx(0.0035 + 0.019)
-    assert metadata.estimator["gravity"] == (0.0, 0.0, -9.81)
+    assert metadata.estimator.contact_distance == pytest.approx(0.0035 + 0.019)
+    assert metadata.estimator.gravity == (0.0, 0.0, -9.81)
     assert describe(TrainConfig(), 0).estimator is None
 
 

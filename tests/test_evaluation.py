@@ -226,7 +226,7 @@ def test_perfect_statistics_pass(env):
     assert report.details["mean_return"] == 20_000
     np.testing.assert_allclose(report.details["mean_apex_error_m"], 0.02, rtol=1e-6)
     np.testing.assert_allclose(report.details["mean_length_s"], 20.0)
-    assert report.score == (True, 5, 20_000)
+    assert report.score == (True, 5, 1.0, 20_000)
 
 
 @pytest.mark.parametrize(
@@ -362,7 +362,7 @@ def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
 def test_fresh_statistics_fail_without_a_crash(env):
     report = judge(env, empty_statistics(4)._replace(running=jnp.zeros(4, bool)))
     assert [result.passed for result in report.results] == [False] * 5
-    assert report.score == (True, 0, 0.0)
+    assert report.score == (True, 0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -392,12 +392,65 @@ def test_upward_speed_is_judged_by_the_drawn_targets(env):
     assert judge(env, fast, target_heights=(0.8, 0.8)).results[SPEED].passed is None
 
 
-def report_of(passed, mean_return) -> Report:
-    results = tuple(Result("", "", 0.0, "", p) for p in passed)
+def half_in_half(low, high):
+    """`low` in every second episode, `high` in the others: two standard errors of 64 episodes are
+    an eighth of the difference."""
+    return np.where(np.arange(EPISODES) % 2, low, high)
+
+
+@pytest.mark.parametrize(
+    ("result", "changes", "margin"),
+    [
+        # Of 200 episodes 2 may fail, and half of them with a margin.
+        (BOUNCES, {"max_bounces": first(199, 3, 2)}, 1.0),
+        (BOUNCES, {"max_bounces": first(198, 3, 2)}, 0.0),
+        (STABLE, {"running": first(199, True, False)}, 1.0),
+        (STABLE, {"running": first(198, True, False)}, 0.0),
+        (SPEED, {"rising_speed": 900 * half_in_half(1.20, 1.67)}, 1.0),
+        (SPEED, {"rising_speed": 900 * half_in_half(1.23, 1.71)}, 0.5),
+        (SPEED, {"rising_speed": 900 * half_in_half(1.30, 1.78)}, 0.0),
+        (SPEED, {"rising_speed": 900 * half_in_half(0.10, 0.14)}, 1.0),
+        (SPEED, {"rising_speed": 90.1}, 1.0),
+        # 96% of 1,800 steps and of 50 bounces.
+        (HORIZONTAL, {"centred_steps": 18 * half_in_half(94, 98)}, 1.0),
+        (HORIZONTAL, {"centred_steps": 18 * half_in_half(88, 104)}, 0.5),
+        (HEIGHT, {"settled_bounces": 50, "accurate_bounces": half_in_half(47, 49)}, 1.0),
+        (HEIGHT, {"settled_bounces": 50, "accurate_bounces": half_in_half(44, 52)}, 0.5),
+        (HEIGHT, {"settled_bounces": 0, "accurate_bounces": 0}, 0.0),
+    ],
+)
+def test_margin_of_a_result(result, changes, margin, env):
+    report = judge(env, statistics(**changes))
+    np.testing.assert_allclose(report.results[result].margin, margin, atol=1e-5)
+    np.testing.assert_allclose(report.margin, margin, atol=1e-5)
+    assert report.passed_with_margin == (margin == 1.0)
+
+
+def test_the_margin_is_the_spread_of_evaluations_of_64_episodes(env):
+    """The whole margin is two standard deviations of the mean speed in many evaluations of 64
+    episodes of different length and speed."""
+    random = np.random.default_rng(0)
+    length = random.integers(100, 900, EPISODES)
+    total = length * random.normal(1.47, 0.2, EPISODES)
+    result = judge(env, statistics(rising_steps=length, rising_speed=total)).results[SPEED]
+    assert 0.0 < result.margin < 1.0
+    drawn = random.integers(0, EPISODES, (20_000, 64))
+    means = total[drawn].sum(axis=1) / length[drawn].sum(axis=1)
+    np.testing.assert_allclose((1.5 - result.value) / result.margin, 2 * means.std(), rtol=0.05)
+
+
+def test_no_margin_without_judgement(env):
+    report = judge(env, statistics(), target_heights=(0.8, 0.8))
+    assert report.results[SPEED].margin is None
+    assert report.passed_with_margin
+
+
+def report_of(passed, mean_return, margin=0.0) -> Report:
+    results = tuple(Result("", "", 0.0, "", p, margin) for p in passed)
     return Report(results, {"mean_return": mean_return})
 
 
-def test_score_orders_by_results_met_and_then_by_return():
+def test_score_orders_by_results_met_and_margin_and_then_by_return():
     worst_first = [
         report_of([False] * 5, 500.0),
         report_of([True] + [False] * 4, 100.0),
@@ -405,6 +458,9 @@ def test_score_orders_by_results_met_and_then_by_return():
         report_of([True] * 4 + [False], 50.0),
         report_of([True, True, True, None, True], 10.0),
         report_of([True] * 5, 20.0),
+        report_of([True] * 5, 5.0, margin=0.5),
+        report_of([True] * 5, 1.0, margin=1.0),
+        report_of([True] * 5, 2.0, margin=1.0),
     ]
     scores = [report.score for report in worst_first]
     assert scores == sorted(scores) and len(set(scores)) == len(scores)

@@ -4,11 +4,14 @@ ones."""
 import copy
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import warnings
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
@@ -283,6 +286,16 @@ def test_arrays_become_tensors(need):
     assert following.shape == (NUM_ENVS, 29)
 
 
+def test_arrays_become_those_of_jax(need):
+    need("array_api_compat")
+    env = gymnasium.wrappers.vector.ArrayConversion(make_vec(), np, jnp)
+    env.reset(seed=0)
+    following, reward, *_, info = env.step(jnp.zeros((NUM_ENVS, 6)))
+    for array, shape in ((following, (NUM_ENVS, 29)), (reward, (NUM_ENVS,))):
+        assert isinstance(array, jax.Array) and array.shape == shape
+    assert isinstance(info["ball_xy_error"], jax.Array)
+
+
 def test_torchrl_wraps_single_and_vectorised_environments(need):
     """TorchRL's own checks pass, and the next observation is the last one of an ended episode."""
     torchrl = need("torchrl.envs")
@@ -369,8 +382,8 @@ def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
 def test_async_environments_run_after_jax_ran_in_the_parent(tmp_path):
     """Gymnasium's processes start from a server by default; a fork would hang. The compiled
     programs are cached where the commands cache them."""
-    (tmp_path / "bounce_mjx").mkdir()
-    (tmp_path / "bounce_mjx/jax").symlink_to(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    kept = tmp_path / "bounce_mjx/jax"
+    shutil.copytree(os.environ["JAX_COMPILATION_CACHE_DIR"], kept, copy_function=os.link)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     script = f"""
 import gymnasium, jax, numpy as np, bounce_mjx

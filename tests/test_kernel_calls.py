@@ -16,12 +16,12 @@ from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, kernel_calls, rows
 from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.gpu.scalars import as_scalars
-from bounce_mjx.learning import forward_kernel, minibatch_kernel, ppo
+from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 
 SIZE = 256
 RESULTS = [jax.ShapeDtypeStruct((SIZE,), jnp.float32), jax.ShapeDtypeStruct((2,), jnp.int32)]
-CONFIG = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(64, 64), compute_dtype="bfloat16")
+CONFIG = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(8,))
 
 
 def doubling(factor: float = 2.0):
@@ -63,10 +63,8 @@ def lowered_kernels(monkeypatch) -> list:
 
 
 def trainer_with_kernels(monkeypatch, num_seeds: int = 1):
-    """A trainer as on a GPU, and the shapes of its state, as if nothing had been traced before."""
-    for module in (minibatch_kernel, forward_kernel):
-        module._batched_call.cache_clear()
-    for module in (elementwise, rows, ppo):
+    """A trainer as on a GPU, and the shapes of its state."""
+    for module in (elementwise, rows):
         monkeypatch.setattr(module, "has_kernels", lambda: True)
     env = BounceBall()
     trainer = ppo.make_trainer(CONFIG, env, env.config.episode_steps)
@@ -81,7 +79,16 @@ def training_text(trainer, state) -> str:
     return program.lower(lowering_platforms=("cuda",)).as_text()
 
 
-def test_the_program_has_the_same_call_as_without():
+@pytest.fixture
+def no_locations():
+    """Programs without the lines of Python that they come from."""
+    limit = jax.config.jax_traceback_in_locations_limit
+    jax.config.update("jax_traceback_in_locations_limit", 0)
+    yield
+    jax.config.update("jax_traceback_in_locations_limit", limit)
+
+
+def test_the_program_has_the_same_call_as_without(no_locations):
     kernel = doubling()
     calls = [
         re.search(r"custom_call @mosaic_gpu.*", lowered_text(function)).group()
@@ -96,106 +103,46 @@ def test_a_kernel_is_lowered_again_unless_its_key_is_known(lowered_kernels):
     for key, factor, count in ((None, 2.0, 1), (None, 2.0, 2), (("a",), 3.0, 3), (("a",), 3.0, 3)):
         lowered_text(lambda x, f=factor, k=key: call_kernel(doubling(f), RESULTS, x, key=k))
         assert len(lowered_kernels) == count
-    modules = [attributes["module"] for attributes, _ in lowered_kernels]
+    modules = [attributes["module"] for attributes in lowered_kernels]
     assert modules[2] not in modules[:2]
 
 
-@pytest.mark.parametrize("num_seeds", [1, 2])
-def test_a_training_on_a_gpu_starts_with_its_longest_kernel(
-    lowered_kernels, monkeypatch, num_seeds: int
-):
-    """The kernel of a minibatch has three results. It is lowered before the others, and leaves no
-    matrix products to XLA. Every kernel is lowered once."""
-    trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
-    assert not lowered_kernels
-    text = training_text(trainer, state)
-    num_results = [len(jax.tree.leaves(program.out_info)) for _, program in lowered_kernels]
-    assert num_results[0] == 3
-    assert len(num_results) == 6 and num_results.count(3) == 1
-    # First states, policy, control step, values, gradient, and sums.
-    assert text.count("custom_call @mosaic_gpu") == 6
-    assert "dot_general" not in text
-    assert not trainer.has_products
-
-
-class Elsewhere:
-    """Kernels that another process has lowered."""
-
-    def __init__(self, kernels: dict[str, dict], kinds: tuple[str, ...]):
-        self.kernels, self.kinds, self.wanted = kernels, kinds, []
-
-    def lowers(self, kind: str) -> bool:
-        return kind in self.kinds
-
-    def wait_for(self, kind: str, name: str) -> dict | None:
-        assert kind in self.kinds
-        self.wanted.append(name)
-        return self.kernels.get(name)
-
-
-KINDS = ("minibatch", "sums", "elementwise", "outputs")
-
-
-@pytest.mark.parametrize("num_seeds", [1, 2])
-def test_another_process_can_lower_the_kernels_of_a_training(
-    lowered_kernels, monkeypatch, num_seeds: int
-):
-    """What a process lowers for another one is what that one asks for. The other one lowers only
-    the kernel of the first states."""
-    trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
-    monkeypatch.setattr(kernel_calls, "_receive", None)
-    given = []
-    kernel_calls.lower_for_another(KINDS, given.append)
-    jax.make_jaxpr(lambda state: trainer.run(state, 1))(state)
-    monkeypatch.setattr(kernel_calls, "_receive", None)
-    # These are two processes, so one does not know what the other one has traced.
-    trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
-    helper = Elsewhere({kernel.name: kernel.attributes for kernel in given}, KINDS)
-    assert len(helper.kernels) == len(given)
-    lowered_kernels.clear()
-    monkeypatch.setattr(kernel_calls, "_helper", helper)
-    text = training_text(trainer, state)
-    assert len(given) == 5 and sorted(helper.wanted) == sorted(helper.kernels)
-    assert len(lowered_kernels) == 1
-    assert text.count("custom_call @mosaic_gpu") == 6
-
-    # Without the other process's kernels, the same program lowers all of them.
-    helper.kernels = {}
-    other = training_text(trainer, state)
-    assert len(lowered_kernels) == 1 + 1 + 5
-
-    def without_kernels(text: str) -> str:
-        return re.sub(r'(kernel_hash|module) = "(?:[^"\\]|\\.)*"', "", text)
-
-    assert without_kernels(other) == without_kernels(text)
-
-
-NAMES = """
-import jax
+ON_DEVICES = """
+import jax, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.gpu import kernel_calls
-import pytest
 import test_kernel_calls as tests
-with pytest.MonkeyPatch.context() as patch:
-    trainer, state = tests.trainer_with_kernels(patch)
-    patch.setattr(kernel_calls, "_lower", lambda *_: ({}, None))
-    kernel_calls.lower_for_another(tests.KINDS, lambda kernel: print(kernel.name))
-    jax.make_jaxpr(lambda state: trainer.run(state, 1))(state)
+lowered, lower = [], kernel_calls._lower
+kernel_calls._lower = lambda *args: lowered.append(args) or lower(*args)
+x = jax.ShapeDtypeStruct((tests.SIZE,), "float32")
+for n in (2, 1):
+    sharding = NamedSharding(Mesh(np.array(jax.devices()[:n]), "d"), PartitionSpec())
+    call = lambda x: kernel_calls.call_kernel(tests.doubling(), tests.RESULTS, x)
+    program = jax.jit(call, in_shardings=sharding).trace(x).lower(lowering_platforms=("cuda",))
+    print(program.as_text().count("custom_call @mosaic_gpu"), len(lowered))
 """
 
 
-def test_a_kernel_has_the_same_name_in_every_process():
-    def names(seed: str) -> list[str]:
-        return subprocess.run(
-            [sys.executable, "-c", NAMES],
-            cwd=Path(__file__).parent,
-            env=os.environ | {"PYTHONHASHSEED": seed},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.splitlines()
+def test_a_kernel_is_lowered_on_its_own_for_one_of_several_devices():
+    """XLA lowers those of a program for several devices."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", ON_DEVICES],
+        cwd=Path(__file__).parent,
+        env=os.environ | flags,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.splitlines() == ["1 0", "1 1"], done.stderr
 
-    first = names("1")
-    assert len(first) == 5 and first == names("2")
+
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_a_training_on_a_gpu_lowers_each_kernel_once(lowered_kernels, monkeypatch, num_seeds: int):
+    """The kernels of the first states and of the control step."""
+    trainer, state = trainer_with_kernels(monkeypatch, num_seeds)
+    assert not lowered_kernels
+    text = training_text(trainer, state)
+    assert len(lowered_kernels) == text.count("custom_call @mosaic_gpu") == 2
 
 
 def test_functions_with_other_numbers_are_other_kernels():

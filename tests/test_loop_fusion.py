@@ -1,73 +1,123 @@
-"""XLA's option that joins loops on a CPU, in processes of their own."""
+"""XLA's option that joins loops on a CPU: which commands use it."""
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import default_preset, read_preset
+from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.training.loop_fusion import OPTION, join_loops
 
 # Two results of one value: with the option, one loop computes both.
 PROGRAM = """
-import os
-import sys
-
+from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.loop_fusion import join_loops
-
-join_loops(*sys.argv[1:])
+join_loops(EnvConfig(physics="{physics}"))
 import jax
 import jax.numpy as jnp
-
-print("start with", repr(os.environ.get("XLA_FLAGS")), flush=True)
-
-
-def abort(*_, **__):
-    if os.environ.get("XLA_FLAGS"):
-        os.abort()
-
-
-{extra}
 two = jax.jit(lambda x: (jnp.sin(x) * 2.0, jnp.sin(x) + x))
 print(two.lower(jnp.ones(1000)).compile().as_text())
 """
-# JAX calls these listeners inside its compiler, where XLA may abort too.
-ABORT_IN_COMPILER = "jax.monitoring.register_event_listener(abort)"
 
 
-def run(extra: str = "", *args: str, flags: str | None = None) -> subprocess.CompletedProcess:
-    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
-    if flags is not None:
-        environment["XLA_FLAGS"] = flags
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(extra=extra), *args],
-        env=environment | {"JAX_PLATFORMS": "cpu"}, capture_output=True, text=True,
-    )  # fmt: skip
+@pytest.mark.parametrize("physics", ["auto", "mjx"])
+def test_two_results_of_one_value_share_a_loop_unless_mjx_runs(physics: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(physics=physics)],
+        env=without_flags() | {"JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    joined = re.search(r"= \(.*\) fusion\(", done.stdout) is not None
+    assert joined == (physics == "auto")
 
 
-def is_joined(done: subprocess.CompletedProcess) -> bool:
-    """Whether one loop of the compiled program has several results."""
-    assert done.returncode == 0, done.stderr
-    return re.search(r"= \(.*\) fusion\(", done.stdout) is not None
+def without_flags() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
 
 
-def test_two_results_of_one_value_share_a_loop() -> None:
-    assert is_joined(run())
+@pytest.fixture(scope="module")
+def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped model with an integrator that only MJX has."""
+    path = tmp_path_factory.mktemp("model") / "rk4.xml"
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    changed = text.replace('integrator="implicitfast"', 'integrator="RK4"')
+    assert changed != text
+    path.write_text(changed, encoding="utf-8")
+    return path
 
 
-def test_mjx_and_the_users_flags_have_priority() -> None:
-    assert not is_joined(run("", "mjx"))
-    assert not is_joined(run(flags=""))
+@pytest.mark.parametrize("user", [None, "", "--xla_cpu_enable_fast_math=false"])
+def test_the_engine_decides_unless_the_user_does(rk4: Path, monkeypatch, user: str | None) -> None:
+    def flags(*configs: EnvConfig) -> str | None:
+        monkeypatch.delenv("XLA_FLAGS", raising=False)
+        if user is not None:
+            monkeypatch.setenv("XLA_FLAGS", user)
+        join_loops(*configs)
+        return os.environ.get("XLA_FLAGS")
+
+    fused, chosen = EnvConfig(), EnvConfig(physics="fused")
+    mjx, falls_to_mjx = EnvConfig(physics="mjx"), EnvConfig(mjcf=rk4)
+    for configs in ((fused,), (chosen,), (fused, chosen)):
+        assert flags(*configs) == (OPTION if user is None else user)
+    for configs in ((mjx,), (falls_to_mjx,), (fused, mjx), (chosen, falls_to_mjx)):
+        assert flags(*configs) == user
 
 
-def test_a_command_starts_again_where_xla_aborts() -> None:
-    done = run(ABORT_IN_COMPILER)
-    assert not is_joined(done)
-    assert re.findall("start with '(.*)'", done.stdout) == [
-        "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion",
-        "",
-    ]
-    assert "starts again" in done.stderr
+# Ends the command where it would start JAX's devices.
+COMMAND = """
+import os, sys
+import jax
+from jax._src import xla_bridge
+from bounce_mjx.commands.main import main
+def devices(*_, **__):
+    print("flags:", os.environ.get("XLA_FLAGS"), flush=True)
+    os._exit(0)
+xla_bridge.backends = devices
+main(sys.argv[1:])
+"""
 
 
-def test_other_aborts_end_the_process() -> None:
-    done = run("abort()")
-    assert done.returncode < 0
-    assert "starts again" not in done.stderr
+@pytest.mark.parametrize(
+    ("command", "joins"),
+    [
+        ("train", True),
+        ("train --mjcf {rk4}", False),
+        ("train --config {run}/config.yaml", False),
+        ("view --html {run}/page.html --mjcf {rk4}", False),
+        ("play pretrained --html {run}/page.html", True),
+        ("play {run} --html {run}/page.html", False),
+        ("eval pretrained --physics mjx", False),
+        ("robustness pretrained --out {run}", True),
+    ],
+)
+def test_each_command_decides_before_jax_starts_its_devices(
+    command: str, joins: bool, rk4: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(resource_path("pretrained"), run)
+    config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+    config["env"]["physics"] = "mjx"
+    (run / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND, *command.format(rk4=rk4, run=run).split()],
+        env=without_flags(),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert f"flags: {OPTION if joins else None}" in done.stdout, done.stdout + done.stderr
+
+
+def test_the_presets_of_all_machines_have_one_task() -> None:
+    """So the engine is known before it is known whether there is an accelerator."""
+    one, other = (read_preset(default_preset(accelerator)) for accelerator in (True, False))
+    assert one.env == other.env

@@ -33,6 +33,15 @@ REFUSED = {
         '<intvelocity name="act2" joint="Joint2" kp="20000" actrange="-2 2"/>',
         "Joint2",
     ),
+    "pid servo": (SERVO_2, '<pid name="act2" joint="Joint2" kp="20000"/>', "act2.* 2 controls"),
+    "servo that holds half its target": (
+        SERVO_2,
+        '<general name="act2" joint="Joint2" biastype="affine" gainprm="10000" '
+        'biasprm="0 -20000 -200"/>',
+        "Joint2",
+    ),
+    "damping negative": ('armature="0.02"', 'damping="-1"', "-1 in dof_damping"),
+    "armature negative": ('armature="0.02"', 'armature="-0.1"', "-0.1 in dof_armature"),
 }
 
 
@@ -59,6 +68,23 @@ def test_the_model_without_visuals_moves_the_same():
         mujoco.mj_step(model, data, nstep=100)
         after.append(np.concatenate([data.qpos, data.qvel]))
     np.testing.assert_array_equal(*after)
+
+
+def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
+    """MuJoCo refuses to drop such geoms."""
+    text = XML.replace('autolimits="true"', 'inertiafromgeom="true"').replace(' mass="0" ', " ")
+    (tmp_path / "robot.xml").write_text(text)
+    pictured, plain = (load_model(tmp_path / "robot.xml", 0.001, visual=v) for v in (True, False))
+    np.testing.assert_array_equal(plain.body_mass, pictured.body_mass)
+
+
+def test_the_memory_that_a_file_asks_for_is_ignored(tmp_path):
+    """Too little of it ends a step, and too much the process."""
+    for memory in ("1K", "900T"):
+        size = f'<size memory="{memory}" nuser_body="900000000"/><worldbody>'
+        (tmp_path / "robot.xml").write_text(XML.replace("<worldbody>", size))
+        model = load_model(tmp_path / "robot.xml", 0.001)
+        mujoco.mj_step(model, mujoco.MjData(model))
 
 
 def test_an_edited_model_is_an_error():

@@ -1,6 +1,8 @@
 """The wheel: its content, and that it works without a source checkout."""
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -84,6 +86,37 @@ print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.module
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.stdout == "\n", done.stdout + done.stderr
+
+
+def test_no_module_redirects_the_output() -> None:
+    """`sys.stdout` belongs to all threads: two that redirect it at once may not restore it."""
+    found = []
+    for path in (CHECKOUT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = {getattr(node, "id", None), getattr(node, "attr", None)}
+            redirects = not names.isdisjoint({"redirect_stdout", "redirect_stderr"})
+            assigned = isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+            if redirects or (assigned and ast.unparse(node) == "sys.stdout"):
+                found.append(f"{path.name}:{node.lineno}")
+    assert not found
+
+
+@pytest.mark.parametrize("module", ["brax", "sb3", "torch", "playground"])
+def test_a_missing_extra_is_told_in_one_way(module: str) -> None:
+    """To a program as an ImportError, and to the user of a command as one sentence."""
+    script = f"""
+import sys
+for library in ("brax", "torch", "stable_baselines3", "ml_collections"):
+    sys.modules[library] = None
+from bounce_mjx.errors import UserError
+try:
+    import bounce_mjx.adapters.{module}
+except ImportError as error:
+    print(isinstance(error, UserError), error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    sentence = r"True .+ cannot be imported \(.+\); install it with pip install .+\n"
+    assert re.fullmatch(sentence, done.stdout), done.stdout + done.stderr
 
 
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:

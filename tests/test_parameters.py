@@ -231,9 +231,9 @@ def test_paddle_position_follows_its_parameter(mj_model, choice):
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
-    """Free run against C over control steps, in random worlds with friction and filtered servos at
-    their limits."""
-    count, num_substeps = 4, 5
+    """Free run against C over control steps, in random worlds with friction, air drag and filtered
+    servos at their limits."""
+    count, num_substeps, air_drag = 4, 5, 0.2
     model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     assert model.na == 6
     start = bouncing_states(model, np.random.default_rng(1))
@@ -252,7 +252,8 @@ def test_mjx_carries_activations_and_worlds(record_property):
         data.append((c_model, mujoco.MjData(c_model)))
         data[i][1].qpos[:], data[i][1].qvel[:], data[i][1].act[:] = (x[i] for x in state)
     engine = make_engine(model, "mjx")
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), num_substeps)))
+    control = partial(Control, air_drag=air_drag)
+    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
     contacts = 0
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i
@@ -260,6 +261,9 @@ def test_mjx_carries_activations_and_worlds(record_property):
         for j, (c_model, d) in enumerate(data):
             d.ctrl[:] = ctrl[j]
             for _ in range(num_substeps):
+                drag = air_drag * np.linalg.norm(d.qvel[6:9]) * d.qvel[6:9]
+                ball = c_model.body("ball_link")
+                d.xfrc_applied[ball.id, :3] = -ball.mass[0] * drag
                 mujoco.mj_step(c_model, d)
                 contacts += d.ncon
     expected = (np.array([getattr(d, name) for _, d in data]) for name in ("qpos", "qvel", "act"))
@@ -335,8 +339,13 @@ def untrained(networks):
 
 
 def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
-    """C agrees with the fused engine, and not all worlds equal the model's."""
-    config = EnvConfig(episode_seconds=0.3, ball_init_pos=(0.58856, 0.0, 0.1))
+    """C agrees with the fused engine, also on the drag of a bouncing ball, and not all worlds equal
+    the model's."""
+    config = EnvConfig(
+        episode_seconds=0.3,
+        ball_init_pos=(0.58856, 0.0, 0.1),
+        randomization={"air_drag": (5.0, 20.0)},
+    )
     key = jax.random.PRNGKey(0)
     env = BounceBall(config, randomize=heavy_and_light)
     c = make_mujoco_evaluator(env, networks, 6)(untrained, key)

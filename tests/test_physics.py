@@ -1,5 +1,7 @@
 """Physics engines: fused against MuJoCo's C step and against MJX, and the limits of fused."""
 
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -388,6 +390,12 @@ SUPPORTED = {
     "spring": ("<joint ", '<joint stiffness="500" springref="0.3" '),
     "joint force range": ("<joint ", '<joint actuatorfrcrange="-40 60" '),
     "gravity compensation of a link": ('<body name="Link3"', '<body name="Link3" gravcomp="2"'),
+    "gravity compensation of either sign": (
+        ARM_BODY,
+        ARM_BODY.replace('<body name="Link3"', '<body name="Link3" gravcomp="2"').replace(
+            '<body name="Link5"', '<body name="Link5" gravcomp="-1"'
+        ),
+    ),
     "gravity compensation": (ARM_BODY, ARM_BODY.replace("<body ", '<body gravcomp="0.7" ')),
     "gravity compensation by actuators": (
         ARM_BODY,
@@ -421,6 +429,14 @@ SUPPORTED = {
 }
 # Models that move like the shipped one.
 EQUIVALENT = {
+    "negative gravity compensation of a link": (
+        '<body name="Link3"',
+        '<body name="Link3" gravcomp="-1"',
+    ),
+    "negative gravity compensation": (
+        ARM_BODY + BALL_BODY,
+        (ARM_BODY + BALL_BODY).replace("<body ", '<body gravcomp="-1" '),
+    ),
     "static body": ("  </worldbody>", f"{WELDED}</body></worldbody>"),
     "springs disabled": (
         OPTIONS,
@@ -460,9 +476,9 @@ def test_supported_models_step_as_mujoco_does(mj_model, name):
 
 UNSUPPORTED = {
     # edit, required part of the message
-    "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator mjINT_RK4"),
-    "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator mjINT_IMPLICIT"),
-    "discrete": ('integrator="implicitfast"', 'integrator="discrete"', "mjINT_DISCRETE"),
+    "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator rk4 "),
+    "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator implicit "),
+    "discrete": ('integrator="implicitfast"', 'integrator="discrete"', "integrator discrete "),
     "flex": (
         "</worldbody>",
         '</worldbody><deformable><flex name="f" dim="1" body="Link5 Link6" element="0 1"/>'
@@ -492,6 +508,7 @@ UNSUPPORTED = {
     "gap": ("<pair ", '<pair gap="0.001" ', "gap"),
     "adhesion": ("<pair ", '<pair adhesion="1" ', "adhesion"),
     "mixed solref": ('solref="-98696 -31.4"', 'solref="-98696 1"', "solref"),
+    "solref with a zero": ('solref="-98696 -31.4"', 'solref="0.02 0"', "solref"),
     "solimp width": ('solimp="0.95 0.99 0.001"', 'solimp="0.95 0.99 0"', "solimp"),
     "limited": ('limited="false"', 'limited="true"', 'limited="true"'),
     "dry friction of the ball": ("<freejoint ", '<joint type="free" frictionloss="0.1" ', "ball"),
@@ -552,7 +569,8 @@ UNSUPPORTED = {
 # Features that MJX also ignores or refuses.
 UNSUPPORTED_BY_BOTH = (
     *("implicit", "discrete", "density", "viscosity", "wind", "actuator group"),
-    *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solimp width", "flex"),
+    *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solref with a zero"),
+    *("solimp width", "flex"),
     *("stiffness polynomial", "damping polynomial", "ellipsoid ball"),
     *("actuator delay", "actuator damping", "actuator armature"),
 )
@@ -604,6 +622,25 @@ MJX_ONLY = {
         "gaintype affine",
     ),
     "noslip": ("<option ", '<option noslip_iterations="3" ', "noslip_iterations"),
+    "solref of a joint limit": (
+        "<joint ",
+        '<joint solreflimit="0.02 0" ',
+        "solref with exactly one positive number",
+    ),
+    "damping without springs": (
+        OPTIONS,
+        OPTIONS.replace("<flag ", '<flag spring="disable" ').replace(
+            "<joint ", '<joint damping="5" '
+        ),
+        "flag spring or damper",
+    ),
+    "springs without damping": (
+        OPTIONS,
+        OPTIONS.replace("<flag ", '<flag damper="disable" ').replace(
+            "<joint ", '<joint stiffness="500" '
+        ),
+        "flag spring or damper",
+    ),
     "surface velocity": ("<geom contype", '<geom surfacevel="1 0 0 0 0 0" contype', "surfacevel"),
 }
 
@@ -613,6 +650,39 @@ def test_mjx_refuses_features_that_it_ignores(name):
     """The error names the feature."""
     old, new, feature = MJX_ONLY[name]
     with pytest.raises(UserError, match=feature):
+        make_engine(edited(old, new), "mjx")
+
+
+def test_importing_mjx_prints_nothing_and_keeps_the_lines_of_other_threads():
+    program = """
+import threading
+from bounce_mjx.physics import make_engine
+from bounce_mjx.robot.model import load_model
+
+model, imported, lines = load_model(None, 0.001), threading.Event(), []
+
+def talk():
+    while not imported.wait(0.001):
+        lines.append(f"line {len(lines)}")
+        print(lines[-1])
+
+talking = threading.Thread(target=talk)
+talking.start()
+make_engine(model, "mjx")
+imported.set()
+talking.join()
+print(len(lines))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    *lines, count = done.stdout.split("\n")[:-1]
+    assert lines == [f"line {i}" for i in range(int(count))]
+    assert lines
+
+
+def test_mjx_names_features_in_words():
+    """Not with MuJoCo's enumerations."""
+    old, new, _ = UNSUPPORTED["ellipsoid ball"]
+    with pytest.raises(UserError, match=r"MJCF \(ellipsoid, box collisions not implemented\)"):
         make_engine(edited(old, new), "mjx")
 
 

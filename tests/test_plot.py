@@ -5,8 +5,11 @@ import dataclasses
 import importlib.util
 import io
 import json
+import math
+import os
 import re
 import shutil
+import struct
 import sys
 import xml.etree.ElementTree
 from pathlib import Path
@@ -17,6 +20,7 @@ import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
+from tensorboardX.crc32c import crc32c
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import plot as plot_command
@@ -144,6 +148,43 @@ def logged(run: Path, name: str) -> dict[int, float]:
     return {event.step: event.value for event in EventAccumulator(str(file)).Reload().Scalars(name)}
 
 
+def test_a_log_of_any_content_is_read_or_refused(tmp_path: Path) -> None:
+    """Only the figures that are numbers count."""
+    values = {1: 2.0, 2: math.inf, 3: math.nan}
+    scalars = {"episode/return": values, "reward/height": {1: -math.inf}}
+    run = write_run(tmp_path / "run", TrainConfig(), scalars)
+    curves = read_curves(run).curves
+    assert list(curves) == ["episode/return"]
+    assert (curves["episode/return"].steps, curves["episode/return"].values) == ([1], [2.0])
+    (log,) = run.glob("events*")
+    message = b"\xff" * 50
+    size = struct.pack("<Q", len(message))
+    record = size + masked_checksum(size) + message + masked_checksum(message)
+    log.write_bytes(log.read_bytes() + record)
+    with pytest.raises(UserError, match="the TensorBoard log in .*/run is damaged"):
+        read_curves(run)
+    log.unlink()
+    os.mkfifo(log)
+    with pytest.raises(UserError, match="not a regular file; remove it"):
+        read_curves(run)
+    log.unlink()
+    log.touch()
+    os.truncate(log, 2**40)
+    with pytest.raises(UserError, match="longer than 256 MB"):
+        read_curves(run)
+
+
+def masked_checksum(data: bytes) -> bytes:
+    """TensorFlow's checksum of a record's part."""
+    crc = crc32c(data)
+    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
+
+
+def test_a_label_is_not_read_as_a_formula(runs: list[Path]) -> None:
+    (group,) = group_runs(runs[:1])
+    image(curves_figure([group._replace(label=r"robot $\frac$.xml, \$5")]), "svg")
+
+
 def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
     """The band covers the steps that all three seeds reached."""
     seeds = [logged(run, "episode/return") for run in runs[:3]]
@@ -238,8 +279,12 @@ def test_plot_of_one_run(trained: Path, tmp_path: Path, capsys) -> None:
 def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, load_config(trained / "config.yaml").model_copy(update={"seed": 1}))
+    (tmp_path / "p").mkdir()
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "p/curves.svg").symlink_to(tmp_path / "mine")
     plot_command.main([str(trained), str(other), "--formats", "svg", "--out", str(tmp_path / "p")])
     assert {path.name for path in (tmp_path / "p").iterdir()} == {"curves.svg", "rewards.svg"}
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 BAD_PLOTS = {
@@ -306,10 +351,13 @@ def test_training_leaves_a_report(trained: Path) -> None:
 
 
 def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
-    run = shutil.copytree(trained, tmp_path / "run")
+    run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
+    other.write_text("mine")
     (run / "report.html").unlink()
+    (run / "report.html").symlink_to(other)
     report_command.main([str(run)])
     check_report(run)
+    assert other.read_text() == "mine"
     assert capsys.readouterr().out.endswith("run/report.html\n")
 
 

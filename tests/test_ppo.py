@@ -275,6 +275,23 @@ def test_update_uses_the_normalisation_of_the_next_rollout():
     np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
 
 
+def test_the_loss_is_the_only_one(monkeypatch):
+    """A user edits `loss`; nothing else computes it."""
+    plain = ppo.loss
+
+    def of_the_values(ppo, params, samples):
+        total, metrics = plain(ppo, params, samples)
+        return ppo.config.value_cost * metrics["loss/value"], metrics
+
+    monkeypatch.setattr(ppo, "loss", of_the_values)
+    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=2)
+    before = trainer.init(jax.random.key(0))
+    after, _ = jax.jit(lambda state: trainer.run(state, 2))(before)
+    assert_identical(after.params.policy, before.params.policy)
+    changed = jax.tree.map(lambda x, y: np.any(x != y), after.params.value, before.params.value)
+    assert all(jax.tree.leaves(changed))
+
+
 def test_episodes_do_not_all_time_out_together():
     trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1000)
     steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)
@@ -391,6 +408,17 @@ def test_run_returns_the_same_types_as_its_input(trainer, init):
     assert types[0] == types[1]
 
 
+@pytest.mark.usefixtures("float64")
+def test_learning_is_in_float32_with_physics_in_float64(tiny):
+    env = BounceBall()
+    trainer = ppo.make_trainer(tiny, env, env.config.episode_steps)
+    start = jax.eval_shape(trainer.init, jax.random.key(0))
+    state, _ = jax.eval_shape(lambda s: trainer.run(s, 1), start)
+    assert state.env.env.pipeline_state.physics.qpos.dtype == jnp.float64
+    learned = state.params, state.optimizer[1].nu, state.statistics, state.learning_rate
+    assert {x.dtype for x in jax.tree.leaves(learned)} == {jnp.dtype(jnp.float32)}
+
+
 def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
     """The state stays in float32, and the update has the same direction as in float32."""
     config = tiny.model_copy(update={"compute_dtype": "bfloat16"})
@@ -412,19 +440,14 @@ def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
     np.testing.assert_allclose(metrics["loss/value"], reference_metrics["loss/value"], rtol=0.05)
 
 
-def test_hidden_layers_are_cast_and_outputs_not(tiny, env):
-    networks = policy.make_networks(tiny, env.observation_size, env.action_size)
-    for network, output in (
-        (networks.policy_network, "Dense_0"),
-        (networks.value_network, "hidden_1"),
-    ):
+def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
+    sizes = env.observation_size, env.action_size
+    for network in policy.make_networks(tiny, *sizes, dtype="bfloat16"):
         params = network.init(jax.random.PRNGKey(0))
-        cast = policy.cast_hidden_layers(tiny, params, jnp.bfloat16)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(cast):
-            name = jax.tree_util.keystr(path)
-            hidden = "hidden_0" in name
-            assert leaf.dtype == (jnp.bfloat16 if hidden else jnp.float32), name
-        assert output in str(jax.tree_util.tree_structure(cast))
+        assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype(jnp.float32)}
+        program = jax.make_jaxpr(network.apply)(params, jnp.zeros((1, env.observation_size)))
+        products = [e for e in program.eqns if e.primitive.name == "dot_general"]
+        assert [e.outvars[0].aval.dtype for e in products] == [jnp.bfloat16, jnp.float32]
 
 
 def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
@@ -462,6 +485,18 @@ def test_random_orders_are_uniform(size):
         # Neighbours are independent: the second is larger than the first in half of the orders.
         rises = np.mean(orders[:, 1:] > orders[:, :-1], axis=0)
         assert np.abs(rises - 0.5).max() <= 5 * 0.5 / np.sqrt(2000)
+
+
+def test_equal_random_numbers_leave_a_long_order_random():
+    """With 18 random bits, 512 pairs of neighbours would have equal numbers, and the smaller index
+    first."""
+    size, count = 2**14, 20
+    keys = jax.random.split(jax.random.PRNGKey(0), count)
+    orders = np.asarray(jax.vmap(lambda key: ppo.random_order(key, size))(keys))
+    np.testing.assert_array_equal(np.sort(orders), np.tile(np.arange(size), (count, 1)))
+    # The variance of the number of rises in a permutation is (size + 1) / 12.
+    rises = np.mean(orders[:, 1:] > orders[:, :-1])
+    assert np.abs(rises - 0.5) <= 5 / np.sqrt(12 * count * size)
 
 
 class FaultyBall(BounceBall):

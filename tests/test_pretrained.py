@@ -1,4 +1,4 @@
-"""The shipped policy: its results, its users, and the command that ships it."""
+"""The shipped policy: its results, its users, and the script that ships it."""
 
 import dataclasses
 import json
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bounce_mjx.commands import ship as ship_command
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
@@ -113,22 +112,31 @@ def test_the_policies_have_names(tmp_path: Path, monkeypatch, console) -> None:
 
 
 @pytest.fixture
-def measure(monkeypatch, measured: Report):
+def ship(monkeypatch):
+    """The module of the script that ships."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+    import ship
+
+    return ship
+
+
+@pytest.fixture
+def measure(monkeypatch, ship, measured: Report):
     """A function (report) that makes `ship` measure this report."""
 
     def replace(report: Report) -> None:
         evaluation = Evaluation(report, "fused", ())
-        monkeypatch.setattr(ship_command, "evaluate_policy", lambda *_, **__: evaluation)
+        monkeypatch.setattr(ship, "evaluate_policy", lambda *_, **__: evaluation)
 
     replace(measured)
     return replace
 
 
 @pytest.mark.slow
-def test_shipping_keeps_the_policy(tmp_path: Path, measure, shipped: dict) -> None:
+def test_shipping_keeps_the_policy(tmp_path: Path, ship, measure, shipped: dict) -> None:
     out = tmp_path / "pretrained"
     for _ in range(2):  # into a new folder, and over an older one
-        ship_command.main([str(FOLDER), "--out", str(out)])
+        ship.main([str(FOLDER), "--out", str(out)])
     assert list(tmp_path.iterdir()) == [out]
     config = load_run_config(out)
     assert config == load_run_config(FOLDER)
@@ -145,22 +153,22 @@ def test_shipping_keeps_the_policy(tmp_path: Path, measure, shipped: dict) -> No
 
 @pytest.mark.slow
 def test_a_policy_that_misses_a_result_is_not_shipped(
-    tmp_path: Path, measure, measured: Report, capsys
+    tmp_path: Path, ship, measure, measured: Report, capsys
 ) -> None:
     first, *rest = measured.results
     missed = dataclasses.replace(first, passed=False)
     measure(dataclasses.replace(measured, results=(missed, *rest)))
     with pytest.raises(SystemExit) as exit_info:
-        ship_command.main([str(FOLDER), "--out", str(tmp_path / "out")])
+        ship.main([str(FOLDER), "--out", str(tmp_path / "out")])
     assert exit_info.value.code == 2
     assert "misses a result" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, capsys) -> None:
+def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, ship, capsys) -> None:
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(SystemExit) as exit_info:
-        ship_command.main([str(FOLDER), "--out", str(tmp_path)])
+        ship.main([str(FOLDER), "--out", str(tmp_path)])
     assert exit_info.value.code == 2
     assert f"--out {tmp_path}" in capsys.readouterr().err
     assert (tmp_path / "mine").read_text() == "mine"

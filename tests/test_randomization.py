@@ -408,15 +408,13 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     after, contacts = [], 0
     for t in range(CONTROL_STEPS):
         asked.append(np.clip(data.qpos[:6] + 0.02 * free_run.actions[t, :, w], low, high))
-        # The drag uses the velocity before the push, and is constant during a control step.
-        velocity = data.qvel[6:9].copy()
-        drag = world["air_drag"] * ball.mass[0] * np.linalg.norm(velocity) * velocity
-        data.xfrc_applied[ball.id, :3] = -drag
         data.qvel[6:9] += free_run.control.ball_push[t, :, w]
         for i in range(10):
             arrived = asked[max(0, (10 * t + i - delay) // 10 + 1)]
             filtered = arrived + (filtered - arrived) * np.exp(-1.0 / max(lag, 1e-3))
             data.ctrl[:] = filtered
+            drag = world["air_drag"] * np.linalg.norm(data.qvel[6:9]) * data.qvel[6:9]
+            data.xfrc_applied[ball.id, :3] = -ball.mass[0] * drag
             mujoco.mj_step(model, data)
             contacts += data.ncon
         after.append((data.qpos.copy(), data.qvel.copy()))

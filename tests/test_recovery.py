@@ -3,6 +3,7 @@ not finite. The resumed training reaches exactly the state of an undisturbed one
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import io
 import json
 import multiprocessing
@@ -16,23 +17,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import Mesh
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboardX import SummaryWriter
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, Result, judge
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -54,10 +55,8 @@ from bounce_mjx.training.command import config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
-from bounce_mjx.training.programs import Programs, kept_programs
-from bounce_mjx.training.setup import imported_modules
-from bounce_mjx.training.signals import StopRequest
 from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
 
@@ -66,27 +65,31 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keeps compiled programs: in this process by config, and for other processes in a cache."""
     kept = {}
 
-    def get_once(
-        programs: Programs,
-        name: str,
-        mesh: Mesh,
-        lower: Callable[[], jax.stages.Lowered],
-        at_once: bool = False,
-    ) -> concurrent.futures.Future:
-        varied = {"total_steps": 0, "eval_every": 0, "log_dir": None}
-        if name != "evaluate":
-            varied["screening_episodes"] = 0
-        key = name, repr(lower.__self__._config.model_copy(update=varied))
+    def once(lower: Callable) -> Callable:
+        """Lowers and compiles only what is new."""
 
-        def program() -> jax.stages.Compiled:
-            if key not in kept:
-                kept[key] = lower().compile()
-            return kept[key]
+        def lower_once(owner: PPOTrainer | Evaluators) -> SimpleNamespace:
+            varied = {"total_steps": 0, "eval_every": 0, "log_dir": None}
+            if isinstance(owner, PPOTrainer):
+                varied["screening_episodes"] = 0
+            key = lower, repr(owner._config.model_copy(update=varied))
 
-        return programs._pool.submit(program)
+            def compile() -> jax.stages.Compiled:
+                if key not in kept:
+                    kept[key] = lower(owner).compile()
+                return kept[key]
+
+            return SimpleNamespace(compile=compile)
+
+        return lower_once
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Programs, "get", get_once)
+        for owner, name in (
+            (PPOTrainer, "_lower_run"),
+            (PPOTrainer, "_lower_init"),
+            (Evaluators, "_lower"),
+        ):
+            patch.setattr(owner, name, once(getattr(owner, name)))
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
@@ -319,7 +322,8 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
         command = train_command.read_command([*flags, "--log-dir", str(tmp_path / name)])
         config, console = config_of(command), Console(file=io.StringIO())
         with contextlib.suppress(training_job.TrainingStopped):
-            training_job.train(config, console, trainer, command="train", report=False, **resumed)
+            options = training_job.Options("train", report=False, **resumed)
+            training_job.train(config, console, trainer, options)
         return next((tmp_path / name).iterdir())
 
     stopped = train("stopped", Stopped)
@@ -332,7 +336,7 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
         "import time\n"
-        "from bounce_mjx.training.signals import StopRequest\n"
+        "from bounce_mjx.interrupt import StopRequest\n"
         "with StopRequest() as stop:\n"
         "    print('ready', flush=True)\n"
         "    while not stop.requested: time.sleep(0.01)\n"
@@ -504,82 +508,62 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
 # Starts
 
 
-COUNTED = """
+# Each factor is read in a way in which a user's own code may read it: the reward's from a file, the
+# action's from the environment, and the loss's from the script itself.
+CHANGED = """
+import os, sys
+from pathlib import Path
 import jax
 from bounce_mjx.commands.train import main
-events, traced = [], []
+from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.task import rewards
+from bounce_mjx.task.env import BounceBall
+events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, _, fun_name="", **__: traced.append(fun_name) if "jaxpr_trace" in event else None
-)
+kind, formula = rewards.TERMS["paddle_home"]
+def from_file(*args):
+    return formula(*args) * float(Path(__file__).with_name("factor").read_text())
+rewards.TERMS["paddle_home"] = rewards.Term(kind, from_file)
+step = BounceBall.step
+def from_variable(self, state, action, *args):
+    return step(self, state, action * float(os.environ["FACTOR"]), *args)
+BounceBall.step = from_variable
+entropy = Gaussian.entropy
+Gaussian.entropy = lambda self: LOSS * entropy(self)
 main()
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
-print("traced:", *sorted({"train_block", "evaluate"} & set(traced)))
 """
 
 
-def test_a_second_start_compiles_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every program of a second start is read from the cache. The training's own programs are not
-    even traced, and train as before; without their files, JAX's cache has them."""
+@pytest.mark.slow
+def test_only_an_equal_training_finds_its_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its second start compiles nothing and trains the same. A change in what a user's code reads
+    trains something else, with the same cache."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
-    script = tmp_path / "counted.py"
-    script.write_text(COUNTED)
-    programs = tmp_path / "cache" / "programs"
+    script = tmp_path / "changed.py"
 
-    def start(name: str) -> tuple[int, int, list[str], dict[str, np.ndarray]]:
-        flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir", tmp_path / name]
+    def start(name: str, **changed: str) -> tuple[int, int, bytes]:
+        factors = {"reward": "1.0", "action": "1.0", "loss": "1.0"} | changed
+        (tmp_path / "factor").write_text(factors["reward"])
+        monkeypatch.setenv("FACTOR", factors["action"])
+        script.write_text(CHANGED.replace("LOSS", factors["loss"]))
+        flags = [*TINY, "--entropy-cost", "0.01", "--total-steps", "64", "--no-report"]
+        flags += ["--log-dir", tmp_path / name]
         with job(tmp_path / f"{name}.log", *flags, script=script) as process:
             assert process.wait() == 0, process.said
         (counts,) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
-        (traced,) = re.findall(r"^traced:(.*)$", process.said, re.MULTILINE)
         (run,) = (tmp_path / name).iterdir()
-        return *map(int, counts), traced.split(), arrays(latest_checkpoint(run))
+        trained = arrays(latest_checkpoint(run))
+        return *map(int, counts), b"".join(trained[key].tobytes() for key in sorted(trained))
 
-    requests, _, traced, trained = start("first")
-    assert traced == ["evaluate", "train_block"]
-    (folder,) = programs.iterdir()
-    assert {path.name for path in folder.iterdir()} == {"train", "init", "evaluate"}
-
-    again, hits, traced, trained_again = start("second")
-    assert again == hits == requests - 3 and traced == []
-    np.testing.assert_equal(trained_again, trained)
-
-    # A damaged file, and one that another user may have written, are not read. JAX has both
-    # programs in its own cache.
-    (folder / "train").write_bytes(b"damaged")
-    (folder / "evaluate").chmod(0o666)
-    again, hits, traced, trained_again = start("third")
-    assert again == hits == requests - 1 and traced == ["evaluate", "train_block"]
-    np.testing.assert_equal(trained_again, trained)
-
-
-def test_programs_are_kept_for_equal_trainings_alone(
-    straight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = load_run_config(straight)
-    env, mesh = BounceBall(config.env), make_mesh(1, config.ppo)
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", "train_jax.py", raising=False)
-    monkeypatch.setattr(sys, "argv", ["train_jax.py", "--seed", "1"])
-    modules = imported_modules(["--seed", "1"])
-
-    def folder(config: TrainConfig, modules: Sequence[str] | None = modules) -> Path | None:
-        return kept_programs(config, env.mj_model, mesh, modules)
-
-    same = folder(config)
-    assert same == folder(config.model_copy(update={"seed": 7, "total_steps": 10**6}))
-    larger = config.ppo.model_copy(update={"hidden_layers": (17,)})
-    others = [
-        folder(config.model_copy(update={"ppo": larger})),
-        folder(config.model_copy(update={"block_steps": 128})),
-        # A user's module, which may add a reward term.
-        folder(config, (*modules, "reward.py 120 1")),
-    ]
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-    others.append(folder(config))
-    assert len({same, *others}) == 5
-    # In a notebook or another program, code in memory may differ from its files.
-    assert imported_modules(["--seed", "2"]) is None and folder(config, None) is None
+    _, _, trained = start("first")
+    requests, hits, again = start("second")
+    assert hits == requests > 0 and again == trained
+    for changed in ("reward", "action", "loss"):
+        assert start(changed, **{changed: "0.5"})[2] != trained
 
 
 def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
@@ -589,7 +573,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     env, policy = BounceBall(config.env), load_policy(best_checkpoint(straight), config)
     with concurrent.futures.ThreadPoolExecutor() as pool:
         chunked, whole = (
-            Evaluators(each, env, make_mesh(1, config.ppo), Programs(pool))
+            Evaluators(each, env, make_mesh(1, config.ppo), pool)
             for each in (config, config.model_copy(update={"screening_episodes": 0}))
         )
     (expected,) = whole.final(policy)
@@ -628,14 +612,56 @@ def test_a_screening_is_never_better_than_a_full_evaluation() -> None:
         return Report((result,), details, screening=screening)
 
     progress = Progress()
-    assert progress.improves(report(False, 5.0, True), 1)
-    assert progress.improves(report(False, 1.0, False), 2)
-    assert not progress.improves(report(False, 9.0, True), 3)
+    assert progress.improves(report(False, 5.0, True), 1, 0.0)
+    assert progress.improves(report(False, 1.0, False), 2, 0.0)
+    assert not progress.improves(report(False, 9.0, True), 3, 0.0)
     stored = Progress.from_dict(
         json.loads(json.dumps(progress.model_dump())) | {"best": None}, Path()
     )
     assert progress.best_steps == 2
     assert [e.screening for e in stored.evaluations] == [True, False, True]
+
+
+def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path, monkeypatch) -> None:
+    """It tells the first evaluation that met all results, and the end."""
+    margins = iter([None, 0.5, 1.0])
+    select = Evaluators.select
+
+    def passing(evaluators: Evaluators, policy) -> list[Report]:
+        margin = next(margins)
+        (report,) = select(evaluators, policy)
+        met = {"passed": margin is not None, "margin": margin}
+        results = tuple(dataclasses.replace(result, **met) for result in report.results)
+        return [dataclasses.replace(report, results=results)]
+
+    monkeypatch.setattr(Evaluators, "select", passing)
+    run = train(tmp_path, STEPS, "--eval-every", "64", "--stop-when-solved")
+    results = json.loads((run / "results.json").read_text())
+    steps = [results[name] for name in ("solved_steps", "margin_steps", "trained_steps")]
+    assert steps == [128, 192, 192]
+    assert 0.0 < results["solved_seconds"] < sum(results["seconds"].values())
+    assert best_checkpoint(run).steps == 192
+
+
+@pytest.mark.parametrize(
+    ("evaluations", "solved"),
+    [
+        ([(64, None)], False),
+        ([(64, None), (128, 1.0)], True),
+        ([(128, 0.5)], False),
+        # Half as many steps again.
+        ([(128, 0.5), (191, 0.5)], False),
+        ([(128, 0.5), (192, 0.5)], True),
+        ([(128, 0.5), (192, None)], True),
+        ([(128, 0.5), (160, 1.0)], True),
+    ],
+)
+def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -> None:
+    progress = Progress()
+    for steps, margin in evaluations:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
+        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
+    assert progress.solved is solved
 
 
 @pytest.mark.parametrize(
@@ -662,7 +688,8 @@ def solved(run: Path) -> Path:
     """A run of 128 steps that ended because it met all results."""
     for path in [run / "results.json", *run.glob("checkpoints/*/128/run.json")]:
         plain = json.loads(path.read_text())
-        (plain if path.name == "results.json" else plain["progress"])["solved_steps"] = 128
+        progress = plain if path.name == "results.json" else plain["progress"]
+        progress |= {"solved_steps": 128, "margin_steps": 128}
         if path.name == "run.json":
             plain["config"] |= {"stop_when_solved": True, "total_steps": 10**6}
         path.write_text(json.dumps(plain))
@@ -700,13 +727,16 @@ def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> No
 
     def save_and_look(writer, names, steps, *rest, **named):
         if "latest" in names:
-            points = EventAccumulator(str(run)).Reload().Scalars("loss/value")
-            logged.append((steps, points[-1].step))
+            log = EventAccumulator(str(run)).Reload()
+            scalars = [log.Scalars(tag) for tag in ("loss/value", "results/mean_length_s")]
+            # The last that an evaluation adds.
+            points = [*scalars, log.Tensors("results/text_summary")]
+            logged.append((steps, *(tag[-1].step for tag in points)))
         save(writer, names, steps, *rest, **named)
 
     monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
     resume(run, "--total-steps", str(2 * STEPS))
-    assert logged == [(256, 256), (384, 384), (512, 512)]
+    assert logged == [(steps,) * 4 for steps in (256, 384, 512)]
 
 
 # Full disks
@@ -790,7 +820,7 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
         said.append(line)
         os.kill(os.getpid(), signal.SIGINT)
 
-    log = SummaryWriter(tmp_path)
+    log = open_log(tmp_path)
     reporter = Reporter(lambda: [log], Console(file=io.StringIO()), TrainConfig(), 0)
     monkeypatch.setattr(reporter, "say", say)
     writer = CheckpointWriter(blocked, TrainConfig())

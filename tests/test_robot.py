@@ -1,7 +1,9 @@
 """Adoption of arms: unsuitable models are refused in one sentence, suitable ones become the task's
 scene with a level paddle and stable servos."""
 
+import os
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -19,7 +21,7 @@ from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt
-from bounce_mjx.robot.arm import compile_spec, locate
+from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
@@ -147,7 +149,46 @@ BROKEN = {
     "text": ("hello", "tool", "does not compile", "correct it"),
     "massless link": (ARM.replace('mass="0.5"', 'mass="0"'), "tool", "does not compile", "mass"),
     "nan": (ARM.replace('pos="0 0 0.2"', 'pos="0 0 nan"'), "tool", "nan in body_pos"),
-    "empty": (mjcf("", ""), "tool", "no site or body named tool", "none"),
+    "empty": (mjcf("", ""), "tool", "no site or body named tool", "beyond at least 3 joints"),
+    "wrong site of many": (
+        mjcf(
+            "".join(f'<site name="mark{i}"/>' for i in range(20))
+            + arm(tip='<site name="flange"/>'),
+            motors(ARM_JOINTS),
+        ),
+        "attachment_site",
+        "one of the sites (tool, flange) or bodies",
+    ),
+    "site too low": (
+        mjcf('<site name="base"/>' + arm(), motors(ARM_JOINTS)),
+        "base",
+        "too few joints",
+        "one of the sites (tool)",
+    ),
+    "negative damping": (
+        ARM.replace('damping="0.1"', 'damping="-0.1"', 1),
+        "tool",
+        "-0.1 in dof_damping",
+    ),
+    "many bodies": (
+        mjcf(
+            arm() + '<replicate count="50"><replicate count="100"><body><geom size=".1"/></body>'
+            "</replicate></replicate>",
+            motors(ARM_JOINTS),
+        ),
+        "tool",
+        "10012 bodies and geoms",
+    ),
+    "device for a mesh": (
+        mjcf(arm(), motors(ARM_JOINTS), assets='<asset><mesh name="m" file="/dev/null"/></asset>'),
+        "tool",
+        "/dev/null, which is a pipe, a device",
+    ),
+    "device for an included file": (
+        mjcf(arm(), motors(ARM_JOINTS), '<include file="/dev/null"/>'),
+        "tool",
+        "/dev/null, which is a pipe, a device",
+    ),
 }
 
 
@@ -175,6 +216,13 @@ def test_a_file_of_a_package_is_found_by_name() -> None:
         locate(Path("package:no_such_arm/arm.xml"))
     with pytest.raises(UserError, match="gone.xml does not exist"):
         locate(Path("package:bounce_mjx/gone.xml"))
+
+
+def test_a_folder_or_a_pipe_is_no_mjcf_file(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe.xml")
+    for path in (tmp_path, tmp_path / "pipe.xml"):
+        with pytest.raises(UserError, match=f"{path} is no file; give the path"):
+            locate(path)
 
 
 # Adopted arms
@@ -303,6 +351,149 @@ def test_the_small_arm_has_servos_instead_of_motors(written) -> None:
     # Critical damping at 1 / control_dt: kp = kv^2 / (4 M), with kv = 2 M / control_dt.
     kp, kv = (np.array(values["robot"][f"servo_{key}"]) for key in ("stiffness", "damping"))
     np.testing.assert_allclose(kp / kv, 50.0, rtol=1e-3)
+
+
+# Models in other people's styles, as MuJoCo compiles them
+
+
+def styled(compiler: str = "", servo: str = 'kv="20"', names: str = "abcde") -> str:
+    """An arm in degrees with classes; each link has a shape that touches and one for pictures, and
+    the last joint has a range, but no limit."""
+    body = '<site name="tool" pos="0 0 0.1"/>'
+    axes = "0 0 1", "0 1 0", "0 1 0", "0 1 0", "1 0 0"
+    for name, axis in reversed([*zip(names, axes, strict=True)]):
+        own = 'range="-90 120" ref="10" springref="20" stiffness="3"' if name == "b" else ""
+        own = 'limited="false"' if name == "e" else own
+        body = (
+            f'<body pos="0 0 {0.2 if name == "a" else 0.3}" euler="0 0 {5 if name == "d" else 0}">'
+            f'<joint name="{name}" axis="{axis}" {own}/><geom class="touching"/>'
+            f'<geom class="pictured"/>{body}</body>'
+        )
+    servos = "".join(f'<position name="{name}" joint="{name}"/>' for name in names)
+    return (
+        f'<mujoco><compiler {compiler}/><default><joint limited="true" range="-170 170" '
+        'damping="0.1" armature="0.01"/><default class="touching"><geom type="capsule" '
+        'fromto="0 0 0 0 0 0.3" size="0.03" group="1"/></default><default class="pictured"><geom '
+        'type="box" size="0.03 0.04 0.05" pos="0.01 0 0.1" contype="0" conaffinity="0" group="2"/>'
+        f'</default><position kp="300" {servo} forcelimited="true" forcerange="-90 90"/></default>'
+        f'<worldbody><body childclass="main">{body}</body></worldbody><actuator>{servos}'
+        "</actuator></mujoco>"
+    ).replace(' childclass="main"', "")
+
+
+STYLES = {
+    "degrees": styled(),
+    "radians": styled('angle="radian"').replace("-170 170", "-3 3").replace("-90 120", "-1.6 2"),
+    "autolimits false": styled('autolimits="false"'),
+    "total mass": styled('settotalmass="7" boundmass="0.1" boundinertia="0.01"'),
+    "shapes that touch": styled('inertiagrouprange="1 1"'),
+    "shapes for pictures": styled('inertiagrouprange="2 2"'),
+    "inertia from geoms": styled('inertiafromgeom="true"'),
+    "pictures discarded": styled('discardvisual="true"'),
+    "welded bodies fused": styled('fusestatic="true"'),
+    "damping ratio": styled(servo='dampratio="1"'),
+    "rotor": styled(servo='kv="20" armature="0.2" damping="0.3"'),
+    "inherited range": styled(servo='kv="20" inheritrange="1"').replace('limited="false"', ""),
+    "spring and damper": styled().replace('stiffness="3"', 'springdamper="0.5 1"'),
+}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
+    """Limits, inertia, springs and servos are those of the file compiled as it is, to the limit of
+    a paddle without mass; also without the geoms that only pictures need."""
+    path, names = tmp_path / "arm.xml", "abcde"
+    path.write_text(STYLES[style])
+    config = RobotConfig.model_validate({"site": "tool", "paddle": {"mass": 1e-12}})
+    found = build_arm(path, config)
+    found.spec.compiler.discardvisual = True
+    model, plain = compile_spec(found.spec, path), compile_spec(read_spec(path), path)
+    limits, expected = (np.array([m.joint(n).range for n in names]) for m in (model, plain))
+    limited = plain.jnt_limited.astype(bool)
+    np.testing.assert_allclose(limits[limited], expected[limited])
+    assert not np.any(limits[~limited]) and not np.any(model.jnt_limited)
+    ignored = any("ignored the range of e" in change for change in found.changes)
+    assert ignored == (not limited[4])
+
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-0.8, 0.8, (3, 5)), rng.uniform(-1.0, 1.0, (3, 5))
+    for qpos, qvel in zip(*states, strict=True):
+        accelerations = []
+        for m in (model, plain):
+            data = mujoco.MjData(m)
+            for i, name in enumerate(names):
+                data.joint(name).qpos[0], data.joint(name).qvel[0] = qpos[i], qvel[i]
+                data.actuator(name).ctrl[0] = qpos[i] + 0.01
+            m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+            mujoco.mj_forward(m, data)
+            accelerations.append([data.joint(name).qacc[0] for name in names])
+        np.testing.assert_allclose(*accelerations, rtol=1e-7)
+
+
+def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
+    """By the noise of a reset at least; of an arm in degrees, and of one that turns one way."""
+    (tmp_path / "degrees.xml").write_text(styled())
+    (tmp_path / "one_way.xml").write_text(mjcf(arm(limits="0 3"), motors(ARM_JOINTS)))
+    for name in ("degrees", "one_way"):
+        path = tmp_path / f"{name}.xml"
+        pose = adopt(path, RobotConfig(site="tool"), 0.01, is_mount_given=False).pose
+        plain = mujoco.MjModel.from_xml_path(str(path))
+        low, high = plain.jnt_range[plain.jnt_limited == 1].T
+        angles = np.array(pose.angles)[plain.jnt_limited == 1]
+        noise = EnvConfig().joint_angle_noise - 1e-9
+        assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
+
+
+def test_the_start_pose_follows_the_height_of_the_base(tmp_path) -> None:
+    """Far above the floor an arm finds the same posture at every height."""
+    poses = []
+    for height in (1.0, 2.0):
+        (tmp_path / "arm.xml").write_text(mjcf(arm(base=f"0 0 {height}"), motors(ARM_JOINTS)))
+        poses.append(adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, False).pose)
+    np.testing.assert_allclose(poses[0].angles, poses[1].angles, atol=1e-6)
+
+
+def test_a_joint_with_a_pid_actuator_gets_a_servo(tmp_path) -> None:
+    """A <pid> has several controls, which shift those of the motors after it."""
+    pid = '<pid joint="j1" kp="10" forcerange="-70 70"/>'
+    (tmp_path / "arm.xml").write_text(mjcf(arm(), pid + motors(ARM_JOINTS[3:], 50.0)))
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
+    assert [servo.force_limit for servo in found.servos] == [70.0] + [50.0] * 5
+
+
+def test_lines_about_an_adopted_arm_are_words(tmp_path) -> None:
+    """Servos without damping or limits, on an arm with lights and constraints."""
+    world = '<light/><camera/><body name="post"><geom size=".1"/></body>' + arm()
+    servos = "".join(f'<position joint="{name}" kp="4000"/>' for name in ARM_JOINTS.split())
+    joined = '<connect body1="world" body2="post" anchor="0 0 0"/>'
+    text = mjcf(world, servos, f"<equality>{5 * joined}</equality>")
+    (tmp_path / "arm.xml").write_text(text.replace('damping="0.1"', 'damping="200"'))
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
+    lines = "\n".join(adopt_command.described(found))
+    assert "strength: no force limit" in lines and "inf" not in lines.replace("inertia", "")
+    assert found.are_kept and "kv 0," in lines
+    assert "removed the lights and cameras (2)" in lines
+    assert "removed the equality constraints (5)" in lines
+
+
+def test_a_name_with_a_line_break_stays_in_the_configs_comment(tmp_path) -> None:
+    mjcf_file = tmp_path / "my\narm.xml"
+    mjcf_file.write_text(ARM)
+    out = tmp_path / "arm.yaml"
+    adopt_command.main([str(mjcf_file), "--site", "tool", "--out", str(out), "--no-view"])
+    assert load_config(out).env.mjcf == mjcf_file
+
+
+def test_compiling_leaves_the_standard_output_to_other_threads() -> None:
+    """A redirection belongs to the process: the lines of other threads would be lost."""
+    outputs = []
+
+    class Spec:
+        def compile(self) -> None:
+            outputs.append(sys.stdout)
+
+    compile_spec(Spec(), Path("arm.xml"))
+    assert outputs == [sys.stdout]
 
 
 LIFT = link(

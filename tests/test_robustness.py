@@ -21,6 +21,7 @@ from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.reports.figures import image
 from bounce_mjx.reports.page import write_report
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure, robustness_table
 from bounce_mjx.resources import resource_path
@@ -98,6 +99,25 @@ def test_settings_change_the_task_and_drop_the_training_world(tmp_path: Path) ->
     assert (slow.env.control_dt, slow.env.observation.velocity) == (0.02, "differences")
     assert (slow.env.action_scale, slow.env.randomization.terms) == (0.03, ())
     assert not slow.trained
+
+
+def test_a_list_and_a_group_are_settings_too(tmp_path: Path) -> None:
+    one, other = suite(
+        tmp_path,
+        dict(
+            name="dropped",
+            unit="cm",
+            strengths=[50, 60],
+            settings={
+                "ball_init_pos": [0.6, 0.0, "strength"],
+                "reward": {"target_y": "-strength", "target_x": 0.6},
+            },
+        ),
+    )
+    assert one.env.ball_init_pos == (0.6, 0.0, 0.5) and other.env.ball_init_pos == (0.6, 0.0, 0.6)
+    assert (one.env.reward.target_x, one.env.reward.target_y) == (0.6, -0.5)
+    with pytest.raises(UserError, match="ball_init_pos is .*, but must"):
+        suite(tmp_path, dict(name="short", settings={"ball_init_pos": [0.6]}))
 
 
 def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
@@ -402,10 +422,15 @@ def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
 
 def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
+    out, mine = tmp_path / "robustness", tmp_path / "mine"
+    out.mkdir()
+    mine.write_text("mine")
+    for suffix in ("json", "png", "svg"):
+        (out / f"robustness.{suffix}").symlink_to(mine)
     with pytest.raises(SystemExit) as exit_info:
         robustness_command.main(["--episodes", "4", "--seed", "3"])
     assert exit_info.value.code == 1
-    out = tmp_path / "robustness"
+    assert mine.read_text() == "mine"
     assert {p.name for p in out.iterdir()} == {f"robustness.{s}" for s in ("json", "png", "svg")}
     written = load_robustness(out)
     assert written.outcomes == measured.outcomes
@@ -417,6 +442,30 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
         robustness_command.main(["--out", str(tmp_path / "other")])
     assert exit_info.value.code == 0
     assert json.loads((tmp_path / "other" / "robustness.json").read_text())["outcomes"]
+
+
+CRAFTED_OUTCOMES = {
+    "no outcomes": None,
+    "unknown engine": {"physics": "other"},
+    "no results": {"values": {}},
+}
+
+
+@pytest.mark.parametrize("change", CRAFTED_OUTCOMES.values(), ids=CRAFTED_OUTCOMES)
+def test_a_crafted_report_is_refused(report: RobustnessReport, tmp_path: Path, change) -> None:
+    plain = report.model_dump()
+    plain["outcomes"] = [] if change is None else [plain["outcomes"][0] | change]
+    (tmp_path / "robustness.json").write_text(json.dumps(plain))
+    with pytest.raises(UserError, match="robustness.json cannot be read"):
+        load_robustness(tmp_path)
+
+
+def test_names_are_not_read_as_formulas(report: RobustnessReport) -> None:
+    name = r"$\frac$, \$5"
+    changes = {"perturbation": name, "group": name, "unit": name}
+    outcomes = [outcome.model_copy(update=changes) for outcome in report.outcomes]
+    outcomes[0].values["stable"] = None
+    image(robustness_figure(report.model_copy(update={"outcomes": outcomes})), "svg")
 
 
 def test_command_does_not_begin_what_it_cannot_write(tmp_path: Path, capsys) -> None:

@@ -6,8 +6,11 @@ import json
 import math
 import os
 import re
+import shlex
 import shutil
 import threading
+import types
+from datetime import datetime
 from pathlib import Path
 
 import jax
@@ -27,17 +30,22 @@ from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config, read_preset
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
+    Checkpoint,
     best_checkpoint,
+    check_links,
     choose_checkpoint,
     create_run,
     find_checkpoint,
     latest_checkpoint,
     named_run,
+    newest_run,
     pretrained_checkpoint,
+    runs_of_seeds,
     save_config,
 )
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.training import job
 from tiny_runs import contents
 
 PRETRAINED = resource_path("pretrained")
@@ -57,7 +65,7 @@ def results_of(progress: Progress) -> dict:
 @pytest.fixture
 def progress() -> Progress:
     progress = Progress()
-    assert progress.improves(report_of([1.0, 2.0, None, 4.0, 5.0]), 64)
+    assert progress.improves(report_of([1.0, 2.0, None, 4.0, 5.0]), 64, 0.0)
     return progress
 
 
@@ -124,10 +132,86 @@ def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     assert named_run(Path("latest"), runs) == Path("latest")
 
 
+def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
+    """Time stamps count, whatever the copy's number or the words beside them; a run without one
+    counts from the writing of its config."""
+    stamps = "2026-01-02_10-00-00", "2026-01-02_10-00-00_2", "2026-01-02_10-00-00_10"
+    names = ["zebra", "2026-01-01_10-00-00", *stamps, "apple", "2026-01-04_10-00-00 long"]
+    times = {"zebra": datetime(2025, 12, 31), "apple": datetime(2026, 1, 3)}
+    for name in sorted(names):
+        (tmp_path / name / "checkpoints/best/64").mkdir(parents=True)
+        save_config(tmp_path / name, TrainConfig())
+        time = times.get(name, datetime(2030, 1, 1)).timestamp()
+        os.utime(tmp_path / name / "config.yaml", (time, time))
+    while names:
+        assert newest_run(tmp_path).name == names.pop()
+        shutil.rmtree(newest_run(tmp_path))
+
+
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
     for find in (latest_checkpoint, best_checkpoint, find_checkpoint):
         with pytest.raises(UserError, match="2026-01-03 holds no checkpoint, as the first one"):
             find(runs / "2026-01-03")
+
+
+# Runs from someone else
+
+
+@pytest.mark.parametrize(
+    "place", ["checkpoints", "checkpoints/latest", "checkpoints/best/9.partial", "seed_000", "log"]
+)
+def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys) -> None:
+    """It would write there, and remove the folders that look like checkpoints."""
+    run, other = runs / "2026-01-02", runs.parent / f"other {runs.name}"
+    shutil.copytree(run / "checkpoints", other)
+    before = contents(other)
+    shutil.rmtree(run / place, ignore_errors=True)
+    (run / place).parent.mkdir(exist_ok=True)
+    (run / place).symlink_to(other)
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--resume", str(run)])
+    assert exit_info.value.code == 2
+    assert f"error: {run}/{place} is a link, and a training" in capsys.readouterr().err
+    assert contents(other) == before
+
+
+def test_links_of_weights_and_biases_do_not_count(runs: Path) -> None:
+    (runs / "2026-01-02/wandb").mkdir()
+    (runs / "2026-01-02/wandb/latest-run").symlink_to("run-1")
+    check_links(runs / "2026-01-02")
+    # The newest run may lie behind a link of the user's.
+    (runs / "link").symlink_to("2026-01-02")
+    check_links(runs / "link")
+
+
+@pytest.mark.parametrize("library", ["x; touch pwned", "$(touch pwned)", "a b", "'", "x" * 9999])
+def test_the_library_of_a_run_is_one_word_of_the_command(
+    library: str, tmp_path: Path, monkeypatch
+) -> None:
+    record = types.SimpleNamespace(progress={"library": library})
+    monkeypatch.setattr(job, "read_record", lambda _: record)
+    with pytest.raises(UserError) as error_info:
+        job.check_library(Checkpoint(tmp_path, tmp_path, 64), "jax")
+    command = shlex.split(str(error_info.value).split("go on with: ")[1])
+    assert command[:3] == ["bounce-mjx", "train-torch", "--library"]
+    assert command[3][:90] == library[:90] and command[4:] == ["--resume", str(tmp_path)]
+    assert len(str(error_info.value)) < 1000
+
+
+def test_a_name_that_a_terminal_would_obey_is_not_printed(runs: Path, capsys) -> None:
+    bad = runs / "2026-01-04\x1b]0;title\x07"
+    shutil.copytree(runs / "2026-01-02", bad)
+    assert choose_checkpoint(None, runs, Console()).run == runs / "2026-01-02"
+    assert "\x1b" not in capsys.readouterr().out
+    with pytest.raises(UserError, match="has a control character in its name; rename it"):
+        find_checkpoint(bad)
+    run = runs / "2026-01-03"
+    for name in ("seed_\x1b[31m", "seed_001\n"):
+        shutil.copytree(runs / "2026-01-01", run / name)
+    (run / "seed_002").symlink_to(runs / "2026-01-01")
+    assert runs_of_seeds(run) == [run]
+    shutil.copytree(runs / "2026-01-01", run / "seed_1234")
+    assert runs_of_seeds(run) == [run / "seed_1234"]
 
 
 # The robot of a run
@@ -285,6 +369,15 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
             load_config(path)
 
 
+def test_a_config_of_an_older_version_may_name_its_network(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("ppo: {network: mlp, gru_size: 64, num_envs: 8}")
+    assert load_config(file) == TrainConfig(ppo={"num_envs": 8})
+    file.write_text("ppo: {network: gru, gru_size: 64}")
+    with pytest.raises(UserError, match="network is gru, .* no recurrent policies; train a policy"):
+        load_config(file)
+
+
 def test_pipe_in_place_of_a_config_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "my.yaml")
     with pytest.raises(UserError, match="my.yaml cannot be read .it is not a regular file"):
@@ -326,7 +419,7 @@ def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> No
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
 
-    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128)
+    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128, 0.0)
     text = to_json(results_of(progress) | {"numpy": np.float64(math.nan), "tuple": (math.nan, 1)})
     plain = json.loads(text, parse_constant=refuse)
     assert [plain["evaluations"][1][name] for name in NAMES] == [None, None, None, None, 5.0]
@@ -388,6 +481,13 @@ def test_commands_say_which_results_are_bad(tmp_path: Path, main, capsys) -> Non
         main([str(tmp_path)])
     assert exit_info.value.code == 2
     assert capsys.readouterr().err.startswith(f"error: {seed}/results.json is damaged (")
+
+
+def test_many_small_values_take_no_memory(tmp_path: Path, progress: Progress) -> None:
+    plain = results_of(progress) | {"other": [[]] * 1_000_000}
+    (tmp_path / "results.json").write_text(json.dumps(plain))
+    with pytest.raises(UserError, match="results.json holds more than 2,000,000 values"):
+        load_results(tmp_path)
 
 
 BAD_PROGRESS = {

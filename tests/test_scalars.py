@@ -59,6 +59,37 @@ def test_scalars_give_the_arrays(function):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
 
 
+def test_rewritten_operations_are_jax_numpys_at_special_numbers():
+    """In one kernel, run by the interpreter, over all pairs of numbers."""
+
+    def function(x, y):
+        return {
+            "clamp": jax.lax.clamp(y, x, 1.5),
+            "copy": jnp.copy(x),
+            "floor": jnp.floor(x),
+            "is_finite": jnp.isfinite(x),
+            "log1p": jnp.log1p(x),
+            "logistic": jax.lax.logistic(x),
+            "pow": jnp.power(x, y),
+            "pow of a whole number": jax.lax.pow(x, jax.lax.convert_element_type(y, jnp.int32)),
+            "sqrt": jnp.sqrt(x),
+            "stop_gradient": jax.lax.stop_gradient(x),
+        }
+
+    positive = jnp.array([0.0, 1e-9, 1e-4, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 1e9, jnp.inf])
+    numbers = jnp.concatenate([positive, -positive, jnp.array([jnp.nan])])
+    pairs = [grid.ravel() for grid in jnp.meshgrid(numbers, numbers)]
+    in_kernel = jax.jit(jax.vmap(elementwise.in_one_kernel(function, interpret=True)))
+    assert "pallas_call" in str(in_kernel.trace(*pairs).jaxpr)
+    expected = jax.vmap(function)(*pairs)
+    for name, found in in_kernel(*pairs).items():
+        np.testing.assert_allclose(found, expected[name], rtol=1e-5, err_msg=name)
+        if found.dtype == jnp.float32:
+            number = ~np.isnan(expected[name])
+            signs = (np.signbit(x)[number] for x in (found, expected[name]))
+            np.testing.assert_array_equal(*signs, err_msg=name)
+
+
 def test_equal_entries_are_one_scalar_and_unused_ones_are_marked():
     shape = jax.ShapeDtypeStruct((3,), jnp.float32)
     scalar_function = as_scalars(lambda x, y: [x, jnp.stack([x[2], x[0]]), x[0] + 1.0], [shape] * 2)
@@ -146,9 +177,10 @@ def test_a_loop_unpacks_the_rows_of_its_steps(monkeypatch):
         "int": jnp.arange(15, dtype=jnp.int32).reshape(3, 5),
         "bool": jnp.arange(15).reshape(3, 5) % 4 == 0,
     }
-    assert rows.pack_steps(tree) is tree
+    assert rows.pack_steps(tree, 1) is tree
     monkeypatch.setattr(rows, "has_kernels", lambda: True)
-    packed = rows.pack_steps(tree)
+    assert rows.pack_steps(tree, 2) is tree
+    packed = rows.pack_steps(tree, 1)
     assert packed.rows.shape == (3, 20)
     _, steps = jax.lax.scan(lambda carry, step: (carry, rows.unpack(step)), 0, packed)
     for name, expected in tree.items():

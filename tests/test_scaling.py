@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
@@ -37,7 +38,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.training import devices, hosts, setup
 from bounce_mjx.training.peers import Peers
 from bounce_mjx.training.ppo_trainer import PPOTrainer
-from tiny_runs import STEPS, TINY, arrays, job
+from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job
 
 # As many environments as eight devices can share.
 SHARED = [*TINY, "--num-envs", "16", "--total-steps", str(2 * STEPS), "--no-report"]
@@ -262,7 +263,7 @@ if sys.argv[1] == "kernel":
 # No other size of the program is a multiple of 104.
 config = PPOConfig(num_envs=104, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
 env = BounceBall()
-trainer = ppo.make_trainer(config, env, 100)
+trainer = ppo.make_trainer(config, env, 100, num_devices=8)
 mesh = devices.make_mesh(8, config)
 shapes = jax.eval_shape(trainer.init, jax.random.PRNGKey(0))
 sharding = devices.state_sharding(mesh, shapes)
@@ -460,6 +461,111 @@ def test_a_stranger_cannot_join_the_training():
 )
 def test_hosts_are_joined_for_every_spelling_of_the_flags(flags: str, joined):
     assert train_command._hosts(flags.split()) == joined
+
+
+def two_hosts(tmp_path: Path, *flags: object) -> list[contextlib.AbstractContextManager]:
+    """The jobs of process 0 and process 1 of a training; process 1 gets further flags."""
+    address = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num-processes", 2]
+    shared = [*SHARED, "--log-dir", tmp_path / "runs", *address]
+    return [
+        job(tmp_path / "leader", *shared, "--process-id", 0),
+        job(tmp_path / "follower", *shared, "--process-id", 1, *flags),
+    ]
+
+
+def test_a_host_with_a_wrong_flag_ends_the_others(tmp_path: Path):
+    leading, following = two_hosts(tmp_path, "--sede", 1)
+    with leading as leader, following as follower:
+        assert follower.wait() == leader.wait() == 2
+    assert re.fullmatch(r"error: .*--sede.*\n", follower.said)
+    assert re.fullmatch(
+        r"error: process 1 \(on .+\) of this training has ended or no longer answers; see its "
+        r"output, then start all processes again\n",
+        leader.said,
+    )
+
+
+def test_hosts_with_different_configs_end_with_a_sentence(tmp_path: Path):
+    leading, following = two_hosts(tmp_path, "--seed", 1)
+    with leading as leader, following as follower:
+        assert leader.wait() == follower.wait() == 2
+    sentence = (
+        "error: the processes of this training differ in seed, which is 0 in process 0 and 1 in "
+        "process 1; start all with the same flags\n"
+    )
+    assert leader.said == follower.said == sentence
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "resume", "difference"),
+    [
+        (
+            {"total_steps": 7},
+            None,
+            "total_steps, which is 50000000 in process 0 and 7 in process 2",
+        ),
+        (
+            {"ppo": PPOConfig(hidden_layers=(8,))},
+            None,
+            r"ppo.hidden_layers, which is \[.+\] in process 0 and \[8\] in process 2",
+        ),
+        ({}, Path("/runs/1"), 'resume, which is null in process 0 and "/runs/1" in process 2'),
+        ({"log_dir": Path("elsewhere")}, None, None),
+    ],
+)
+def test_the_setting_in_which_hosts_differ_is_named(
+    changes, resume, difference, monkeypatch: pytest.MonkeyPatch
+):
+    class Exchange:
+        """Processes 0 and 1 agree, and this is process 2."""
+
+        def exchange(self, value):
+            common = TrainConfig().model_dump(mode="json", exclude={"log_dir"}) | {"resume": None}
+            return json.loads(json.dumps([common, common, value]))
+
+    monkeypatch.setattr(hosts, "_peers", Exchange())
+    expected = (
+        pytest.raises(UserError, match=difference) if difference else contextlib.nullcontext()
+    )
+    with expected:
+        hosts.agree(TrainConfig().model_copy(update=changes), resume)
+
+
+JOINED_ONLY = """
+import jax, sys, time
+jax.distributed.initialize(sys.argv[1], 2, 1)
+print("joined", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_ctrl_c_ends_the_wait_for_other_hosts(tmp_path: Path, joined: bool):
+    address = f"127.0.0.1:{free_port()}"
+    flags = ["--coordinator-address", address, "--num-processes", 2, "--process-id", 0]
+    with contextlib.ExitStack() as stack:
+        leader = stack.enter_context(job(tmp_path / "leader", *flags))
+        if joined:
+            # It never connects to the leader.
+            silent = stack.enter_context(job(tmp_path / "silent", address, code=JOINED_ONLY))
+            silent.wait_until_said("joined")
+        else:
+            wait_for_port(address)
+        leader.process.send_signal(signal.SIGINT)
+        assert leader.wait() == 130
+    assert leader.said == ""
+
+
+def wait_for_port(address: str) -> None:
+    """Waits until a process listens at an address."""
+    host, port = address.split(":")
+    deadline = time.monotonic() + TIMEOUT
+    while time.monotonic() < deadline:
+        with contextlib.suppress(OSError), socket.create_connection((host, int(port))):
+            return
+        time.sleep(0.1)
+    pytest.fail(f"nothing listens at {address}")
 
 
 @pytest.mark.parametrize("process_id", [0, 1])

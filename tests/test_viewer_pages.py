@@ -126,10 +126,10 @@ def test_replay_page_moves_and_makes_no_requests(
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, str]]:
-    """`bounce_mjx.play`, without a display and a run, and the address that it prints."""
+    """`bounce-mjx play`, without a display and a run, and the address that it prints."""
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "bounce_mjx.play", "--port", "8230"],
+        [sys.executable, "-u", "-m", "bounce_mjx", "play", "--port", "8230"],
         cwd=tmp_path,
         env=env,
         stdout=subprocess.PIPE,

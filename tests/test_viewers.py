@@ -10,6 +10,9 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.parse
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -28,7 +31,9 @@ from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import play, train, view
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -39,7 +44,6 @@ from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
-    Controller,
     make_policy_controller,
     make_random_controller,
     make_scripted_controller,
@@ -144,12 +148,12 @@ def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording:
 def test_random_actions_are_uniform(env: BounceBall) -> None:
     states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 500))
     control = make_random_controller(env)
-    actions, _ = control.act(None, states, jax.random.PRNGKey(1), ())
+    actions = control(None, states, jax.random.PRNGKey(1))
     assert actions.shape == (env.action_size, 500)
     np.testing.assert_allclose(
         np.quantile(actions, (0.0, 0.25, 0.75, 1.0)), (-1, -0.5, 0.5, 1), atol=0.05
     )
-    assert np.all(control.act(None, states, jax.random.PRNGKey(2), ())[0] != actions)
+    assert np.all(control(None, states, jax.random.PRNGKey(2)) != actions)
 
 
 def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
@@ -201,10 +205,9 @@ def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
 def exchangeable(env: BounceBall) -> Simulation:
     """One robot under a policy that is one constant action for all joints."""
 
-    def control(policy, states, key, memory):
-        return policy + jnp.zeros_like(states.obs[: env.action_size]), memory
+    def controller(policy, states, key):
+        return policy + jnp.zeros_like(states.obs[: env.action_size])
 
-    controller = Controller(control, start_memory=lambda batch: ())
     return Simulation(env, controller, 1, seed=0, policy=np.float32(0.0))
 
 
@@ -436,6 +439,7 @@ class Client:
 
     def __init__(self, address: str):
         protocol = Subprotocol(f"viser-v{viser.__version__}")
+        self.address = address
         self._socket = connect(
             address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None,
             ping_interval=None,
@@ -444,6 +448,7 @@ class Client:
         self._controls: dict[str, str] = {}
         self._labels: list[str] = []
         self.texts: list[str] = []
+        self.values: dict[str, object] = {}
         self.keys: list[str] = []
         self.camera: dict[str, list[float]] = {}
         self.download = b""
@@ -480,6 +485,8 @@ class Client:
                 self.download += message["content"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
+            if "value" in updates:
+                self.values[message["uuid"]] = updates["value"]
             if "text" in updates:
                 self._labels.append(updates["text"])
 
@@ -489,14 +496,17 @@ class Client:
 
     def look(self, position: list[float]) -> None:
         """Reports the client's camera."""
-        vectors = {"look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
-        numbers = {"fov": 1.0, "near": 0.01, "far": 9.0, "image_height": 9, "image_width": 9}
-        pose = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": position}
-        self.send({"type": "ViewerCameraMessage", **pose, **vectors, **numbers})
+        self.send(CAMERA | {"position": position})
 
     def send(self, message: object) -> None:
-        self._socket.send(msgspec.msgpack.encode(message))
+        self.send_bytes(msgspec.msgpack.encode(message))
+
+    def send_bytes(self, data: bytes | str) -> None:
+        self._socket.send(data)
         time.sleep(0.1)
+
+    def close(self) -> None:
+        self._socket.close()
 
 
 def watch(
@@ -528,6 +538,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
             run_browser(
                 simulation, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
                 host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
+                stop=StopRequest(),
             )  # fmt: skip
         except BaseException as error:
             failures.append(error)
@@ -576,33 +587,176 @@ def stands_still(did: dict[str, list]) -> bool:
     return len(did["target"]) == before
 
 
+# Values that the controls do not offer; the last item of each row is one that it offers.
 HOSTILE = {
-    "robots": (0, 40, HUGE, -HUGE, NAN, "many", [1], None),
-    "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", {}),
-    "height, m": (1e9, -1.0, NAN, -INFINITY, "high"),
-    "speed, m/s": (1e9, NAN, INFINITY),
+    "robots": (1e308, -1e308, 40, HUGE, -HUGE, NAN, INFINITY, "many", [1], None, True, 10**18, 2),
+    "speed": (1e9, -1e9, 1e308, NAN, INFINITY, -INFINITY, "fast", {}, b"", 0.5),
+    "height, m": (1e9, -1.0, NAN, -INFINITY, "high", [0.5, 0.6], 0.6),
+    "speed, m/s": (1e9, NAN, INFINITY, None, 1.0),
+    "pause": (1, 0.0, "yes", None, [], NAN, False),
+    "drawn at each reset": (1, "no", {}, True),
+    "reset": ("", 3, None, [], True),
+    "towards": ("sideways", "", 3, None, [], "x" * 2000, "up"),
 }
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [1.0, 0.0, 0.0],
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+} | {"fov": 1.0, "near": 0.01, "far": 9.0, "image_height": 9, "image_width": 9}
+# Messages that a page never sends; most of them are valid for viser.
+FOREIGN = (
+    [1, 2, 3],
+    None,
+    {},
+    {"type": "NoSuchMessage"},
+    {"type": ["GuiUpdateMessage"], "uuid": "a", "updates": {}},
+    {"type": "GuiUpdateMessage", "uuid": ["a"], "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "a"},
+    {"type": "CommandTriggerMessage", "uuid": 3},
+    {"type": "CommandTriggerMessage", "uuid": "a", "more": 1},
+    {"type": "GuiButtonHoldMessage", "uuid": "a", "frequency": "x"},
+    {"type": "GuiFormDirtyMessage", "uuid": "a"},
+    {"type": "FileTransferPart", "transfer_uuid": "a", "part_index": 0, "content": b"a"},
+    {"type": "GetRenderResponseMessage", "payload": b"", "render_uuid": "a"},
+    {"type": "ScenePointerMessage", "event_type": "click"},
+    *(CAMERA | {name: value} for name in list(CAMERA)[1:] for value in (NAN, 1e300, "a", [0, "a"])),
+)
 
 
-def test_no_client_can_end_or_stall_the_server(page) -> None:
+def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
+    """Every value that a control does not offer is refused before it is stored, so that the page
+    sends it to no other client, and nothing is printed."""
     client, did = page
-    for label, values in HOSTILE.items():
-        control = client.control(label)
+    controls = {label: client.control(label) for label in HOSTILE}
+    capfd.readouterr()
+    for label, (*values, _) in HOSTILE.items():
         for value in values:
-            client.set(control, value)
-            client.set(client.control("towards"), "up")
-        client.set(control, [], name="update_cb")
-    for value in ("sideways", "", 3, None):
-        client.set(client.control("towards"), value)
-    client.set(client.control("pause"), "no", name="nonsense")
-    client.set(client.control("robots"), 1)
-    wait_until(lambda: did["shown"][-1] == 1)
-    client.send([1, 2, 3])
-    assert set(did["shown"]) == {1, 2}
-    assert set(did["speed"]) == {0.1, 1.0, 2.0}
-    assert {height for height in did["target"] if height is not None} == {0.3, 0.8}
-    speeds = {float(np.linalg.norm(push)) for push in did["push"]}
-    assert speeds == {0.2, 1.0}
+            client.set(controls[label], value)
+        for name in ("update_cb", "disabled", "min", "uuid", "nonsense"):
+            client.set(controls[label], [], name=name)
+    for message in FOREIGN:
+        client.send(message)
+    client.send_bytes(b"\xc1")
+    client.send_bytes(b"\x91" * 2000)
+    client.send_bytes("text")
+    assert (set(did["shown"]), set(did["speed"]), set(did["target"])) == ({1}, {1.0}, {None})
+    assert not did["push"]
+
+    with contextlib.closing(Client(client.address)) as other:
+        assert other.control("robots") == controls["robots"]
+        for label, (*_, value) in HOSTILE.items():
+            client.set(controls[label], value)
+        wait_until(lambda: did["push"] and did["shown"][-1] == 2 and did["speed"][-1] == 0.5)
+        np.testing.assert_allclose(did["push"], [(0.0, 0.0, 1.0)])
+        client.press("faster")
+        while other.values.get(controls["speed"]) != 0.6:
+            other.receive()
+        # The values that the other client was told, in the server's own number of decimals.
+        told = [other.values[controls[label]] for label in ("robots", "height, m", "speed, m/s")]
+        assert told == [2, 0.6, 1.0]
+    assert capfd.readouterr() == ("", "")
+
+
+def handshake(address: str, host: str | None, origin: str | None, version: str = "") -> bytes:
+    """The status of the answer to a page that opens a WebSocket."""
+    where = urllib.parse.urlsplit(address)
+    lines = ["GET / HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade"]
+    lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13"]
+    lines += [f"Sec-WebSocket-Protocol: viser-v{version or viser.__version__}"]
+    lines += [] if host is None else [f"Host: {host}"]
+    lines += [] if origin is None else [f"Origin: {origin}"]
+    with socket.create_connection((where.hostname, where.port)) as client:
+        client.sendall("\r\n".join([*lines, "", ""]).encode())
+        return client.recv(12)[-3:]
+
+
+@pytest.mark.parametrize(
+    ("host", "allowed", "pages", "strangers"),
+    [
+        (
+            "127.0.0.1",
+            (),
+            (
+                "http://127.0.0.1:PORT",
+                "http://localhost:PORT",
+                "http://[::1]:9",
+                "https://LocalHost",
+            ),
+            (
+                "http://evil.test:PORT",
+                "http://192.0.2.1:PORT",
+                "http://localhost.evil.test",
+                "http://",
+            ),
+        ),
+        (
+            "0.0.0.0",
+            (),
+            (
+                "http://192.0.2.1:PORT",
+                "http://[2001:db8::1]:PORT",
+                f"http://{socket.gethostname()}",
+            ),
+            ("http://evil.test:PORT", "http://127.0.0.1.evil.test:PORT"),
+        ),
+        (
+            "127.0.0.1",
+            ("gpu.lab",),
+            ("http://gpu.lab:PORT", "https://GPU.lab", "http://localhost:PORT"),
+            ("http://evil.test:PORT", "http://agpu.lab"),
+        ),
+    ],
+    ids=["local", "everywhere", "allowed"],
+)
+def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -> None:
+    with open_server(host, 0, allowed) as server:
+        address = f"http://127.0.0.1:{server.get_port()}"
+        pages, strangers = (
+            [text.replace("PORT", str(server.get_port())) for text in texts]
+            for texts in (pages, strangers)
+        )
+        for page in pages:
+            name = page.partition("://")[2]
+            assert handshake(address, name, page) == b"101", page
+            # A program that is no browser tells no origin.
+            assert handshake(address, name, None) == b"101", page
+            for stranger in [*strangers, "null", "http://localhost:1", "file://", "http://[", ""]:
+                assert handshake(address, name, stranger) == b"403", (page, stranger)
+        for stranger in strangers:
+            name = stranger.partition("://")[2]
+            assert handshake(address, name, stranger) == b"403", stranger
+            assert handshake(address, name, None) == b"403", stranger
+        assert handshake(address, None, None) == b"403"
+        # A proxy replaces the name.
+        for name in allowed:
+            assert handshake(address, "127.0.0.1", f"https://{name}") == b"101"
+        assert handshake(address, "localhost", None, version="0.0.1") == b"400"
+
+        request = urllib.request.Request(address, headers={"Host": "evil.test"})
+        with pytest.raises(urllib.error.HTTPError) as refusal:
+            urllib.request.urlopen(request)
+        assert refusal.value.code == 403 and b"--allow-host" in refusal.value.read()
+        with urllib.request.urlopen(address) as answer:
+            assert b"<html" in answer.read(2000)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:
+    """As a version would be that starts its server in another way."""
+
+    class Other:
+        def __init__(self, **options):
+            self.stop = lambda: stopped.append(True)
+
+    stopped = []
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(UserError, match="would admit every website.*; install"):
+        with open_server("127.0.0.1", 0):
+            pass
+    assert stopped
 
 
 def test_keys_act_as_in_the_window(page) -> None:
@@ -734,8 +888,8 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
     told, shown = [], []
 
     class Page:
-        def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
-            told.append(("served", host, port))
+        def __init__(self, config: TrainConfig, host: str, port: int, console: Console, allowed):
+            told.append(("served", host, port, allowed))
 
         def block(self, steps: int, means: dict[str, float]) -> None:
             told.append(("block", steps, means["speed/steps_per_second"] > 0.0))
@@ -751,9 +905,9 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
     # The process would end there.
     monkeypatch.setattr(train, "leave", lambda status: None)
     flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]
-    train.main([*TINY, *flags, "--watch", "--watch-port", "8123"])
+    train.main([*TINY, *flags, "--watch", "--watch-port", "8123", "--watch-allow-host", "gpu.lab"])
     assert told == [
-        ("served", "127.0.0.1", 8123),
+        ("served", "127.0.0.1", 8123, ("gpu.lab",)),
         ("block", 64, True),
         ("block", 128, True),
         ("evaluation", 128, 5),
@@ -866,7 +1020,7 @@ def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatc
         wait_until(lambda: any(frame.over.any() for frame in frames))
         for value in (1e9, -1e9, NAN, INFINITY, "much", [1], None):
             client.set(client.control("restitution"), value)
-        assert {world["restitution"] for world in worlds if world} == {(0.85,), (0.6,), (0.98,)}
+        assert {world["restitution"] for world in worlds if world} == {(0.85,)}
         client.set(client.control("nominal world"), True)
         wait_until(lambda: worlds[-1] == NOMINAL)
 
@@ -891,7 +1045,23 @@ def test_another_robot_has_no_slider_for_the_restitution() -> None:
     assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
 
 
-def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
+def test_a_server_prints_nothing_and_hides_no_output(capsys, monkeypatch) -> None:
+    """Another thread prints while the server starts."""
+    make_server = viser.ViserServer
+
+    def make_beside_output(**named) -> viser.ViserServer:
+        thread = threading.Thread(target=print, args=("meanwhile",))
+        thread.start()
+        thread.join()
+        return make_server(**named)
+
+    monkeypatch.setattr(viser, "ViserServer", make_beside_output)
+    with open_server("127.0.0.1", 0):
+        pass
+    assert capsys.readouterr().out == "meanwhile\n"
+
+
+def test_a_client_that_does_not_answer_does_not_delay_the_end(capfd) -> None:
     """A page that is stopped in a debugger never answers when the server closes the connection."""
     with contextlib.ExitStack() as servers, contextlib.ExitStack() as stack:
         server = servers.enter_context(open_server("127.0.0.1", 0))
@@ -899,7 +1069,7 @@ def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
             socket.create_connection((server.get_host(), server.get_port()))
         )
         client.sendall(
-            b"GET / HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
             + f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
         )
@@ -908,6 +1078,8 @@ def test_a_client_that_does_not_answer_does_not_delay_the_end() -> None:
         ending.start()
         ending.join(4.0)
         assert not ending.is_alive()
+    wait_until(lambda: not server._websock_server._server_thread.is_alive())
+    assert capfd.readouterr() == ("", "")
 
 
 def test_reward_bars_show_every_term() -> None:
@@ -925,11 +1097,11 @@ def test_reward_bars_show_every_term() -> None:
 
 
 def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
-    """Runs `python -m bounce_mjx.<command>` in a folder, without a display."""
+    """Runs `python -m bounce_mjx COMMAND` in a folder, without a display."""
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return subprocess.run(
-        [sys.executable, "-m", *command], cwd=cwd, env=env | variables, capture_output=True,
-        text=True, timeout=300,
+        [sys.executable, "-m", "bounce_mjx", *command], cwd=cwd, env=env | variables,
+        capture_output=True, text=True, timeout=300,
     )  # fmt: skip
 
 
@@ -944,8 +1116,8 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
 
 
 VIDEOS = {
-    "mp4 by EGL": ("egl", "a.mp4", "bounce_mjx.play", 60),
-    "gif by OSMesa": ("osmesa", "a.gif", "bounce_mjx.view --actions scripted", 25),
+    "mp4 by EGL": ("egl", "a.mp4", "play", 60),
+    "gif by OSMesa": ("osmesa", "a.gif", "view --actions scripted", 25),
 }
 
 
@@ -957,10 +1129,14 @@ def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> N
     if "CI" not in os.environ and not offscreen.works(backend):
         pytest.skip(f"{backend} is not installed")
     flags = f"--video {name} --size 320 240 --seconds 0.6".split()
+    mine, planted = tmp_path / "mine", tmp_path / f".unfinished-{name}"
+    mine.write_text("mine")
+    planted.symlink_to(mine)
     done = run([*command.split(), *flags], tmp_path, MUJOCO_GL=backend)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    assert os.listdir(tmp_path) == [name]
+    assert mine.read_text() == "mine"
+    assert set(os.listdir(tmp_path)) == {name, mine.name, planted.name}
     rate, frames = read_video(tmp_path / name)
     assert rate == fps
     assert frames.shape == (round(0.6 * fps), 240, 320, 3)
@@ -995,7 +1171,7 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
     try:
         display = f":{int(screen.stdout.readline())}"
         viewer = subprocess.Popen(
-            [sys.executable, "-m", "bounce_mjx.play", "--seconds", "60"],
+            [sys.executable, "-m", "bounce_mjx", "play", "--seconds", "60"],
             cwd=tmp_path,
             env=os.environ | {"DISPLAY": display},
             stdout=log,
@@ -1034,6 +1210,7 @@ MISTAKES = {
     "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
     "speed": ("--speed 0", "--speed is 0", "0.1"),
+    "no host": ("--allow-host http://a", "'http://a' is no name of a host", "without http://"),
 }
 
 

@@ -1,8 +1,11 @@
 """The exception that a user's mistake raises, and how a command reports it."""
 
 import contextlib
+import io
+import os
 import sys
 from collections.abc import Iterator
+from typing import NoReturn
 
 from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
 
@@ -12,22 +15,72 @@ class UserError(Exception):
     expected one and the remedy."""
 
 
+class MissingPackage(UserError, ImportError):
+    """An optional package cannot be imported."""
+
+
+@contextlib.contextmanager
+def needed(package: str, install: str) -> Iterator[None]:
+    """Around the import of an optional package.
+
+    Args:
+      install: what pip installs, such as 'bounce_mjx[brax]'.
+
+    Raises:
+      MissingPackage: the package cannot be imported.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise MissingPackage(
+            f"{package} cannot be imported ({reason_of(error)}); install it with "
+            f"pip install {install}"
+        ) from error
+
+
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Reports a `UserError` as one sentence on stderr and exits with status 2; Ctrl-C exits with
-    status 130. Neither prints a traceback."""
+    """Reports a `UserError`, or a `JAX_PLATFORMS` that JAX refuses, as one sentence on stderr and
+    exits with status 2; Ctrl-C exits with status 130. Neither prints a traceback, and nor does an
+    output that cannot encode a path."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         yield
     except UserError as error:
-        print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
-        sys.exit(2)
+        _exit_with(str(error))
+    except (RuntimeError, AssertionError):
+        refusal = _refused_platforms()
+        if refusal is None:
+            raise
+        _exit_with(refusal)
     except Interrupted:
         leave()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 
 
-def _on_one_line(text: str) -> str:
+def _exit_with(sentence: str) -> NoReturn:
+    print(f"error: {on_one_line(sentence)}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _refused_platforms() -> str | None:
+    """Why JAX does not start on the user's `JAX_PLATFORMS`; None if it does."""
+    platforms = os.environ.get("JAX_PLATFORMS")
+    if not platforms or "jax" not in sys.modules:
+        return None
+    try:
+        sys.modules["jax"].devices()
+    except (RuntimeError, AssertionError) as error:
+        return (
+            f"JAX does not start on JAX_PLATFORMS={platforms} ({reason_of(error)}); unset it, or "
+            "name platforms of this machine, such as cpu"
+        )
+    return None
+
+
+def on_one_line(text: str) -> str:
     """A text without the line breaks and terminal codes that a file or a flag may hold."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return shorten(line, 3000)

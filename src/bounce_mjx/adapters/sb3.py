@@ -3,8 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
+
+from bounce_mjx.errors import UserError, needed
+
+with needed("Stable-Baselines3", "'bounce_mjx[sb3]'"):
+    import gymnasium
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecEnv
 
 from bounce_mjx.adapters.gymnasium.batch import (
     Batch,
@@ -19,18 +25,8 @@ from bounce_mjx.adapters.gymnasium.environments import (
 )
 from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
 from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
-from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
-
-try:
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import VecEnv
-except ImportError as error:
-    raise ImportError(
-        "bounce_mjx.adapters.sb3 needs Stable-Baselines3, which cannot be imported "
-        f"({error}); install it with pip install 'bounce_mjx[sb3]'"
-    ) from error
 
 _SHOWN = 4
 

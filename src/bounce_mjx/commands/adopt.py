@@ -1,5 +1,6 @@
 """Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +13,9 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.errors import UserError, exit_on_user_error, on_one_line
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.config import EnvConfig
@@ -42,6 +44,7 @@ class AdoptCommand(StrictModel):
     """Show the arm afterwards."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
@@ -51,7 +54,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx adopt",
             description="Finds the start pose and the servos of an arm, and writes its config.",
         )
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.robot.adopt import adopt
             from bounce_mjx.task.env import BounceBall
             from bounce_mjx.training.setup import set_up_jax
@@ -118,11 +121,12 @@ def described(adoption: "Adoption") -> list[str]:
 
     pose, arm = adoption.pose, adoption.arm
     x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
+    strength = f"{pose.acceleration:.0f} m/s^2 upward beside holding the arm"
     kind = "kept" if adoption.are_kept else "made from the reflected inertia"
     lines = [
         f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
         f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
-        f"strength: {pose.acceleration:.0f} m/s^2 upward beside holding the arm",
+        f"strength: {strength if math.isfinite(pose.acceleration) else 'no force limit'}",
         f"servos ({kind}), action scale {adoption.action_scale:g} rad:",
     ]
     for name, angle, inertia, servo in zip(
@@ -144,8 +148,10 @@ def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adopt
     from bounce_mjx.runs.files import write_atomically
 
     site = adoption.config.site
-    head = f"# An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}\n"
-    text = head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    head = f"An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}"
+    text = f"# {on_one_line(head)}\n" + yaml.safe_dump(
+        values, sort_keys=False, default_flow_style=None, width=100
+    )
     try:
         write_atomically(out, text)
     except OSError as error:

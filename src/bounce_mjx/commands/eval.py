@@ -22,7 +22,8 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.training.loop_fusion import join_loops
 
 # An evaluation that is not slower needs no lines about its progress.
@@ -52,6 +53,7 @@ class EvalCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     with exit_on_user_error():
@@ -64,28 +66,28 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
-        join_loops(command.physics)
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table
             from bounce_mjx.runs.config import load_run_config
-            from bounce_mjx.runs.files import to_json
+            from bounce_mjx.runs.files import to_json, write_output
             from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
 
-        set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
+        engine = {"physics": command.physics} if command.physics in ("fused", "mjx") else {}
+        join_loops(config.env.model_copy(update=engine))
+        set_up_jax()
         policy = load_policy(checkpoint, config)
         console.out(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False
         )
         length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
         with _Progress(console) as progress:
-            report, engine, warnings = run_interruptible(
-                evaluate_policy,
+            report, engine, warnings = evaluate_policy(
                 policy,
                 config.env,
                 config.ppo,
@@ -106,7 +108,7 @@ def main(args: Sequence[str] | None = None) -> None:
             plain |= {"seed": command.seed, "target_height": command.target_height}
             plain |= {"nominal": command.nominal}
             try:
-                command.json_file.write_text(to_json(plain), encoding="utf-8")
+                write_output(command.json_file, to_json(plain))
             except OSError as error:
                 raise UserError(
                     f"--json {command.json_file} cannot be written ({error.strerror}); give "

@@ -12,7 +12,8 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 
 
 class ExportCommand(StrictModel):
@@ -30,6 +31,7 @@ class ExportCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
@@ -41,8 +43,9 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         if command.onnx is None and command.jax is None:
             raise UserError("there is no file to write; give --onnx FILE or --jax FILE")
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.deploy.export import export_jax, export_onnx
+            from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.training.setup import set_up_jax
 
@@ -61,9 +64,9 @@ def main(args: Sequence[str] | None = None) -> None:
         for flag, (path, export) in files.items():
             if path is None:
                 continue
-            content = run_interruptible(export, checkpoint)
+            content = export(checkpoint)
             try:
-                path.write_bytes(content)
+                write_output(path, content)
             except OSError as error:
                 raise UserError(
                     f"{flag} {path} cannot be written ({error.strerror}); give another file"

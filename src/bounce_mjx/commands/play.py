@@ -12,13 +12,16 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Positive, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 
 if TYPE_CHECKING:
+    from bounce_mjx.runs.folders import Checkpoint
     from bounce_mjx.task.env import BounceBall
     from bounce_mjx.viewers.controllers import Controller
     from bounce_mjx.viewers.show import Shown
@@ -42,6 +45,7 @@ class PlayCommand(StrictModel):
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
@@ -55,43 +59,50 @@ def main(args: Sequence[str] | None = None) -> None:
             raise UserError(
                 f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
             )
-        join_loops()
-        with interruptible_imports():
+        with no_garbage_collection():
+            from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.show import show
 
         console = Console()
+        chosen = [
+            choose_checkpoint(path, command.log_dir, console)
+            for path in command.checkpoints or (None,)
+        ]
+        configs = [_config(checkpoint, command) for checkpoint in chosen]
+        join_loops(*(config.env for config in configs))
         set_up_jax()
-        paths = command.checkpoints or (None,)
         show(
-            [_load(path, command, console) for path in paths],
+            [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
             command.viewing,
             target_height=command.target_height,
             console=console,
         )
 
 
-def _load(path: Path | None, command: PlayCommand, console: Console) -> "Shown":
+def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
+    """The config of a checkpoint's training, with the engine and the world that are to be shown."""
+    config = load_run_config(checkpoint.run)
+    changes = {} if command.physics == "config" else {"physics": command.physics}
+    if command.randomization.terms:
+        changes["randomization"] = command.randomization
+    env = validate(EnvConfig, dict(config.env) | changes, "play")
+    return config.model_copy(update={"env": env})
+
+
+def _load(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
     from bounce_mjx.learning.policy import make_networks
-    from bounce_mjx.runs.config import load_run_config
-    from bounce_mjx.runs.folders import choose_checkpoint
     from bounce_mjx.runs.reading import load_policy
     from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
 
-    checkpoint = choose_checkpoint(path, command.log_dir, console)
-    config = load_run_config(checkpoint.run)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-    changes = {} if command.physics == "config" else {"physics": command.physics}
-    if command.randomization.terms:
-        changes["randomization"] = command.randomization
     policy = load_policy(checkpoint, config)
 
     def make_controller(env: "BounceBall") -> "Controller":
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         return make_policy_controller(networks, policy)
 
-    env_config = validate(EnvConfig, dict(config.env) | changes, "play")
     title = f"{checkpoint.run.name}, {checkpoint.steps / 1e6:.1f} M steps"
-    return Shown(env_config, make_controller, title)
+    return Shown(config.env, make_controller, title)

@@ -11,7 +11,8 @@ from pydantic import Field
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 
 
 class PlotCommand(StrictModel):
@@ -29,6 +30,7 @@ class PlotCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
@@ -38,7 +40,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx plot",
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.reports.curves import group_runs
             from bounce_mjx.reports.figures import (
                 curves_figure,
@@ -48,6 +50,7 @@ def main(args: Sequence[str] | None = None) -> None:
             )
             from bounce_mjx.reports.page import record_checkpoint
             from bounce_mjx.runs.config import load_run_config
+            from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
             from bounce_mjx.task.env import BounceBall
 
@@ -58,15 +61,13 @@ def main(args: Sequence[str] | None = None) -> None:
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:
             env = BounceBall(load_run_config(checkpoints[0].run).env)
-            figures["evaluation"] = evaluation_figure(
-                env, run_interruptible(record_checkpoint, checkpoints[0])
-            )
+            figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
         for name, figure in figures.items():
             for suffix in command.formats:
                 path = command.out / f"{name}.{suffix}"
                 try:
                     command.out.mkdir(parents=True, exist_ok=True)
-                    path.write_bytes(image(figure, suffix))
+                    write_output(path, image(figure, suffix))
                 except OSError as error:
                     raise UserError(
                         f"{path} cannot be written ({error.strerror}); choose another folder with "

@@ -10,7 +10,8 @@ import tyro
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 
 
 class ReportCommand(StrictModel):
@@ -22,6 +23,7 @@ class ReportCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     with exit_on_user_error():
@@ -31,11 +33,11 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx report",
             description="Writes the report of a run, report.html in its folder.",
         )
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.reports.page import record_checkpoint, write_report
             from bounce_mjx.runs.folders import find_checkpoint, named_run
 
         checkpoint = find_checkpoint(named_run(command.run, command.log_dir))
-        recording = run_interruptible(record_checkpoint, checkpoint)
+        recording = record_checkpoint(checkpoint)
         path, _ = write_report(checkpoint.run, recording)
         print(path)

@@ -13,12 +13,14 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
-from bounce_mjx.interrupt import interruptible_imports, run_interruptible
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import resource_path
 from bounce_mjx.training.loop_fusion import join_loops
 
 if TYPE_CHECKING:
     from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
+    from bounce_mjx.evaluation.suite import Condition
     from bounce_mjx.learning.policy import Policy
     from bounce_mjx.runs.config import TrainConfig
 
@@ -45,6 +47,7 @@ class RobustnessCommand(StrictModel):
     """Folder in which to look for the newest run."""
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
@@ -56,21 +59,24 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="bounce-mjx robustness",
             description="Measures the five results of a trained policy in perturbed worlds.",
         )
-        join_loops(command.physics)
-        with interruptible_imports():
+        with no_garbage_collection():
             from bounce_mjx.evaluation.robustness import RobustnessReport
+            from bounce_mjx.evaluation.suite import load_suite
             from bounce_mjx.reports.robustness import robustness_table
             from bounce_mjx.runs.config import load_run_config
             from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
 
-        set_up_jax()
         console = Console()
         checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
         config = load_run_config(checkpoint.run)
-        policy = load_policy(checkpoint, config)
         suite = command.suite or resource_path("configs/robustness.yaml")
+        conditions = load_suite(suite, config.env)
+        engine = {"physics": command.physics} if command.physics in ("fused", "mjx") else {}
+        join_loops(*(condition.env.model_copy(update=engine) for condition in conditions))
+        set_up_jax()
+        policy = load_policy(checkpoint, config)
         shipped = checkpoint.run in map(resource_path, SHIPPED.values())
         out = command.out or (Path("robustness") if shipped else checkpoint.run)
         _make_folder(out)
@@ -80,7 +86,7 @@ def main(args: Sequence[str] | None = None) -> None:
             suite=str(suite),
             episodes=command.episodes,
             seed=command.seed,
-            outcomes=run_interruptible(_measure, command, config, policy, suite, console),
+            outcomes=_measure(command, config, policy, conditions, console),
         )
         console.print(robustness_table(report))
         _write(out, report)
@@ -91,14 +97,12 @@ def _measure(
     command: RobustnessCommand,
     config: "TrainConfig",
     policy: "Policy",
-    suite: Path,
+    conditions: "Sequence[Condition]",
     console: Console,
 ) -> "list[Outcome]":
     """Measures all conditions and shows a progress bar."""
     from bounce_mjx.evaluation.robustness import measure_conditions
-    from bounce_mjx.evaluation.suite import load_suite
 
-    conditions = load_suite(suite, config.env)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("conditions", total=len(conditions))
@@ -131,7 +135,7 @@ def _write(out: Path, report: "RobustnessReport") -> None:
     try:
         write_atomically(out / ROBUSTNESS_FILE, to_json(report.model_dump()))
         for suffix in ("png", "svg"):
-            (out / f"robustness.{suffix}").write_bytes(image(figure, suffix))
+            write_atomically(out / f"robustness.{suffix}", image(figure, suffix))
     except OSError as error:
         raise _not_writable(out, error) from error
     for suffix in ("json", "png", "svg"):

@@ -2,14 +2,16 @@
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.settings import whole_number
+from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
@@ -18,7 +20,6 @@ from bounce_mjx.training.command import (
     run_command,
 )
 from bounce_mjx.training.command import read_command as read
-from bounce_mjx.training.helpers import start_helpers
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
@@ -42,6 +43,8 @@ class TrainCommand(TrainingCommand):
     """Serve a page beside the training, with the newest policy, the curves and the five results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
+    watch_allow_host: tuple[HostName, ...] = ()
+    """Other names under which a browser may open that page, such as a proxy's."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""
     host_timeout: Annotated[int, Field(ge=1, le=10**6)] = DEFAULT_TIMEOUT
@@ -52,20 +55,15 @@ class TrainCommand(TrainingCommand):
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line."""
     args = sys.argv[1:] if args is None else args
-    with exit_on_user_error():
-        if asks_for_help(args):
-            read_command(args)
     several_hosts = _hosts(args)
-    helpers = None
-    if several_hosts is None:
-        # A process of several hosts also aborts when another one is lost.
-        join_loops(early_flag(args, "--physics"))
-        helpers = start_helpers(args)
+    with exit_on_user_error(), interruptible_imports():
+        if several_hosts is None or asks_for_help(args):
+            command = read_command(args, default_preset(has_plugin()))
+            join_loops(command.env)
     with interruptible_imports():
-        from bounce_mjx.training.setup import find_devices, imported_modules, set_up_jax
+        from bounce_mjx.training.setup import find_devices, set_up_jax
 
         set_up_jax()
-        modules = imported_modules(args)
         if several_hosts is None:
             # CUDA starts beside the imports.
             find_devices()
@@ -76,26 +74,27 @@ def main(args: Sequence[str] | None = None) -> None:
         if several_hosts is not None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
-        command = read_command(args)
-        if helpers is not None:
-            helpers.begin(config_of(command))
+        if several_hosts is not None or has_plugin() != has_accelerator():
+            command = read_command(args)
+        hosts.agree(config_of(command), command.resume)
         if not command.watch or not hosts.is_leader():
-            run_command(command, PPOTrainer, PROG, modules=modules, helpers=helpers)
+            run_command(command, PPOTrainer, PROG)
             return
         # Only a training that is watched pays for this import.
         from bounce_mjx.viewers.watch import TrainingPage
 
-        page = TrainingPage(config_of(command), command.watch_host, command.watch_port, Console())
-        run_command(command, PPOTrainer, PROG, page, modules=modules, helpers=helpers)
+        address = command.watch_host, command.watch_port
+        page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
+        run_command(command, PPOTrainer, PROG, page)
         page.wait()
         # A thread that simulates cannot be stopped.
         leave(0)
 
 
-def read_command(args: Sequence[str]) -> TrainCommand:
+def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
     description = "Trains a policy that keeps the ball bouncing."
-    return read(TrainCommand, args, prog=PROG, description=description)
+    return read(TrainCommand, args, prog=PROG, description=description, preset=preset)
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:

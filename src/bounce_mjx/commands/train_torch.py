@@ -5,19 +5,19 @@ At its end, or when it is stopped, it writes the networks and the optimizer as `
 format of rsl_rl's runner.
 """
 
+import functools
 import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
-    early_flag,
     path_flag,
     read_command,
     run_command,
@@ -46,7 +46,6 @@ def main(args: Sequence[str] | None = None) -> None:
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
         if not asks_for_help(args):
-            join_loops(early_flag(args, "--physics"))
             with interruptible_imports():
                 from bounce_mjx.training import job  # noqa: F401
                 from bounce_mjx.training.setup import set_up_jax
@@ -61,14 +60,15 @@ def main(args: Sequence[str] | None = None) -> None:
             if library in get_args(Library):
                 defaults = {"library": library}
         description = "Trains a policy that keeps the ball bouncing, with PyTorch."
-        command = read_command(
-            TorchTrainCommand, args, prog=PROG, description=description, **defaults
+        read = functools.partial(
+            read_command, TorchTrainCommand, args, prog=PROG, description=description, **defaults
         )
-        try:
-            # PyTorch takes seconds to import, and is optional.
-            trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
-        except ImportError as error:
-            raise UserError(str(error)) from error
+        command = read(preset=default_preset(has_plugin()))
+        join_loops(command.env)
+        if has_plugin() != has_accelerator():
+            command = read()
+        # PyTorch takes seconds to import, and is optional.
+        trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         made = []
 
         def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":

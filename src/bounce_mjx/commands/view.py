@@ -11,7 +11,8 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import ROBOTS, load_config, named_file
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.training.command import path_flag
@@ -31,6 +32,7 @@ class ViewCommand(StrictModel):
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
 
 
+@interruptible
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
@@ -44,8 +46,8 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Shows the environment under random, zero or scripted actions.",
             default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
         )
-        join_loops(command.env.physics)
-        with interruptible_imports():
+        with no_garbage_collection():
+            join_loops(command.env)
             from bounce_mjx.training.setup import set_up_jax
             from bounce_mjx.viewers.controllers import (
                 make_random_controller,

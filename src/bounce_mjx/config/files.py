@@ -1,6 +1,5 @@
 """Settings as YAML."""
 
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,7 @@ import yaml
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.files import read_regular
 
 _MAX_BYTES = 2**16
 _MAX_ALIASES = 10
@@ -38,13 +38,7 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
       UserError: the file is missing or is no YAML mapping.
     """
     try:
-        # Opening a pipe would wait for a writer, and a device may have no end.
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise ValueError("it is not a regular file")
-        data = path.read_bytes()
-        if len(data) > _MAX_BYTES:
-            raise ValueError(f"it is longer than {_MAX_BYTES} bytes")
-        values = _Loader(data.decode("utf-8")).get_single_data()
+        values = _Loader(read_regular(path, _MAX_BYTES).decode("utf-8")).get_single_data()
     # PyYAML raises exceptions of many types where a value looks like a number or a date but is not
     # one.
     except Exception as error:

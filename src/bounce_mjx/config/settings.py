@@ -29,6 +29,15 @@ def _check_path(path: Path) -> Path:
 PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
 
 
+def _check_host(name: str) -> str:
+    if not re.fullmatch(r"[\w.-]+", name):
+        raise ValueError(f"{name!r} is no name of a host; give it without http:// and port")
+    return name
+
+
+HostName = Annotated[str, pydantic.AfterValidator(_check_host)]
+
+
 def whole_number(value: Any) -> Any:
     """A whole number in scientific notation, such as "1e6", as an integer; any other value is
     returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent need a

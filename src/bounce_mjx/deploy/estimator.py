@@ -8,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.task.ball_filter import BallFilter, Constants
+from bounce_mjx.task.ball_filter import BallFilter
 
 # Time of control steps whose planes of the paddle are kept, s.
 _MEMORY = 0.3
@@ -28,8 +28,7 @@ class Estimator:
           age: time since the picture was taken, s.
         """
         self._chain, self._control_dt = Chain(metadata), metadata.control_dt
-        constants = Constants(**metadata.estimator)
-        self._filter = BallFilter(constants, metadata.control_dt, np, _repeat)
+        self._filter = BallFilter(metadata.estimator, metadata.control_dt, np, _repeat)
         self._track = self._filter.start(position, np.float64(age))
         count = math.ceil(_MEMORY / metadata.control_dt) + 1
         self._planes = np.tile(self._filter.plane(*self._chain.paddle(joint_angles)), (count, 1))

@@ -14,8 +14,8 @@ import numpy as np
 
 from bounce_mjx.deploy import metadata as metadata_module
 from bounce_mjx.deploy.metadata import FORMAT, Link, Metadata, Part
-from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, act_with_memory, make_networks
+from bounce_mjx.errors import UserError, needed
+from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD
 from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -27,6 +27,8 @@ from bounce_mjx.task.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
+
+_EXTRA = "'bounce_mjx[export]'"
 
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
@@ -41,8 +43,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping and metadata.
 
     The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
-    action); the output is `action`, float32 [N, n]. A gru also has the input `memory` and the
-    output `next_memory`, float32 [N, H]; at the start of an episode the memory is zero.
+    action); the output is `action`, float32 [N, n].
 
     Raises:
       UserError: the checkpoint is damaged, its arm cannot be exported, or onnx is not installed.
@@ -59,30 +60,25 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
 
     `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, n] for any N; `inputs` is
-    a dict with the names and shapes of `export_onnx`. For a gru it gives the actions and the next
-    memory.
+    a dict with the names and shapes of `export_onnx`.
 
     Raises:
-      UserError: the checkpoint is damaged.
+      UserError: the checkpoint is damaged, or flatbuffers is not installed.
     """
+    with needed("flatbuffers", _EXTRA):
+        # JAX serialises with it.
+        import flatbuffers  # noqa: F401
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
     parts = _parts(config.env)
     networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
 
-    memory_size = _memory_size(config)
-
-    def call(inputs: dict[str, jax.Array]) -> jax.Array | tuple[jax.Array, jax.Array]:
+    def call(inputs: dict[str, jax.Array]) -> jax.Array:
         flat = [inputs[p.name].reshape(-1, p.history * p.size) for p in parts]
-        memory = (inputs["memory"],) if memory_size else ()
-        observation = jnp.concatenate(flat, axis=-1)
-        actions, memory = act_with_memory(networks, policy, observation, memory)
-        return (actions, *memory) if memory_size else actions
+        return act(networks, policy, jnp.concatenate(flat, axis=-1))
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = {p.name: jax.ShapeDtypeStruct((n, p.history, p.size), jnp.float32) for p in parts}
-    if memory_size:
-        shapes["memory"] = jax.ShapeDtypeStruct((n, memory_size), jnp.float32)
     return jax.export.export(jax.jit(call), platforms=("cpu", "cuda"))(shapes).serialize()
 
 
@@ -111,8 +107,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         observation=_parts(env),
         position=env.observation.position,
         velocity=env.observation.velocity,
-        estimator=filter_constants(env, m)._asdict() if filtered else None,
-        memory_size=_memory_size(config),
+        estimator=filter_constants(env, m) if filtered else None,
         control_dt=env.control_dt,
         action=_ACTION,
         action_scale=env.action_scale,
@@ -136,11 +131,6 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
     )
-
-
-def _memory_size(config: TrainConfig) -> int:
-    """Size of the policy's memory; 0 without one."""
-    return config.ppo.gru_size if config.ppo.network == "gru" else 0
 
 
 def _parts(env: EnvConfig) -> tuple[Part, ...]:
@@ -207,13 +197,9 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> Any:
     """ONNX model of a policy network; flax names the layers MLP_0/hidden_i and Dense_0."""
-    try:
+    with needed("onnx", _EXTRA):
         import onnx
         from onnx import helper, numpy_helper
-    except ImportError as error:
-        raise UserError(
-            "the package onnx is missing, which writes ONNX files; pip install 'bounce_mjx[export]'"
-        ) from error
 
     nodes, constants = [], []
 
@@ -224,28 +210,6 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
     def node(kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
         nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
-
-    def gated_unit(weights: Any, x: str) -> str:
-        """The next memory by flax's `GRUCell`: r and z from input and memory, then
-        n = tanh(input + r * memory), and (1 - z) * n + z * memory."""
-
-        def linear(gate: str, value: str) -> str:
-            layer = weights[gate]
-            inputs = [value, constant(f"gru/{gate}/kernel", layer["kernel"])]
-            if "bias" in layer:
-                inputs.append(constant(f"gru/{gate}/bias", layer["bias"]))
-            return node("Gemm", inputs, f"gru/{gate}")
-
-        def gate(name: str) -> str:
-            terms = [linear(f"i{name}", x), linear(f"h{name}", "memory")]
-            return node("Sigmoid", [node("Add", terms, f"gru/{name}/sum")], f"gru/{name}")
-
-        reset, kept = gate("r"), gate("z")
-        recalled = node("Mul", [reset, linear("hn", "memory")], "gru/recalled")
-        total = node("Add", [linear("in", x), recalled], "gru/new/sum")
-        new = node("Tanh", [total], "gru/new")
-        change = node("Sub", ["memory", new], "gru/change")
-        return node("Add", [new, node("Mul", [kept, change], "gru/kept")], "next_memory")
 
     parts = metadata.observation
     flat = [node("Flatten", [p.name], f"{p.name}/flat", axis=1) for p in parts]
@@ -268,8 +232,6 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
         weights = [constant(f"{name}/{k}", hidden[name][k]) for k in ("kernel", "bias")]
         x = node("Gemm", [x, *weights], f"{name}/linear")
         x = node("Mul", [x, node("Sigmoid", [x], f"{name}/sigmoid")], f"{name}/silu")
-    if metadata.memory_size:
-        x = gated_unit(params["gru"], x)
     weights = [constant(f"mean/{k}", params["Dense_0"][k]) for k in ("kernel", "bias")]
     x = node("Gemm", [x, *weights], "mean")
     limits = [constant("action/least", -1.0), constant("action/most", 1.0)]
@@ -283,10 +245,6 @@ def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> A
         for p in parts
     ]
     outputs = [tensor("action", ["N", len(metadata.joint_names)], metadata.action)]
-    if metadata.memory_size:
-        shape = ["N", metadata.memory_size]
-        inputs.append(tensor("memory", shape, "next_memory of the last step; at first zeros"))
-        outputs.append(tensor("next_memory", shape, "the memory of the next step"))
     graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
     model = helper.make_model(
         graph,

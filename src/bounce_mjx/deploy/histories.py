@@ -37,7 +37,7 @@ class Histories:
         self._ball = measured.get("ball_position", np.zeros(3))
         self._ball_velocity = np.zeros(3)
         # Without time stamps, each picture arrives after the latency that the filter expects.
-        self._latency = (metadata.estimator or {}).get("latency") or 0.0
+        self._latency = (metadata.estimator and metadata.estimator.latency) or 0.0
         self._age = float(measured["ball_age"][0]) if "ball_age" in measured else self._latency
         height = self._ball[2]
         self._flight_apex, self._lowest = height, height

@@ -5,12 +5,16 @@ Every entry is JSON under the name of its field in `Metadata`.
 
 import json
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
+from bounce_mjx.deploy.strict import read
 from bounce_mjx.task.ball_filter import Constants
 
 FORMAT = 2
 """Version of the entries; readers refuse other versions."""
+
+Length = Annotated[float, (-1e3, 1e3)]
+Vector = tuple[Length, Length, Length]
 
 
 class Part(NamedTuple):
@@ -18,9 +22,9 @@ class Part(NamedTuple):
 
     name: str
     """Name of the quantity; `past_actions` are the network's outputs in the last steps."""
-    history: int
+    history: Annotated[int, (1, 100)]
     """Number of values, the newest first."""
-    size: int
+    size: Annotated[int, (1, 1000)]
     """Number of entries of one value."""
     unit: str
     """Unit of the entries; empty for a pure number."""
@@ -29,15 +33,15 @@ class Part(NamedTuple):
 class Link(NamedTuple):
     """A hinge between the world and the paddle, in the frame of the previous hinge."""
 
-    joint: int
+    joint: Annotated[int, (0, 1000)]
     """Index of its joint."""
-    position: tuple[float, float, float]
+    position: Vector
     """A point on the axis, m."""
     quaternion: tuple[float, float, float, float]
     """Orientation at the angle `reference`, in the order w, x, y, z."""
     axis: tuple[float, float, float]
     """Unit vector along the axis."""
-    reference: float
+    reference: Annotated[float, (-1e3, 1e3)]
     """Joint angle of the unturned hinge, rad."""
 
 
@@ -45,25 +49,23 @@ class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
     format: int
-    steps: int
+    steps: Annotated[int, (0, 10**12)]
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
     observation: tuple[Part, ...]
     """The inputs of the network, each [N, history, size]."""
-    position: str
+    position: Literal["measured", "filter"]
     """Source of ball_position: `measured`, or `filter` for the estimate of the Kalman filter."""
-    velocity: str
+    velocity: Literal["measured", "differences", "filter"]
     """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
-    estimator: dict[str, Any] | None
-    """Constants of the Kalman filter by the names in `ball_filter.Constants`; None without one."""
-    memory_size: int
-    """Size H of the input `memory` and of the output `next_memory` [N, H]; 0 without a memory."""
-    control_dt: float
+    estimator: Constants | None
+    """Constants of the Kalman filter; None without one."""
+    control_dt: Annotated[float, (1e-3, 1.0)]
     """Time between two actions, s."""
     action: str
     """Meaning of the output [N, J], in words."""
-    action_scale: float
+    action_scale: Annotated[float, (0.0, 1e3)]
     """Change of the servo target at the action 1, rad."""
     joint_ranges: tuple[tuple[float, float] | None, ...]
     """Range of each servo target, rad; None for a joint without one."""
@@ -80,11 +82,11 @@ class Metadata(NamedTuple):
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
     documents their units; missing terms were not randomised."""
-    bounce_max_distance: float
+    bounce_max_distance: Length
     """Largest height above the paddle at which the ball counts as near it, m."""
     chain: tuple[Link, ...]
     """The hinges from the world to the paddle."""
-    paddle: tuple[float, float, float]
+    paddle: Vector
     """Centre of the paddle in the frame of the last hinge, m."""
     paddle_normal: tuple[float, float, float]
     """Unit normal of the paddle's upper face in the frame of the last hinge."""
@@ -92,11 +94,7 @@ class Metadata(NamedTuple):
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
     """JSON texts of the metadata by field name."""
-    plain = metadata._asdict() | {
-        "observation": [part._asdict() for part in metadata.observation],
-        "chain": [link._asdict() for link in metadata.chain],
-    }
-    return {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+    return {name: json.dumps(value, allow_nan=False) for name, value in _plain(metadata).items()}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
@@ -105,27 +103,49 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
+    # An entry of older versions.
+    if json.loads(entries.get("memory_size", "0")):
+        raise ValueError("its network has a memory, which this version does not run")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
-    plain = {name: json.loads(entries[name]) for name in Metadata._fields}
-    try:
-        plain["observation"] = tuple(Part(**part) for part in plain["observation"])
-        plain["chain"] = tuple(Link(**link) for link in plain["chain"])
-        metadata = Metadata(**plain)
-        if metadata.estimator is not None:
-            Constants(**metadata.estimator)
-        _check(metadata)
-    except (TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"its metadata is malformed: {error}") from error
+    kinds = get_type_hints(Metadata, include_extras=True)
+    metadata = Metadata(
+        **{name: read(kind, json.loads(entries[name]), name) for name, kind in kinds.items()}
+    )
+    _check(metadata)
     return metadata
 
 
+def _plain(value: Any) -> Any:
+    """A value with groups in place of named tuples."""
+    if hasattr(value, "_asdict"):
+        return {name: _plain(inner) for name, inner in value._asdict().items()}
+    return [_plain(inner) for inner in value] if isinstance(value, tuple) else value
+
+
 def _check(metadata: Metadata) -> None:
+    """Raises ValueError if two entries contradict each other."""
     count = len(metadata.joint_names)
-    numbers: list[Any] = [metadata.control_dt, metadata.action_scale, *metadata.paddle]
-    numbers += metadata.paddle_normal
-    numbers += [n for link in metadata.chain for n in (*link.position, *link.quaternion)]
-    if not all(math.isfinite(number) for number in numbers) or not metadata.control_dt > 0.0:
-        raise ValueError("its metadata holds a number that is not finite or not positive")
-    if len(metadata.joint_ranges) != count or any(n.joint >= count for n in metadata.chain):
-        raise ValueError(f"its metadata is not of {count} joints")
+    for name in (
+        "joint_ranges",
+        "servo_stiffness",
+        "servo_damping",
+        "torque_limits",
+        "default_joint_angles",
+    ):
+        if len(getattr(metadata, name)) != count:
+            raise ValueError(f"its {name} are not of {count} joints")
+    if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):
+        raise ValueError("one of its joint_ranges ends below its start")
+    if not metadata.chain or any(link.joint >= count for link in metadata.chain):
+        raise ValueError(f"its chain is not of {count} joints")
+    units = [metadata.paddle_normal]
+    units += [unit for link in metadata.chain for unit in (link.axis, link.quaternion)]
+    if not all(math.isclose(math.hypot(*unit), 1.0, abs_tol=1e-3) for unit in units):
+        raise ValueError(
+            "its chain or its paddle_normal holds a direction of another length than 1"
+        )
+    sources = {"ball_position": metadata.position, "ball_velocity": metadata.velocity}
+    is_filtered = any(sources.get(part.name) == "filter" for part in metadata.observation)
+    if is_filtered != (metadata.estimator is not None):
+        raise ValueError("its estimator does not fit to the sources of its observation")

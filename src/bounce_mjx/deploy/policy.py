@@ -7,9 +7,11 @@ import numpy as np
 
 from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
 from bounce_mjx.deploy.metadata import Metadata, from_entries
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, needed
 
 _MAX_PAUSE = 1.0
+# Measurements beyond it are not of a robot.
+_LARGEST = 1e6
 _LOG_ERRORS_ONLY = 3
 
 UNITS = {
@@ -43,12 +45,8 @@ class DeployedPolicy:
         Raises:
           UserError: the file is not a policy from `bounce-mjx export`, or onnxruntime is missing.
         """
-        try:
+        with needed("onnxruntime", "onnxruntime"):
             import onnxruntime
-        except ImportError as error:
-            raise UserError(
-                "the package onnxruntime is missing, which runs a policy; pip install onnxruntime"
-            ) from error
         options = onnxruntime.SessionOptions()
         # The network is too small to share between threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -61,6 +59,9 @@ class DeployedPolicy:
             self.metadata: Metadata = from_entries(entries)
             self._shapes = _shapes(len(self.metadata.joint_names))
             self._check_inputs()
+            self.reset()
+            # A network that fails or gives no numbers fails here, and not on the robot.
+            self._act({p.name: np.zeros((p.history, p.size)) for p in self.metadata.observation})
         # onnxruntime raises exceptions of many types for a damaged file.
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
@@ -78,7 +79,6 @@ class DeployedPolicy:
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
-        self._memory = np.zeros((1, self.metadata.memory_size), np.float32)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -102,7 +102,7 @@ class DeployedPolicy:
         Raises:
           UserError: a required measurement is missing; a measurement is unknown, has the wrong
             shape or is not finite; or the time is more than 1 s from the last. The policy's
-            state does not change.
+            state does not change. Or the network gives no finite action; then call `reset`.
         """
         measured = self._checked(measurements)
         time = float(measured.pop("time")[0]) if "time" in measured else None
@@ -111,7 +111,6 @@ class DeployedPolicy:
             return self._action.copy()
         if self._histories is None:
             self._histories = Histories(self.metadata, measured)
-            action = self._respond()
         else:
             for i in range(1, steps + 1):
                 share = i / steps
@@ -122,9 +121,7 @@ class DeployedPolicy:
                 }
                 last = i == steps
                 self._histories.add(measured if last else measured | between, self._action, last)
-                # A memory needs every step.
-                if last or self.metadata.memory_size:
-                    action = self._respond()
+        action = self._act(self._histories.values)
         self._measured, self._time, self._action = measured, time, action
         return self._action.copy()
 
@@ -133,7 +130,8 @@ class DeployedPolicy:
         step plus the scaled action, clipped to the joint ranges.
 
         Raises:
-          UserError: there was no step since the reset, or it had no measured joint angles.
+          UserError: there was no step since the reset, or it had no measured joint angles; or the
+            action is not J numbers from -1 to 1.
         """
         if "joint_angles" not in self._measured:
             raise UserError(
@@ -141,22 +139,18 @@ class DeployedPolicy:
                 "step with joint_angles first"
             )
         ranges = self.metadata.joint_ranges
+        action = _array("the action", action, (len(ranges),), "from -1 to 1", 1.0)
         low = [-np.inf if limits is None else limits[0] for limits in ranges]
         high = [np.inf if limits is None else limits[1] for limits in ranges]
-        targets = self._measured["joint_angles"] + self.metadata.action_scale * np.asarray(action)
+        targets = self._measured["joint_angles"] + self.metadata.action_scale * action
         return np.clip(targets, low, high)
 
-    def _respond(self) -> np.ndarray:
-        """Action [J] of the network for the histories; updates its memory."""
-        inputs = {
-            name: values[None].astype(np.float32) for name, values in self._histories.values.items()
-        }
-        if not self.metadata.memory_size:
-            (actions,) = self._session.run(["action"], inputs)
-        else:
-            actions, self._memory = self._session.run(
-                ["action", "next_memory"], inputs | {"memory": self._memory}
-            )
+    def _act(self, values: dict[str, np.ndarray]) -> np.ndarray:
+        """Action [J] of the network for values [history, size] by name."""
+        inputs = {name: value[None].astype(np.float32) for name, value in values.items()}
+        (actions,) = self._session.run(["action"], inputs)
+        if not np.all(np.isfinite(actions)):
+            raise UserError("the network gives an action that is not finite; stop the robot")
         return actions[0].astype(float)
 
     @property
@@ -171,14 +165,26 @@ class DeployedPolicy:
         stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
         actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
         outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
-        known = self._shapes.keys() | OF_BOUNCES | {"past_actions", "paddle_position"}
-        if unknown := stated.keys() - known:
+        sizes = self._sizes()
+        if unknown := stated.keys() - sizes:
             raise ValueError(f"its input {min(unknown)} is unknown here")
+        if wrong := [name for name, (_, size) in stated.items() if size != sizes[name]]:
+            raise ValueError(f"its input {wrong[0]} must have the size {sizes[wrong[0]]}")
         expected = {"action": [len(self.metadata.joint_names)]}
-        if size := self.metadata.memory_size:
-            stated["memory"] = expected["next_memory"] = [size]
-        if stated != actual or outputs != expected:
+        if stated != actual or outputs != expected or len(stated) < len(self.metadata.observation):
             raise ValueError("its inputs or outputs are not as its metadata states")
+
+    def _sizes(self) -> dict[str, int]:
+        """Number of entries of one value of each input that a network may have."""
+        sizes = {name: shape[0] for name, shape in self._shapes.items() if name != "time"}
+        derived = {
+            "paddle_position": 3,
+            "apex_error": 1,
+            "bounce_position": 2,
+            "bounce_interval": 1,
+        }
+        joints = ("past_actions", "bounce_joint_angles", "bounce_joint_velocities")
+        return sizes | derived | dict.fromkeys(joints, len(self.metadata.joint_names))
 
     def _needs(self) -> tuple[str, ...]:
         seen = {part.name for part in self.metadata.observation}
@@ -210,30 +216,12 @@ class DeployedPolicy:
         checked = {"ball_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
         checked["ball_angular_velocity"] = np.zeros(3)
         for name, value in measurements.items():
-            checked[name] = self._array(name, value)
+            limit = np.inf if name == "time" else _LARGEST
+            label = f"the measurement {name}"
+            checked[name] = _array(label, value, self._shapes[name], UNITS[name], limit)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
-
-    def _array(self, name: str, value: Any) -> np.ndarray:
-        shape = self._shapes[name]
-        try:
-            array = np.array(value, float)
-        except (TypeError, ValueError) as error:
-            raise UserError(
-                f"the measurement {name} is {str(value)[:100]!r}; give {_words(name, shape)}"
-            ) from error
-        if array.shape != shape and not (shape == (1,) and array.shape == ()):
-            raise UserError(
-                f"the measurement {name} has the shape {list(array.shape)}; give "
-                f"{_words(name, shape)}"
-            )
-        if not np.all(np.isfinite(array)):
-            raise UserError(
-                f"the measurement {name} holds {array[~np.isfinite(array)].flat[0]}; give finite "
-                f"numbers ({UNITS[name]})"
-            )
-        return array.reshape(shape)
 
     def _steps_since(self, time: float | None) -> int:
         """Control steps since the last step, at least 0."""
@@ -256,6 +244,16 @@ def _shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
     return shapes | {"ball_quaternion": (4,)}
 
 
-def _words(name: str, shape: tuple[int, ...]) -> str:
+def _array(label: str, value: Any, shape: tuple[int, ...], unit: str, limit: float) -> np.ndarray:
+    """A user's numbers as an array; UserError for another shape or numbers beyond a limit."""
     count = "one number" if shape == (1,) else f"{shape[0]} numbers"
-    return f"{count} ({UNITS[name]})"
+    try:
+        array = np.array(value, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
+    if array.shape != shape and not (shape == (1,) and array.shape == ()):
+        raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
+    wrong = ~(np.isfinite(array) & (np.abs(array) <= limit + 1e-6))
+    if np.any(wrong):
+        raise UserError(f"{label} holds {array[wrong].flat[0]}; give finite numbers ({unit})")
+    return array.reshape(shape)

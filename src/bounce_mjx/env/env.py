@@ -284,11 +284,7 @@ class Env:
         )
         memory = memory._replace(counter=noise.next_counter(memory.counter), actuation=queue)
         if "air_drag" in world:
-            velocity = jnp.stack([before.physics.qvel[i] for i in self._addresses.ball_qvel[:3]])
-            mass = before.parameters.ball_mass
-            if mass is None:
-                mass = float(self.mj_model.body_mass[self._addresses.ball_body])
-            control = control._replace(ball_force=actuation.drag_force(world, velocity, mass))
+            control = control._replace(air_drag=world["air_drag"])
         if "push_speed" in world:
             push = actuation.push(
                 world, memory.counter, memory.phases[1], memory.step, config.control_dt

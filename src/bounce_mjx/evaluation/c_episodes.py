@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from mujoco import rollout
 
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act_with_memory
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -48,11 +49,10 @@ def make_mujoco_evaluator(
         return reset_episodes(env, key, episodes, ranges)
 
     @jax.jit
-    def decide(policy, states, memory):
-        actions, memory = act_with_memory(networks, policy, states.obs.T, memory)
-        actions = actions.T
+    def decide(policy, states):
+        actions = act(networks, policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
-        return actions, memory, states, _rollout_inputs(env, control)
+        return actions, states, _inputs(env, control)
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -61,20 +61,17 @@ def make_mujoco_evaluator(
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         states = start(key, ranges)
-        memory = networks.policy_network.start_memory((episodes,))
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
-        ball_velocity = np.array(find_addresses(env.mj_model).ball_qvel[:3]) + 1 + env.mj_model.nq
+        ball_velocity = _ball_velocity(env.mj_model)
         models = episode_models(env, states.pipeline_state.parameters)
         data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
         statistics = empty_statistics(episodes)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, memory, states, inputs = decide(policy, states, memory)
-                control, push = (np.asarray(x, np.float64) for x in inputs)
-                simulated[:, ball_velocity] += push
-                spec = _CTRL if control.shape[-1] == env.mj_model.nu else _CTRL_AND_FORCE
-                trajectory, _ = pool.rollout(models, data, simulated, control, control_spec=spec)
-                simulated = trajectory[:, -1]
+                actions, states, inputs = decide(policy, states)
+                inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
+                simulated[:, ball_velocity] += inputs.ball_push
+                simulated = _simulate(pool, models, data, simulated, inputs)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
                 if step % 100 < 99:
@@ -88,24 +85,51 @@ def make_mujoco_evaluator(
     return evaluate
 
 
-def _rollout_inputs(env: BounceBall, control: Control) -> tuple[jax.Array, jax.Array]:
-    """Inputs of MuJoCo's rollout for N episodes [N, substeps, size] (`ctrl`, and `xfrc_applied` if
-    there is a force on the ball), and the velocities that pushes add to the balls [N, 3], m/s.
+class _Inputs(NamedTuple):
+    """Inputs of MuJoCo over one control step of N episodes."""
 
-    Args:
-      control: the batch is last.
-    """
-    count, model = control.ctrl.shape[-1], env.mj_model
+    targets: np.ndarray
+    """Servo targets [N, substeps, nu]."""
+    ball_push: np.ndarray
+    """Velocities [N, 3] that pushes add to the balls, m/s."""
+    air_drag: np.ndarray | None
+    """Deceleration [N] of the balls by the air divided by their squared speed, 1/m."""
+
+
+def _inputs(env: BounceBall, control: Control) -> _Inputs:
+    """Inputs from controls whose batch is last."""
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-    push = jnp.zeros((count, 3)) if control.ball_push is None else control.ball_push.T
-    if control.ball_force is None:
-        return targets, push
-    forces = jnp.zeros((count, model.nbody, 6))
-    forces = forces.at[:, find_addresses(model).ball_body, :3].set(control.ball_force.T)
-    forces = jnp.broadcast_to(
-        forces.reshape(count, 1, -1), (count, env.config.num_substeps, model.nbody * 6)
-    )
-    return jnp.concatenate([targets, forces], axis=-1), push
+    push = jnp.zeros((len(targets), 3)) if control.ball_push is None else control.ball_push.T
+    return _Inputs(targets, push, control.air_drag)
+
+
+def _simulate(
+    pool: rollout.Rollout,
+    models: list[mujoco.MjModel],
+    data: list[mujoco.MjData],
+    states: np.ndarray,
+    inputs: _Inputs,
+) -> np.ndarray:
+    """States [N, size] after one control step. The drag needs the velocity in each physics step."""
+    if inputs.air_drag is None:
+        trajectory, _ = pool.rollout(models, data, states, inputs.targets, control_spec=_CTRL)
+        return trajectory[:, -1]
+    ball, ball_velocity = find_addresses(models[0]).ball_body, _ball_velocity(models[0])
+    drag = inputs.air_drag * [model.body_mass[ball] for model in models]
+    forces = np.zeros((len(states), models[0].nbody, 6))
+    for targets in np.moveaxis(inputs.targets, 1, 0):
+        velocity = states[:, ball_velocity]
+        speed = np.linalg.norm(velocity, axis=1)
+        forces[:, ball, :3] = -(drag * speed)[:, None] * velocity
+        control = np.concatenate([targets, forces.reshape(len(states), -1)], axis=1)[:, None]
+        trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
+        states = trajectory[:, 0]
+    return states
+
+
+def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Indices [3] of the ball's velocity in a state of mjSTATE_FULLPHYSICS."""
+    return np.array(find_addresses(mj_model).ball_qvel[:3]) + 1 + mj_model.nq
 
 
 def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoco.MjModel]:

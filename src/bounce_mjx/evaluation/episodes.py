@@ -9,7 +9,7 @@ import numpy as np
 
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Memory, Networks, Policy, act_with_memory
+from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.task.randomization import Ranges
 from bounce_mjx.task.state import State
@@ -19,7 +19,6 @@ class _Episodes(NamedTuple):
     """Episodes under way, batch last."""
 
     states: State
-    memory: Memory
     statistics: Statistics
     recording: Recording
     step: jax.Array
@@ -61,16 +60,15 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
-    begun = _begin(env, networks, states, recorded)
+    begun = _begin(env, states, recorded)
     ended = _run_until(env, networks, policy, begun, env.config.episode_steps)
     return ended.statistics, ended.recording
 
 
-def _begin(env: BounceBall, networks: Networks, states: State, recorded: int) -> _Episodes:
+def _begin(env: BounceBall, states: State, recorded: int) -> _Episodes:
     episodes = states.done.shape[-1]
     return _Episodes(
         states=states,
-        memory=networks.policy_network.start_memory((episodes,)),
         statistics=empty_statistics(episodes),
         recording=empty_recording(
             env.config.episode_steps, env.action_size, min(recorded, episodes)
@@ -92,11 +90,10 @@ def _run_until(
         return jnp.any(now.statistics.running) & (now.step < last_step)
 
     def advance(now: _Episodes) -> _Episodes:
-        actions, memory = act_with_memory(networks, policy, now.states.obs.T, now.memory)
+        actions = act(networks, policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
         return _Episodes(
             states=states,
-            memory=memory,
             statistics=accumulate(env, now.statistics, states, now.step),
             recording=record(env, now.recording, states, now.statistics.running, now.step),
             step=now.step + 1,
@@ -133,7 +130,7 @@ def make_reporting_evaluator(
 
     @jax.jit
     def start(key: jax.Array) -> _Episodes:
-        return _begin(env, networks, reset_episodes(env, key, episodes), recorded=0)
+        return _begin(env, reset_episodes(env, key, episodes), recorded=0)
 
     @jax.jit
     def go_on(policy: Policy, now: _Episodes, last_step: jax.Array) -> _Episodes:

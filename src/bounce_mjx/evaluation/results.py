@@ -38,9 +38,15 @@ class Report:
         return all(result.passed is not False for result in self.results)
 
     @property
+    def margin(self) -> float:
+        """The smallest margin of a judged result, from 0 to 1."""
+        margins = [result.margin or 0.0 for result in self.results if result.passed is not None]
+        return min(margins, default=1.0)
+
+    @property
     def passed_with_margin(self) -> bool:
-        """Whether all judged results are met with a margin."""
-        return all(result.with_margin for result in self.results if result.passed is not None)
+        """Whether `MARGIN_EPISODES` other episodes should pass as well."""
+        return self.margin == 1.0
 
     @property
     def summary(self) -> str:
@@ -51,11 +57,11 @@ class Report:
         return f"{sum(judged)} of {len(judged)} {kind} met"
 
     @property
-    def score(self) -> tuple[bool, int, bool, float]:
+    def score(self) -> tuple[bool, int, float, float]:
         """Sort key of quality: a full evaluation ranks above a screening, then the number of
-        results met counts, then whether all are met with a margin, then the mean return."""
+        results met counts, then the smallest margin, then the mean return."""
         met = sum(result.passed is not False for result in self.results)
-        return not self.screening, met, self.passed_with_margin, self.details["mean_return"]
+        return not self.screening, met, self.margin, self.details["mean_return"]
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> "Report":

@@ -4,11 +4,13 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pydantic
+from pydantic import Field
 
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
@@ -39,8 +41,8 @@ class Outcome(pydantic.BaseModel):
     strength: float | None
     trained: bool
     """Whether the training ranges of the policy contain the condition."""
-    physics: str
-    """Name of the engine: fused, mjx or mujoco."""
+    physics: Literal["fused", "mjx", "mujoco"]
+    """Name of the engine."""
     values: dict[str, float | None]
     """The five results by name; None if there was nothing to measure."""
     failed: list[str]
@@ -64,7 +66,7 @@ class RobustnessReport(pydantic.BaseModel):
     episodes: int
     """Number of episodes in each condition."""
     seed: int
-    outcomes: list[Outcome]
+    outcomes: Annotated[list[Outcome], Field(min_length=1, max_length=10_000)]
 
     @property
     def passed(self) -> bool:

@@ -199,7 +199,7 @@ def _with_settings(
                 f"{source}: {shorten(name)} is not a setting to perturb; give a key of env, and "
                 "terms of the randomisation under terms"
             )
-        group[key] = _SIGNS[value] * strength if value in _SIGNS else value
+        group[key] = _filled_in(value, strength)
     changed = validate(EnvConfig, values, source)
     if changed.layout != env.layout:
         raise UserError(
@@ -207,6 +207,15 @@ def _with_settings(
             "fixes; remove that setting"
         )
     return changed
+
+
+def _filled_in(value: Any, strength: float | None) -> Any:
+    """A value from the suite with the number in place of each word strength."""
+    if isinstance(value, dict):
+        return {key: _filled_in(inner, strength) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_filled_in(inner, strength) for inner in value]
+    return _SIGNS[value] * strength if isinstance(value, str) and value in _SIGNS else value
 
 
 def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, source: str) -> Bounds:

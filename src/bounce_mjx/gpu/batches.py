@@ -1,32 +1,12 @@
 """Kernels under `jax.vmap` and on several devices."""
 
-import contextlib
-import contextvars
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.custom_partitioning import custom_partitioning
 from jax.sharding import NamedSharding, PartitionSpec
-
-_outer_axis: contextvars.ContextVar[int] = contextvars.ContextVar("outer_axis", default=0)
-
-
-@contextlib.contextmanager
-def outer_axis(size: int) -> Iterator[None]:
-    """Tells that `jax.vmap` adds an axis of this size around all that is traced within. JAX first
-    traces the functions of `batch_by` without it, and drops what it has traced."""
-    token = _outer_axis.set(size)
-    try:
-        yield
-    finally:
-        _outer_axis.reset(token)
-
-
-def is_dropped() -> bool:
-    """Whether a function of `batch_by` is being traced without the outer axis."""
-    return _outer_axis.get() > 0
 
 
 def batch_by(function: Callable[..., tuple], batched: Callable[..., tuple]) -> Callable[..., tuple]:
@@ -44,8 +24,7 @@ def batch_by(function: Callable[..., tuple], batched: Callable[..., tuple]) -> C
             x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             for x, is_batched in zip(args, in_batched, strict=True)
         ]
-        with outer_axis(0 if axis_size == _outer_axis.get() else _outer_axis.get()):
-            results = tuple(batched(*args))
+        results = tuple(batched(*args))
         return results, (True,) * len(results)
 
     return call
@@ -58,7 +37,8 @@ def partition_by(
     replicated: tuple[str, ...],
     **sizes: int,
 ) -> Callable[..., Any]:
-    """`function`, which each of several devices applies to its shard.
+    """`function`, which each of several devices applies to its shard; in the program of one device,
+    it is the function itself.
 
     Args:
       specs: computes the partitions of the arguments and of the results from the partition of the
@@ -67,10 +47,6 @@ def partition_by(
       replicated: the axes of the rule that are never sharded.
       sizes: size of each axis in the rule that is only part of an array's axis.
     """
-    # On one device, a custom partitioning would have no effect except to keep the program out of
-    # the compilation cache.
-    if jax.device_count() == 1:
-        return function
     partitioned = custom_partitioning(function)
 
     def partition(mesh, arg_shapes, result_shape):

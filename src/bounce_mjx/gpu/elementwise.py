@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
 from bounce_mjx.gpu.batches import batch_by, partition_by
-from bounce_mjx.gpu.kernel_calls import Key, call_kernel, lowers_for_another
+from bounce_mjx.gpu.kernel_calls import Key, call_kernel
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
@@ -233,7 +233,7 @@ def in_kernel(
     """
 
     def run(rows: jax.Array) -> jax.Array:
-        if interpret or lowers_for_another():
+        if interpret:
             return _run_in_kernel(rows, function, num_results, key, interpret)
         # `jax.jit`, because the primitive has no implementation outside compiled programs.
         bind = functools.partial(

@@ -59,13 +59,13 @@ def pack(tree: Any) -> Any:
     return Rows.of(tree) if has_kernels() else tree
 
 
-def pack_steps(tree: Any) -> Any:
+def pack_steps(tree: Any, num_devices: int) -> Any:
     """Packs a pytree of arrays [T, ..., B], whose T parts a loop unpacks one after another.
 
     The rows of a part are one axis: from [T, R, B], XLA would cut each row in the loop on its own,
-    instead of all of them at once. Several devices share the axis B, so they keep the arrays.
+    instead of all of them at once. Several devices that share the axis B keep the arrays.
     """
-    if not has_kernels() or jax.device_count() > 1:
+    if not has_kernels() or num_devices > 1:
         return tree
     packed = jax.vmap(Rows.of)(tree)
     return dataclasses.replace(packed, rows=packed.rows.reshape(len(packed.rows), -1), flat=True)

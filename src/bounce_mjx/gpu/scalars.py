@@ -249,13 +249,33 @@ def _logistic(x: Scalar) -> Scalar:
 
 
 def _sqrt(x: Scalar) -> Scalar:
-    positive = x > 0.0
-    return jnp.where(positive, x * lax.rsqrt(jnp.where(positive, x, 1.0)), x)
+    regular = (x > 0.0) & (x < jnp.inf)
+    root = x * lax.rsqrt(jnp.where(regular, x, 1.0))
+    return jnp.where(regular, root, jnp.where(x < 0.0, jnp.nan, x))
 
 
 def _floor(x: Scalar) -> Scalar:
     nearest = lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN)
     return jnp.where(nearest > x, nearest - 1.0, nearest)
+
+
+def _log1p(x: Scalar) -> Scalar:
+    # The sum 1 + x loses the digits of a small x, but not the Taylor series.
+    series = x * (1.0 - x * (0.5 - x * (1.0 / 3.0 - 0.25 * x)))
+    return jnp.where(jnp.abs(x) < 0.03, series, jnp.log(1.0 + x))
+
+
+def _pow(x: Scalar, y: Scalar) -> Scalar:
+    y = lax.convert_element_type(y, x.dtype)
+    whole = _floor(y) == y
+    odd = whole & (2.0 * _floor(0.5 * y) != y)
+    power = jnp.exp(y * jnp.log(jnp.abs(x)))
+    # The product is NaN for 0^0, inf^0 and (+-1)^inf.
+    is_one = (y == 0.0) | (x == 1.0) | ((x == -1.0) & whole)
+    power = jnp.where(is_one, 1.0, power)
+    power = jnp.where((x < 0.0) & (x > -jnp.inf) & ~whole, jnp.nan, power)
+    is_negative = (x < 0.0) | (1.0 / x < 0.0)
+    return jnp.where(odd & is_negative, -power, power)
 
 
 # Operations that Mosaic GPU does not compile, expressed with operations that it does.
@@ -264,9 +284,9 @@ _REWRITTEN: dict[str, Callable[..., Scalar]] = {
     "copy": lambda x: x,
     "floor": _floor,
     "is_finite": lambda x: jnp.abs(x) < jnp.inf,
-    "log1p": lambda x: jnp.log(1.0 + x),
+    "log1p": _log1p,
     "logistic": _logistic,
-    "pow": lambda x, y: jnp.exp(y * jnp.log(x)),
+    "pow": _pow,
     "sqrt": _sqrt,
     "stop_gradient": lambda x: x,
 }

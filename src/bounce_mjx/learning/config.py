@@ -1,6 +1,6 @@
 """Settings of the trainer."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import Field
@@ -59,11 +59,6 @@ class PPOConfig(StrictModel):
     """Factor by which the trainer scales the reward."""
     init_noise_std: Positive = 0.4
     """Standard deviation of the action noise at the start."""
-    network: Literal["mlp", "gru"] = "mlp"
-    """Policy network: hidden layers alone, or hidden layers and a gated recurrent unit, which
-    remembers the episode so far. The value network is always an mlp."""
-    gru_size: Count = 128
-    """Size of the memory of a gru."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy and of the value network."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -72,6 +67,19 @@ class PPOConfig(StrictModel):
     critic_metrics: tuple[str, ...] = ("n_bounces",)
     """Metrics of the environment that are inputs of the value network in addition to the
     observation. The reward depends on the bounce count, which the observation does not contain."""
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _check_network(cls, values: Any) -> Any:
+        """Configs of older versions name the kind of the policy network."""
+        if not isinstance(values, dict):
+            return values
+        if values.get("network", "mlp") != "mlp":
+            raise ValueError(
+                f"network is {values['network']}, but this version has no recurrent policies; "
+                "train a policy that sees past values, such as env.observation.ball_position: 10"
+            )
+        return {key: x for key, x in values.items() if key not in ("network", "gru_size")}
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):
@@ -87,11 +95,6 @@ class PPOConfig(StrictModel):
                 f"num_minibatches {self.num_minibatches} does not divide the batch of "
                 f"{batch} samples (num_envs {self.num_envs} * rollout_length "
                 f"{self.rollout_length}); choose a divisor of {batch}"
-            )
-        if self.network == "gru" and self.num_envs % self.num_minibatches:
-            raise ValueError(
-                f"num_minibatches {self.num_minibatches} does not divide num_envs {self.num_envs}; "
-                "the minibatches of a gru consist of whole environments, so choose a divisor"
             )
         return self
 

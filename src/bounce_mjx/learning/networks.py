@@ -1,5 +1,4 @@
-"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights, and a
-policy with a gated recurrent unit.
+"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights.
 
 A policy's file stores the parameters under the names of these modules, so the names must not
 change.
@@ -54,14 +53,18 @@ class MLP(nn.Module):
     """Width of each layer."""
     activate_final: bool
     """Whether SiLU follows the last layer too."""
+    dtype: Any = None
+    """Type in which layers with SiLU are computed; None for that of inputs and parameters."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs [..., widths[-1]] for inputs [..., N]."""
         for i, width in enumerate(self.widths):
-            x = nn.Dense(width, kernel_init=orthogonal(_GAIN), name=f"hidden_{i}")(x)
-            if self.activate_final or i + 1 < len(self.widths):
-                x = nn.silu(x)
+            is_hidden = self.activate_final or i + 1 < len(self.widths)
+            dtype = self.dtype if is_hidden else None
+            init, name = orthogonal(_GAIN), f"hidden_{i}"
+            dense = nn.Dense(width, dtype=dtype, kernel_init=init, name=name)
+            x = nn.silu(dense(x)) if is_hidden else dense(x)
         return x
 
 
@@ -85,34 +88,14 @@ class PolicyNetwork(nn.Module):
     hidden_layers: tuple[int, ...]
     action_size: int
     init_noise_std: float
+    dtype: Any = None
+    """Type in which the hidden layers are computed; None for that of inputs and parameters."""
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
         """Distribution of the action [..., A] for normalised observations [..., N]."""
-        hidden = MLP(self.hidden_layers, activate_final=True)(observation)
+        hidden = MLP(self.hidden_layers, activate_final=True, dtype=self.dtype)(observation)
         mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
         return Gaussian(mean, jnp.broadcast_to(std, mean.shape))
-
-
-class RecurrentPolicyNetwork(nn.Module):
-    """A `PolicyNetwork` with a gated recurrent unit (Cho et al. 2014) behind the hidden layers."""
-
-    hidden_layers: tuple[int, ...]
-    gru_size: int
-    action_size: int
-    init_noise_std: float
-
-    @nn.compact
-    def __call__(self, observation: jax.Array, memory: jax.Array) -> tuple[Gaussian, jax.Array]:
-        """Distribution of the action [..., A] and the next memory [..., H], for normalised
-        observations [..., N] and the memory [..., H] of the observations before."""
-        hidden = MLP(self.hidden_layers, activate_final=True)(observation)
-        memory, output = nn.GRUCell(
-            self.gru_size, recurrent_kernel_init=orthogonal(1.0), name="gru"
-        )(memory, hidden)
-        mean_init = orthogonal(_MEAN_GAIN)
-        mean = nn.Dense(self.action_size, kernel_init=mean_init)(output)
-        std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
-        return Gaussian(mean, jnp.broadcast_to(std, mean.shape)), memory

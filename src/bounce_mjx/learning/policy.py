@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.gaussian import Gaussian
-from bounce_mjx.learning.networks import MLP, PolicyNetwork, RecurrentPolicyNetwork
+from bounce_mjx.learning.networks import MLP, PolicyNetwork
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
 
 
@@ -21,12 +20,7 @@ class Policy(NamedTuple):
     """Parameters of the policy network."""
 
 
-Memory = tuple[jax.Array, ...]
-"""Memory of a policy network between control steps: (hidden state [..., H],) of a gru, and () of an
-mlp."""
-
-
-class Network(NamedTuple):
+class NetworkFunctions(NamedTuple):
     """A network as two pure functions."""
 
     init: Callable[[jax.Array], Any]
@@ -35,70 +29,42 @@ class Network(NamedTuple):
     """(parameters, normalised inputs [..., N]) -> output."""
 
 
-class PolicyFunctions(NamedTuple):
-    """A policy network as pure functions."""
-
-    init: Callable[[jax.Array], Any]
-    """key -> parameters; consumes the key."""
-    apply: Callable[..., Any]
-    """(parameters, normalised observations [..., N]) -> `Gaussian` over actions [..., A]. A gru
-    takes its hidden state [..., H] as third argument and also returns the next one; `respond` calls
-    both kinds alike."""
-    start_memory: Callable[[tuple[int, ...]], Memory]
-    """Shape of the batch -> memory at the start of an episode: zeros."""
-
-
 class Networks(NamedTuple):
     """The two networks of a training."""
 
-    policy_network: PolicyFunctions
-    value_network: Network
+    policy_network: NetworkFunctions
+    """Its inputs are observations, its output is a `Gaussian` over actions [..., A]."""
+    value_network: NetworkFunctions
     """Its inputs are the observation and the critic metrics, its output the values [...]."""
 
 
-class Outputs(NamedTuple):
-    """Both networks with their parameters, for T steps of B environments; without derivatives."""
-
-    distribution: Callable[[jax.Array, Memory], tuple[Gaussian, Memory]]
-    """(normalised inputs of both networks [B, N], memory) -> distribution of the actions [B, A],
-    next memory."""
-    values: Callable[[jax.Array], jax.Array]
-    """Normalised inputs [T, B, N] -> values [T, B]."""
-
-
 def make_networks(
-    config: PPOConfig, observation_size: int, action_size: int, num_critic_metrics: int = 0
+    config: PPOConfig,
+    observation_size: int,
+    action_size: int,
+    num_critic_metrics: int = 0,
+    dtype: Any = None,
 ) -> Networks:
-    """The networks of a config for an environment with these sizes; the critic is not needed to
-    act."""
-    value = MLP((*config.hidden_layers, 1), activate_final=False)
+    """The networks of a config for an environment with these sizes.
+
+    Args:
+      num_critic_metrics: metrics that the critic sees; to act, it is not needed.
+      dtype: type in which the hidden layers are computed; by default, that of their inputs and
+        parameters.
+    """
+    sizes = action_size, config.init_noise_std
+    policy = PolicyNetwork(config.hidden_layers, *sizes, dtype)
+    value = MLP((*config.hidden_layers, 1), activate_final=False, dtype=dtype)
     critic_size = observation_size + num_critic_metrics
     return Networks(
-        policy_network=_policy_functions(config, observation_size, action_size),
-        value_network=Network(
+        policy_network=NetworkFunctions(
+            init=lambda key: policy.init(key, jnp.zeros((1, observation_size))),
+            apply=policy.apply,
+        ),
+        value_network=NetworkFunctions(
             init=lambda key: value.init(key, jnp.zeros((1, critic_size))),
             apply=lambda params, inputs: value.apply(params, inputs)[..., 0],
         ),
-    )
-
-
-def _policy_functions(
-    config: PPOConfig, observation_size: int, action_size: int
-) -> PolicyFunctions:
-    sizes = action_size, config.init_noise_std
-    one = jnp.zeros((1, observation_size))
-    if config.network == "mlp":
-        mlp = PolicyNetwork(config.hidden_layers, *sizes)
-        return PolicyFunctions(
-            init=lambda key: mlp.init(key, one),
-            apply=mlp.apply,
-            start_memory=lambda batch: (),
-        )
-    gru = RecurrentPolicyNetwork(config.hidden_layers, config.gru_size, *sizes)
-    return PolicyFunctions(
-        init=lambda key: gru.init(key, one, jnp.zeros((1, config.gru_size))),
-        apply=gru.apply,
-        start_memory=lambda batch: (jnp.zeros((*batch, config.gru_size)),),
     )
 
 
@@ -107,69 +73,7 @@ def untrained_policy(networks: Networks, observation_size: int, key: jax.Array) 
     return Policy(init_normalizer(observation_size), networks.policy_network.init(key))
 
 
-def respond(
-    network: PolicyFunctions, params: Any, inputs: jax.Array, memory: Memory
-) -> tuple[Gaussian, Memory]:
-    """Distribution of the actions [..., A] and the next memory, for normalised observations
-    [..., N]."""
-    if not memory:
-        return network.apply(params, inputs), ()
-    distribution, hidden = network.apply(params, inputs, *memory)
-    return distribution, (hidden,)
-
-
-def respond_in_sequence(
-    network: PolicyFunctions, params: Any, inputs: jax.Array, memory: Memory, starts: jax.Array
-) -> Gaussian:
-    """Distributions of the actions [..., T, A] for T control steps; a gradient flows back through
-    all of them (Werbos 1990).
-
-    Args:
-      inputs: normalised observations [..., T, N].
-      memory: before the first step.
-      starts: whether each step is the first one of an episode, which begins without a memory
-        [..., T], bool.
-    """
-
-    def step(memory: Memory, now: tuple[jax.Array, jax.Array]) -> tuple[Memory, Gaussian]:
-        inputs, starts = now
-        distribution, memory = respond(network, params, inputs, forget(memory, starts))
-        return memory, distribution
-
-    steps = jnp.moveaxis(inputs, -2, 0), jnp.moveaxis(starts, -1, 0)
-    _, distributions = jax.lax.scan(step, memory, steps)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2), distributions)
-
-
-def forget(memory: Memory, starts: jax.Array) -> Memory:
-    """Memory [..., H], emptied where an episode starts [...]."""
-    return jax.tree.map(lambda x: jnp.where(starts[..., None], 0.0, x), memory)
-
-
-def cast_hidden_layers(config: PPOConfig, params: Any, dtype: jnp.dtype) -> Any:
-    """Parameters of one network of `make_networks` with its hidden layers in another type.
-
-    The output layer and the noise keep theirs, so the outputs stay as precise: flax computes a
-    layer in the wider one of the types of its parameters and its input.
-    """
-    hidden = {f"hidden_{i}" for i in range(len(config.hidden_layers))}
-
-    def cast(path: tuple, x: jax.Array) -> jax.Array:
-        return x.astype(dtype) if any(getattr(k, "key", None) in hidden for k in path) else x
-
-    return jax.tree_util.tree_map_with_path(cast, params)
-
-
 def act(networks: Networks, policy: Policy, observation: jax.Array) -> jax.Array:
-    """The most likely actions [..., A] of an mlp for observations [..., N], clipped to [-1, 1]."""
-    return act_with_memory(networks, policy, observation, ())[0]
-
-
-def act_with_memory(
-    networks: Networks, policy: Policy, observation: jax.Array, memory: Memory
-) -> tuple[jax.Array, Memory]:
-    """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1], and the next
-    memory."""
+    """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1]."""
     inputs = normalize(observation, policy.normalizer)
-    distribution, memory = respond(networks.policy_network, policy.params, inputs, memory)
-    return jnp.clip(distribution.mean, -1.0, 1.0), memory
+    return jnp.clip(networks.policy_network.apply(policy.params, inputs).mean, -1.0, 1.0)

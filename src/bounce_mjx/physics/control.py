@@ -12,7 +12,8 @@ class Control(NamedTuple):
     """Servo targets and disturbances over N physics steps; None leaves a disturbance out.
 
     All engines apply it the same way: `servo_targets` gives the `ctrl` of each physics step, the
-    push changes the ball's velocity before the first step, and the force acts during every step.
+    push changes the ball's velocity before the first step, and every step has the drag of its
+    velocity.
     """
 
     ctrl: Any
@@ -25,8 +26,8 @@ class Control(NamedTuple):
     """Outputs [nu] of the servos' first-order lags before the first step."""
     lag: Any = None
     """Time constant [] of the lags in physics steps."""
-    ball_force: Any = None
-    """Force [3] on the ball's centre, N."""
+    air_drag: Any = None
+    """Deceleration of the ball by the air divided by its squared speed [], 1/m."""
     ball_push: Any = None
     """Velocity [3] added to the ball's before the first step, m/s."""
 
@@ -59,3 +60,10 @@ def servo_targets(control: Control, num_steps: int) -> jax.Array:
     """Targets [num_steps, nu] of all servos in each physics step."""
     steps = jnp.arange(num_steps, dtype=control.ctrl.dtype)
     return jax.vmap(lambda step: servo_target(control, step))(steps)
+
+
+def drag(air_drag: Scalar, velocity: Any) -> tuple[Scalar, ...]:
+    """Acceleration of a ball with this velocity (x, y, z; m/s) by the drag of the air, m/s^2."""
+    squared = sum(v * v for v in velocity)
+    speed = squared * jax.lax.rsqrt(jnp.where(squared > 0.0, squared, 1.0))
+    return tuple(-air_drag * speed * v for v in velocity)

@@ -1,8 +1,6 @@
 """Interface of the physics engines, and the choice of an engine for a model."""
 
-import contextlib
 import functools
-import io
 from collections.abc import Callable
 from types import ModuleType
 from typing import NamedTuple
@@ -11,6 +9,7 @@ import jax
 import mujoco
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.lazy import silence_mjx
 from bounce_mjx.physics import fused
 from bounce_mjx.physics.control import Control
 from bounce_mjx.physics.convergence import solver_warning
@@ -34,6 +33,12 @@ class Engine(NamedTuple):
     """Known differences from MuJoCo's C engine, one sentence each, shown to the user."""
 
 
+def is_fused(mj_model: mujoco.MjModel, choice: str) -> bool:
+    """Whether the engine `choice` ("auto", "fused" or "mjx") is fused for a compiled model; this
+    starts no device of JAX's."""
+    return choice == "fused" or (choice == "auto" and fused.unsupported_feature(mj_model) is None)
+
+
 def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     """Builds the engine `choice` ("auto", "fused" or "mjx") for a compiled model.
 
@@ -41,7 +46,7 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
       UserError: the engine does not support the model.
     """
     beyond_fused = fused.unsupported_feature(mj_model)
-    if choice == "fused" or (choice == "auto" and beyond_fused is None):
+    if is_fused(mj_model, choice):
         if beyond_fused is not None:
             raise UserError(_refusal(beyond_fused, _beyond_mjx(mj_model), "fused"))
         reason = "the model qualifies" if choice == "auto" else "chosen by --physics fused"
@@ -112,10 +117,10 @@ def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
 
 
 def _mjx_engine() -> ModuleType:
-    # The import is lazy because MJX takes seconds to import, and silent because MJX prints a line
-    # for each optional dependency that is not installed.
-    with contextlib.redirect_stdout(io.StringIO()):
-        from bounce_mjx.physics import mjx_engine
+    # The import is lazy because MJX takes seconds to import.
+    silence_mjx()
+    from bounce_mjx.physics import mjx_engine
+
     return mjx_engine
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import re
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from mujoco import mjx
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.control import Control, servo_target
+from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, find_addresses
@@ -61,9 +62,8 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
     m = mj_model
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
     ignored = {
-        f"the integrator {integrator.name} (only Euler, RK4 and implicitfast)": (
-            integrator not in _INTEGRATORS
-        ),
+        f"the integrator {integrator.name.removeprefix('mjINT_').lower()} "
+        "(only Euler, RK4 and implicitfast)": integrator not in _INTEGRATORS,
         "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
         "limits of a servo whose gain depends on its state (gaintype affine)": (
             integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and _has_limited_affine_gain(m)
@@ -83,8 +83,13 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
         "nonlinear damping (damping with several numbers)": (
             np.any(m.dof_dampingpoly) or np.any(m.tendon_dampingpoly)
         ),
-        "a solref of mixed signs": np.any(m.pair_solref[:, 0] * m.pair_solref[:, 1] < 0.0),
-        "a solimp without a width": np.any(m.pair_solimp[:, 2] <= mujoco.mjMINVAL),
+        "springs, damping or gravity compensation with the flag spring or damper disabled": (
+            _loses_passive_forces(m)
+        ),
+        "a solref with exactly one positive number": np.any(
+            np.sum(_all_constraints(m, "ref") > 0.0, axis=1) == 1
+        ),
+        "a solimp without a width": np.any(_all_constraints(m, "imp")[:, 2] <= mujoco.mjMINVAL),
         "adhesion": np.any(m.pair_adhesion) or np.any(m.geom_adhesion),
         "surface velocities (surfacevel)": np.any(m.geom_surfacevel),
         "sleeping bodies (sleep)": m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
@@ -96,8 +101,31 @@ def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
     try:
         mjx.put_model(mj_model)
     except NotImplementedError as error:
-        return f"a feature of the MJCF ({str(error).rstrip('.')})"
+        return f"a feature of the MJCF ({_in_words(str(error))})"
     return None
+
+
+def _loses_passive_forces(m: mujoco.MjModel) -> bool:
+    """Whether MJX leaves out a force: with one of the two flags disabled, it has no passive force
+    at all."""
+    springs, dampers = (
+        not m.opt.disableflags & flag
+        for flag in (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    )
+    kept = (m.jnt_stiffness, m.tendon_stiffness) if springs else (m.dof_damping, m.tendon_damping)
+    return springs != dampers and bool(m.ngravcomp or any(map(np.any, kept)))
+
+
+def _all_constraints(m: mujoco.MjModel, kind: str) -> np.ndarray:
+    """`solref` or `solimp` (the kind "ref" or "imp") of everything that has one."""
+    owners = ("pair_{}", "geom_{}", "jnt_{}", "dof_{}", "eq_{}", "tendon_{}_lim", "tendon_{}_fri")
+    return np.concatenate([getattr(m, owner.format(f"sol{kind}")) for owner in owners])
+
+
+def _in_words(message: str) -> str:
+    """MJX's message without its enumerations: "(mjtGeom.mjGEOM_BOX, ...)" becomes "box, ..."."""
+    named = re.sub(r"mjt\w+\.mj[A-Z]+_(\w+)(: \d+)?", lambda match: match[1].lower(), message)
+    return re.sub(r"[][()<>]", "", named).rstrip(".")
 
 
 def _has_limited_affine_gain(m: mujoco.MjModel) -> bool:
@@ -121,20 +149,22 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps."""
     addresses = constants.addresses
+    ball_velocity = np.array(addresses.ball_qvel[:3])
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
+        if control.air_drag is not None:
+            acceleration = jnp.stack(drag(control.air_drag, data.qvel[ball_velocity]))
+            force = model.body_mass[addresses.ball_body] * acceleration
+            applied = data.xfrc_applied.at[addresses.ball_body, :3].set(force)
+            data = data.replace(xfrc_applied=applied)
         return mjx.step(_with_saturated_servos(model, constants, data), data)
 
     with _full_precision():
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
-            velocity = np.array(addresses.ball_qvel[:3])
-            data = data.replace(qvel=data.qvel.at[velocity].add(control.ball_push))
-        if control.ball_force is not None:
-            force = data.xfrc_applied.at[addresses.ball_body, :3].set(control.ball_force)
-            data = data.replace(xfrc_applied=force)
+            data = data.replace(qvel=data.qvel.at[ball_velocity].add(control.ball_push))
         if state.act is not None:
             data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)

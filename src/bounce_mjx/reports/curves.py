@@ -1,13 +1,15 @@
 """Learning curves from the TensorBoard logs of runs, grouped by config (ignoring the seed)."""
 
 import json
+import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import identify_robot
@@ -16,6 +18,7 @@ from bounce_mjx.runs.robot import identify_robot
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
 # Maximum number of settings in a label.
 _MAX_NAMED = 3
+_MAX_LOG_BYTES = 2**28
 
 
 class Curve(NamedTuple):
@@ -47,20 +50,37 @@ class Group(NamedTuple):
 
 
 def read_curves(run: Path) -> RunCurves:
-    """Reads the scalars in the log of a run.
+    """Reads the finite scalars in the log of a run.
 
     Raises:
-      UserError: the log has no scalars.
+      UserError: the log is damaged or has no scalars.
     """
     # At the top of the module, this import would delay the start of a training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    files = list(run.glob("*tfevents*"))
+    # TensorBoard would wait for a pipe's writer.
+    if not all(map(os.path.isfile, files)) or sum(map(os.path.getsize, files)) > _MAX_LOG_BYTES:
+        raise UserError(
+            f"the TensorBoard log in {run} is longer than {_MAX_LOG_BYTES // 2**20} MB or not a "
+            "regular file; remove it, or give another run's folder"
+        )
     # 0 keeps every point; by default, at most 10,000 points are kept.
-    log = EventAccumulator(str(run), size_guidance={"scalars": 0}).Reload()
+    log = EventAccumulator(str(run), size_guidance={"scalars": 0})
+    try:
+        log.Reload()
+    # Damaged files raise exceptions of many types.
+    except Exception as error:
+        raise UserError(
+            f"the TensorBoard log in {run} is damaged ({shorten(reason_of(error))}); remove it, or "
+            "give another run's folder"
+        ) from error
     curves = {}
     for name in log.Tags()["scalars"]:
         # A resumed run may have logged a step twice; the later value belongs to the final policy.
-        values = {event.step: event.value for event in log.Scalars(name)}
+        values = {e.step: e.value for e in log.Scalars(name) if math.isfinite(e.value)}
+        if not values:
+            continue
         steps = sorted(values)
         curves[name] = Curve(np.array(steps), np.array([values[step] for step in steps]))
     if not curves:

@@ -132,6 +132,11 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
+def literal(text: str) -> str:
+    """A text that matplotlib does not read as a formula."""
+    return text.replace("$", r"\$")
+
+
 @contextlib.contextmanager
 def style() -> Iterator[None]:
     """The look of all figures."""
@@ -179,7 +184,7 @@ def _value_label(value: float, _) -> str:
 def _add_legend(figure: Figure, groups: Sequence[Group], *, solved: bool) -> None:
     axes = figure.axes[0]
     handles = [
-        axes.plot([], [], color=colour, linewidth=1.6, label=group.label)[0]
+        axes.plot([], [], color=colour, linewidth=1.6, label=literal(group.label))[0]
         for group, colour in _coloured(groups)
     ]
     if solved and any(run.solved_steps is not None for group in groups for run in group.runs):

@@ -28,6 +28,7 @@ from bounce_mjx.reports.figures import (
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, verdict
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import load_policy
@@ -74,7 +75,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     }
     page = run / REPORT_FILE
     try:
-        page.write_text(_page(run, config, results, figures), encoding="utf-8")
+        write_atomically(page, _page(run, config, results, figures))
     except OSError as error:
         raise UserError(
             f"{page} cannot be written ({error.strerror}); make the folder writable"

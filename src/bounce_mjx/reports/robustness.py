@@ -17,7 +17,7 @@ from rich.table import Table
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
-from bounce_mjx.reports.figures import style
+from bounce_mjx.reports.figures import literal, style
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.files import read_json
 
@@ -59,7 +59,10 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
     if not path.is_file():
         return None
     try:
-        return read_json(path, RobustnessReport)
+        report = read_json(path, RobustnessReport)
+        if any(_HEADERS.keys() - outcome.values.keys() for outcome in report.outcomes):
+            raise ValueError("an outcome lacks a result")
+        return report
     except (OSError, ValueError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); delete it, or write it again with bounce-mjx "
@@ -109,7 +112,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
         title = f"{report.met} of {len(report.outcomes)} conditions meet all judged results"
         below = f"{report.episodes} episodes in each condition, {_engines_text(report)}"
         figure.text(0.02, 1 - 0.25 / height, title, va="center", fontsize=11, fontweight="bold")
-        figure.text(0.02, 1 - 0.48 / height, below, va="center", fontsize=8.5)
+        figure.text(0.02, 1 - 0.48 / height, literal(below), va="center", fontsize=8.5)
         cells = max(len(row) for column in columns for _, rows in column for row in rows)
         for i, column in enumerate(columns):
             axes = figure.add_axes(
@@ -175,12 +178,17 @@ def _draw_column(axes: Axes, groups: Sequence[Group]) -> None:
     y = 0.0
     for name, rows in groups:
         if name != NOMINAL:
-            axes.text(-0.15, y + 0.75, name, ha="right", va="center", fontsize=9, fontweight="bold")
+            heading = literal(name)
+            axes.text(
+                -0.15, y + 0.75, heading, ha="right", va="center", fontsize=9, fontweight="bold"
+            )
             y += 1.3
         for row in rows:
             unit = row[0].unit
             label = f"{row[0].perturbation}, {unit}" if unit else row[0].perturbation
-            axes.text(-0.15, y + 0.5, label, ha="right", va="center", fontsize=8, color=_INK)
+            axes.text(
+                -0.15, y + 0.5, literal(label), ha="right", va="center", fontsize=8, color=_INK
+            )
             for x, outcome in enumerate(row):
                 _draw_cell(axes, x, y, outcome)
             _draw_frames(axes, y, [outcome.trained for outcome in row])
@@ -189,7 +197,7 @@ def _draw_column(axes: Axes, groups: Sequence[Group]) -> None:
 
 
 def _draw_cell(axes: Axes, x: float, y: float, outcome: Outcome) -> None:
-    share = outcome.values["stable"]
+    share = outcome.values["stable"] or 0.0
     shade = float(_SCALE(share))
     axes.add_patch(
         Rectangle((x + 0.03, y + 0.04), 0.94, 0.92, facecolor=_COLOURS(shade), edgecolor="none")

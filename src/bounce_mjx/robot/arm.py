@@ -5,7 +5,7 @@ Every change to the user's model is collected as one sentence.
 
 import contextlib
 import importlib.util
-import io
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.limits import check_files
 from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
@@ -30,6 +31,7 @@ _HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "target_height")
 _RESERVED += ("paddle_home",)
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
@@ -75,7 +77,8 @@ def locate(mjcf: Path) -> Path:
     else:
         path = mjcf
     if not path.is_file():
-        raise UserError(f"the MJCF file {path} does not exist; give the path of an MJCF file")
+        wrong = "is no file" if path.exists() else "does not exist"
+        raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
     return path
 
 
@@ -132,13 +135,19 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     """The spec of an MJCF file.
 
     Raises:
-      UserError: the file is no MJCF.
+      UserError: the file is no MJCF, or is too large.
     """
+    check_files(path)
     try:
         with _silent():
-            return mujoco.MjSpec.from_file(str(path))
+            spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise _not_compiled(path, error) from error
+    # The task needs no user data, and the memory that MuJoCo chooses.
+    spec.memory, spec.nuserdata, spec.nkey = -1, 0, 0
+    for name in [name for name in dir(spec) if name.startswith("nuser_")]:
+        setattr(spec, name, -1)
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -166,12 +175,22 @@ def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarr
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, config.site)
     if body > 0:
         return body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    sites = _listed(model.site(i).name for i in range(model.nsite))
-    bodies = _listed(model.body(i).name for i in range(1, model.nbody))
-    raise UserError(
-        f"no site or body named {shorten(config.site)}; give --site one of the sites ({sites}) or "
-        f"bodies ({bodies})"
-    )
+    raise UserError(f"no site or body named {shorten(config.site)}; {_other_sites(model)}")
+
+
+def _other_sites(model: mujoco.MjModel) -> str:
+    """The remedy for a wrong site: the sites and bodies that enough joints lead to."""
+    joints = np.zeros(model.nbody, int)
+    for body in range(1, model.nbody):
+        own = model.jnt_type[_joints_of(model, body)]
+        joints[body] = joints[model.body_parentid[body]] + np.isin(own, (_HINGE, _SLIDE)).sum()
+    sites = [
+        model.site(i).name for i in range(model.nsite) if joints[model.site_bodyid[i]] >= MIN_JOINTS
+    ]
+    bodies = [model.body(i).name for i in np.flatnonzero(joints >= MIN_JOINTS)]
+    if not any(sites + bodies):
+        return f"give an arm with a named site or body beyond at least {MIN_JOINTS} joints"
+    return f"give --site one of the sites ({_listed(sites, 40)}) or bodies ({_listed(bodies, 40)})"
 
 
 class _Builder:
@@ -197,6 +216,7 @@ class _Builder:
         names = self._name(joints, end)
         gripper = self._check_other_joints(chain, joints)
         self._check_loops(joints)
+        self._freeze(joints, actuators)
         self._strip(joints, gripper, actuators)
         scene = self._attach(names, end, position, quaternion)
         replaced = self._replace_servos(scene, names, servos)
@@ -234,24 +254,24 @@ class _Builder:
             acting = [j for j in hinges if _name(model, j) in wanted]
         if len(acting) < MIN_JOINTS:
             have = _listed(_name(model, j) for j in acting) if acting else "none"
+            remedy = _other_sites(model) if wanted is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
-                f"the way to {site}, where at least {MIN_JOINTS} must act; give an arm with more, "
-                "or another --site"
+                f"the way to {site}, where at least {MIN_JOINTS} must act; {remedy}"
             )
         return acting
 
     def _actuators(self, joints: list[int]) -> dict[int, list[int]]:
         """Actuators of each acting joint."""
         model = self._model
-        if model.nu == 0:
+        if model.nactuator == 0:
             raise UserError(
                 "no actuators; add a <position> or <motor> with a force limit for each joint"
             )
         actuators = {
             joint: [
                 a
-                for a in range(model.nu)
+                for a in range(model.nactuator)
                 if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
                 and model.actuator_trnid[a, 0] == joint
             ]
@@ -287,7 +307,7 @@ class _Builder:
         last = int(model.jnt_bodyid[joints[-1]])
         driven = {
             int(model.actuator_trnid[a, 0])
-            for a in range(model.nu)
+            for a in range(model.nactuator)
             if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
         }
         beside, gripper = [], []
@@ -329,6 +349,44 @@ class _Builder:
                     "it, or give a serial arm"
                 )
 
+    def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
+        """Gives the spec the numbers of the compiled model.
+
+        MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
+        again in another scene, without its limits and with fewer parts, they would be others.
+        """
+        arm, model = self._arm, self._model
+        # Each access to a list of a spec walks through the whole spec.
+        bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
+        for i, body in enumerate(bodies[1:], start=1):
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[i], model.body_inertia[i]
+            body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
+            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.fullinertia[0] = np.nan
+        arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
+        for i in joints:
+            joint, dof = parts[i], model.jnt_dofadr[i]
+            if np.any(joint.range) and not model.jnt_limited[i]:
+                self._changes.append(
+                    f"ignored the range of {_name(model, i)}, which is not limited"
+                )
+            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            joint.range = model.jnt_range[i] if model.jnt_limited[i] else np.zeros(2)
+            joint.springdamper = np.zeros(2)
+            joint.stiffness[0], joint.damping[0] = model.jnt_stiffness[i], model.dof_damping[dof]
+            joint.armature = model.dof_armature[dof]
+            for a in actuators[i]:
+                # The rotor moves with the joint, also where another servo replaces the actuator.
+                gear, drive = model.actuator_gear[a, 0], drives[a]
+                joint.armature += gear**2 * model.actuator_armature[a]
+                joint.damping[0] += gear**2 * model.actuator_damping[a]
+                drive.armature, drive.damping[0] = 0.0, 0.0
+                drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
+                control = model.actuator_ctrladr[a]
+                drive.inheritrange, drive.ctrlrange = 0.0, model.actuator_ctrlrange[control]
+
     def _strip(
         self, joints: list[int], gripper: list[int], actuators: dict[int, list[int]]
     ) -> None:
@@ -337,16 +395,15 @@ class _Builder:
         own = {a for actuators_of_joint in actuators.values() for a in actuators_of_joint}
         others = [a for i, a in enumerate(arm.actuators) if i not in own]
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        self._remove("keyframe", arm.keys)
-        self._remove("sensor", arm.sensors)
-        self._remove("actuator beside the arm's", others)
-        self._remove("tendon", arm.tendons)
-        self._remove("equality constraint", arm.equalities)
-        self._remove("contact pair or exclusion", [*arm.pairs, *arm.excludes])
-        self._remove("light or camera", [*arm.lights, *arm.cameras])
-        self._remove("floor", [g for g in arm.geoms if g.type in floors])
-        bodies = {i: arm.bodies[i] for i in range(model.nbody)}
-        parts = {i: arm.joints[i] for i in range(model.njnt)}
+        self._remove("keyframes", arm.keys)
+        self._remove("sensors", arm.sensors)
+        self._remove("actuators beside the arm's", others)
+        self._remove("tendons", arm.tendons)
+        self._remove("equality constraints", arm.equalities)
+        self._remove("contact pairs and exclusions", [*arm.pairs, *arm.excludes])
+        self._remove("lights and cameras", [*arm.lights, *arm.cameras])
+        self._remove("floors", [g for g in arm.geoms if g.type in floors])
+        bodies, parts = list(arm.bodies), list(arm.joints)
         loose = {
             int(model.jnt_bodyid[j]): j
             for j in range(model.njnt)
@@ -374,20 +431,18 @@ class _Builder:
         for body in (*gripper, *objects):
             if not _is_below(model, int(model.body_parentid[body]), gripper + objects):
                 arm.delete(bodies[body])
-        self._disable_contacts_and_limits(joints, parts)
+        self._disable_contacts_and_limits(joints)
 
-    def _remove(self, noun: str, elements: Iterable) -> None:
+    def _remove(self, nouns: str, elements: Iterable) -> None:
         elements = list(elements)
         names = [element.name for element in elements]
         for element in elements:
             self._arm.delete(element)
         if elements:
-            named = f" ({_listed(name for name in names if name)})" if any(names) else ""
-            plural = noun if len(elements) == 1 else noun.replace(" ", "s ", 1)
-            plural = plural if " " in noun or len(elements) == 1 else f"{noun}s"
-            self._changes.append(f"removed {len(elements)} {plural}{named}")
+            named = f": {_listed(names)}" if any(names) else ""
+            self._changes.append(f"removed the {nouns} ({len(elements)}{named})")
 
-    def _disable_contacts_and_limits(self, joints: list[int], parts: dict) -> None:
+    def _disable_contacts_and_limits(self, joints: list[int]) -> None:
         model = self._model
         touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
         if touching:
@@ -397,8 +452,6 @@ class _Builder:
             geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
-        for joint in joints:
-            parts[joint].limited = mujoco.mjtLimited.mjLIMITED_FALSE
 
     def _hide_contact_shapes(self) -> None:
         """Leaves only the pictured geoms of a body visible, where it has both kinds."""
@@ -532,7 +585,7 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
     joint = int(model.actuator_trnid[actuator, 0])
     return Servo(
         float(model.actuator_gainprm[actuator, 0] * gear**2),
-        float(-model.actuator_biasprm[actuator, 2] * gear**2),
+        float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
         _force_limit(model, actuators, joint),
     )
 
@@ -546,8 +599,10 @@ def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> flo
         if model.actuator_forcelimited[actuator]:
             limit = float(np.min(np.abs(model.actuator_forcerange[actuator])))
         is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-        if model.actuator_ctrllimited[actuator] and is_motor:
-            largest = float(np.min(np.abs(model.actuator_ctrlrange[actuator])))
+        # A <pid> has several controls; the other arrays have one row for each actuator.
+        control = model.actuator_ctrladr[actuator]
+        if is_motor and model.actuator_ctrllimited[control]:
+            largest = float(np.min(np.abs(model.actuator_ctrlrange[control])))
             limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
         total = max(total, limit * gear)
     if model.jnt_actfrclimited[joint]:
@@ -607,8 +662,11 @@ def _not_compiled(path: Path, error: ValueError) -> UserError:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes.
+
+    Both switches belong to the process, so one thread at a time uses them.
+    """
+    with _SILENCE, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         earlier = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(lambda text: None)

@@ -89,7 +89,10 @@ def load_model(
         without a position servo, or has a number that cannot be simulated.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
-    spec.compiler.discardvisual = spec.compiler.discardvisual or not visual
+    # MuJoCo does not drop geoms that make the bodies' inertia.
+    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if not visual and spec.compiler.inertiafromgeom != from_geoms:
+        spec.compiler.discardvisual = True
     mj_model = compile_spec(spec, path)
     try:
         check_numbers(mj_model)
@@ -101,7 +104,17 @@ def load_model(
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Refuses actuators whose control is not a target position of their joint."""
+    """Refuses actuators whose control is not a target position of their joint.
+
+    With a <pid>, which has several controls, an actuator's index would not be its control's.
+    """
+    several = np.flatnonzero(mj_model.actuator_ctrlnum != 1)
+    if several.size:
+        name = mj_model.actuator(several[0]).name or f"number {several[0]}"
+        raise UserError(
+            f"an actuator ({name}) with {mj_model.actuator_ctrlnum[several[0]]} controls; drive "
+            "each joint by a <position>, which has one"
+        )
     plain_or_filtered = (
         mujoco.mjtDyn.mjDYN_NONE,
         mujoco.mjtDyn.mjDYN_FILTER,
@@ -113,7 +126,10 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
             and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
             and mujoco.mjtDyn(mj_model.actuator_dyntype[actuator]) in plain_or_filtered
             and mj_model.actuator_gainprm[actuator, 0] > 0.0
-            and mj_model.actuator_biasprm[actuator, 1] < 0.0
+            # Otherwise the joint would rest at another position than the control.
+            and np.isclose(
+                mj_model.actuator_biasprm[actuator, 1], -mj_model.actuator_gainprm[actuator, 0]
+            )
         )
         if not is_position_servo:
             name = joint_name(mj_model, joint)
@@ -167,7 +183,7 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
     """The actuator of each hinge and slide that has one, in the order of the joints."""
     acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     servos: dict[int, int] = {}
-    for actuator in range(mj_model.nu):
+    for actuator in range(mj_model.nactuator):
         joint = int(mj_model.actuator_trnid[actuator, 0])
         if mj_model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
             continue

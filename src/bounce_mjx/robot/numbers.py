@@ -23,7 +23,8 @@ _DERIVED_FIELDS = frozenset(
 
 
 def check_numbers(mj_model: mujoco.MjModel) -> None:
-    """Refuses a time step that is not positive, and numbers that are not finite.
+    """Refuses a time step that is not positive, numbers that are not finite, and joints that gain
+    energy.
 
     Raises:
       UserError: the text starts with the wrong number.
@@ -31,6 +32,10 @@ def check_numbers(mj_model: mujoco.MjModel) -> None:
     step = mj_model.opt.timestep
     if not 0.0 < step < np.inf:
         raise UserError(f"the timestep {step}; give a positive number of seconds")
+    for name in ("dof_damping", "dof_frictionloss", "dof_armature"):
+        least = np.min(getattr(mj_model, name), initial=0.0)
+        if least < 0.0:
+            raise UserError(f"the negative number {least:g} in {name}; give 0 or more")
     fields = [(mj_model, name) for name in physical_fields(mj_model)]
     fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
     # Derived fields come last: the message must name a number that is in the file.

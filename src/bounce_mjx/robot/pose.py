@@ -24,11 +24,16 @@ _LEVEL_TOLERANCE = 1e-9
 _DAMPING = 1e-3
 _ITERATIONS = 60
 _MAX_STEP = 0.4
+# Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
+# short range it is a tenth.
+_LEAST_MARGIN = 0.1
 _CLEARANCE = 0.09
 # Least height of the lines between the joints, half the thickness of a link, m; the base, within a
 # radius around the first joint, may be lower.
 _FLOOR_CLEARANCE = 0.07
 _BASE_RADIUS = 0.2
+# Lowest height of the paddle in the search, m: the links below it stay above the floor.
+_LOWEST = 0.1
 # Heights above the paddle that must be free of the arm, m: the ball flies there.
 _HEADROOM = 1.0
 
@@ -123,6 +128,9 @@ class _Search:
         )
         self._limited = ~free
         self._range = np.where(free, -np.inf, low), np.where(free, np.inf, high)
+        # A servo whose joint is at its limit could move it one way only.
+        margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
+        self._inside = self._range[0] + margin, self._range[1] - margin
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         self._mounted = (
@@ -144,7 +152,7 @@ class _Search:
         if not level:
             raise UserError(
                 f"no reachable pose with a level paddle in front of the robot ({self._names()} "
-                "within their ranges); check the site, or the paddle's position and quaternion"
+                "inside their ranges); check the site, or the paddle's position and quaternion"
             )
         if not poses:
             raise UserError(
@@ -155,7 +163,7 @@ class _Search:
         if not able:
             raise UserError(
                 f"no pose in which the joints {self._names()} can lift the paddle and tilt it "
-                "about two axes; give an arm with joints about more axes"
+                "about two axes; give an arm with joints about more axes, or with wider ranges"
             )
         strong = [p for p in able if p.acceleration >= _LEAST_ACCELERATION]
         if not strong:
@@ -214,7 +222,8 @@ class _Search:
     def _level_poses(self, reach: float):
         """Poses [n] with a level paddle in front of the robot, at many distances and heights."""
         distances = reach * np.array([0.45, 0.6, 0.75])
-        heights = (0.1, 0.25, 0.4)
+        lowest = max(_LOWEST, self._base[2] - 0.3 * reach)
+        heights = lowest + reach * np.array([0.0, 0.15, 0.3])
         for distance in distances:
             for height in heights:
                 goal = np.array([self._base[0] + distance, self._base[1], height])
@@ -245,7 +254,7 @@ class _Search:
             step = jacobian.T @ np.linalg.solve(gram, error)
             largest = np.max(np.abs(step))
             step *= min(1.0, _MAX_STEP / max(largest, 1e-12))
-            angles = np.clip(angles + step, *self._range)
+            angles = np.clip(angles + step, *self._inside)
         else:
             return None
         wrapped = self._wrapped(angles)
@@ -256,7 +265,7 @@ class _Search:
     def _wrapped(self, angles: np.ndarray) -> np.ndarray:
         """The same pose with each free hinge within half a turn of its middle."""
         hinge = self._model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        low, high = self._range
+        low, high = self._inside
         middle = np.where(self._limited, 0.5 * (self._low + self._high), 0.0)
         turned = angles - 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
         inside = hinge & (turned >= low) & (turned <= high)

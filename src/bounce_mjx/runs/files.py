@@ -9,9 +9,12 @@ from typing import Any, TypeVar
 import pydantic
 from pydantic_core import to_jsonable_python
 
+from bounce_mjx.files import new_file, read_regular
+
 PARTIAL = ".partial"
 MANIFEST_FILE = "manifest.json"
 _MAX_JSON_BYTES = 64 * 2**20
+_MAX_JSON_VALUES = 2_000_000
 
 ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
@@ -31,10 +34,12 @@ def to_json(plain: Any) -> str:
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
     """Reads and validates a JSON file; raises OSError or ValueError if it does not fit `model`."""
-    if path.stat().st_size > _MAX_JSON_BYTES:
-        raise ValueError(f"{path.name} is too large")
+    text = read_regular(path, _MAX_JSON_BYTES).decode("utf-8")
+    # In memory, a small value takes many times its place in the file.
+    if sum(map(text.count, ",[{")) > _MAX_JSON_VALUES:
+        raise ValueError(f"{path.name} holds more than {_MAX_JSON_VALUES:,} values")
     try:
-        return model.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        return model.model_validate(json.loads(text))
     except pydantic.ValidationError as error:
         raise ValueError(f"{path.name}: {first_mistake(error)}") from error
     except RecursionError as error:
@@ -47,16 +52,21 @@ def first_mistake(error: pydantic.ValidationError) -> str:
     return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}".removeprefix(": ")
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Writes a text file; readers see either the complete old text or the complete new text."""
-    partial = path.with_name(path.name + PARTIAL)
-    try:
-        partial.write_text(text, encoding="utf-8")
-        sync(partial)
-        partial.rename(path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Writes a file; readers see either the complete old content or the complete new one. Nothing
+    is written through a link (`new_file`)."""
+    with new_file(path) as new:
+        new.write_bytes(content.encode() if isinstance(content, str) else content)
+        sync(new)
+
+
+def write_output(path: Path, content: str | bytes) -> None:
+    """Writes a file that the user named, like `write_atomically`; a device or a pipe, such as
+    /dev/stdout, stays one."""
+    if path.exists() and not path.is_file():
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    else:
+        write_atomically(path, content)
 
 
 def sync(path: Path) -> None:
@@ -87,7 +97,7 @@ def check_integrity(folder: Path) -> None:
 def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:
     """Entries of a manifest; ValueError for links and devices, which may be endless."""
     entries = {}
-    for path in folder.rglob("*"):
+    for path in (folder, *folder.rglob("*")):
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             raise ValueError(f"{path.name} is not a regular file")
         if path.is_file() and not path.name.startswith(".") and path.name != MANIFEST_FILE:

@@ -22,6 +22,7 @@ import contextlib
 import datetime
 import itertools
 import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -44,6 +45,9 @@ SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
 """Policies that come with the package: their names, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
 REPLACED = ".discarded"
+# A terminal obeys these characters.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_STAMP = "%Y-%m-%d_%H-%M-%S"
 
 
 class Checkpoint(NamedTuple):
@@ -63,7 +67,7 @@ def create_run(config: TrainConfig) -> Path:
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
-    stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    stamp = datetime.datetime.now().strftime(_STAMP)
     try:
         config.log_dir.mkdir(parents=True, exist_ok=True)
         for copy in itertools.count(1):
@@ -103,7 +107,23 @@ def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
 
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds; the run itself if it has one seed."""
-    return sorted(run.glob("seed_*")) or [run]
+    seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
+    return sorted(path for path in seeds if not path.is_symlink()) or [run]
+
+
+def check_links(run: Path) -> None:
+    """Checks that a run's folder holds no links, through which a training would write elsewhere;
+    those of Weights & Biases do not count, as it makes them anew.
+
+    Raises:
+      UserError: there is one, as there may be in a run from someone else.
+    """
+    for path in run.rglob("*"):
+        if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
+            raise UserError(
+                f"{path} is a link, and a training writes only into the folder of its run; remove "
+                "it, or put in its place what it leads to"
+            )
 
 
 def find_run(path: Path) -> Path:
@@ -116,6 +136,8 @@ def find_run(path: Path) -> Path:
         )
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
+            if _CONTROL.search(str(folder)):
+                raise UserError(f"{folder} has a control character in its name; rename it")
             return folder
     raise UserError(
         f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
@@ -124,14 +146,15 @@ def find_run(path: Path) -> Path:
 
 
 def newest_run(log_dir: Path) -> Path:
-    """Folder of the newest run with a checkpoint."""
+    """Folder of the newest run with a checkpoint, by the time stamps in the runs' names; a run
+    without one counts from the last start of its training."""
     found = [run for run in _runs(log_dir) if _has_checkpoint(run)]
     if not found:
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with bounce-mjx train, or "
             "give a run's folder"
         )
-    return max(found)
+    return max(found, key=_started)
 
 
 def named_run(path: Path | None, log_dir: Path) -> Path:
@@ -210,16 +233,16 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
     results = load_results(_best_seed(run))
     yield f"using the newest run: {run} ({results.best.summary if results else 'not evaluated'})"
     if results is None or not results.best.passed:
-        for other in sorted(_runs(log_dir), reverse=True):
+        for other in sorted(_runs(log_dir), key=_started, reverse=True):
             # A damaged file of another run is no reason to stop.
             with contextlib.suppress(UserError):
                 found = load_results(_best_seed(other)) if _has_checkpoint(other) else None
                 if found is not None and found.best.passed:
                     yield f"an older run met all its results: {other}"
                     break
-    newer = [other for other in _runs(log_dir) if other > run]
-    if newer:
-        yield f"a newer run holds no checkpoint yet: {max(newer)}"
+    newest = max(_runs(log_dir), key=_started)
+    if newest != run:
+        yield f"a newer run holds no checkpoint yet: {newest}"
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
@@ -240,8 +263,20 @@ def _best_seed(run: Path) -> Path:
 
 
 def _runs(log_dir: Path) -> list[Path]:
-    """Folders of runs, with and without a checkpoint."""
-    return [path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}")]
+    """Folders of runs, with and without a checkpoint, whose names can be printed."""
+    configs = filter(os.path.isfile, log_dir.glob(f"*/{CONFIG_FILE}"))
+    return [path.parent for path in configs if not _CONTROL.search(path.parent.name)]
+
+
+def _started(run: Path) -> tuple[float, int, str]:
+    """Sort key of the time at which a run was started: by the time stamp in its name, or without
+    one, by the time at which its config was written."""
+    found = re.search(r"(\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d)(?:_(\d+))?", run.name)
+    if found is not None:
+        with contextlib.suppress(ValueError, OverflowError):
+            time = datetime.datetime.strptime(found[1], _STAMP).timestamp()
+            return time, int(found[2] or 1), run.name
+    return os.path.getmtime(run / CONFIG_FILE), 1, run.name
 
 
 def _has_checkpoint(run: Path) -> bool:

@@ -12,7 +12,12 @@ from bounce_mjx.runs.files import first_mistake, read_json
 
 RESULTS_FILE = "results.json"
 
+PATIENCE = 1.5
+"""Length of a training that waits in vain for a margin, in steps of the first evaluation that met
+all five results."""
+
 _Steps = Annotated[int, Field(ge=0, lt=2**63)]
+_Seconds = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Evaluation(pydantic.BaseModel, extra="allow"):
@@ -28,7 +33,22 @@ class Evaluation(pydantic.BaseModel, extra="allow"):
 class _Evaluations(pydantic.BaseModel):
     best_steps: _Steps = 0
     solved_steps: _Steps | None = None
+    """Steps at the first evaluation that met all five results: the end of the time "to all five
+    results" in every measurement."""
+    solved_seconds: _Seconds | None = None
+    """Seconds from the start of the process, without its imports, to the end of that evaluation."""
+    margin_steps: _Steps | None = None
+    """Steps at the first evaluation that met all five with a margin
+    (`Report.passed_with_margin`)."""
     evaluations: list[Evaluation] = []
+
+    @property
+    def solved(self) -> bool:
+        """Whether `stop_when_solved` ends the training."""
+        if self.solved_steps is None:
+            return False
+        latest = max((evaluation.steps for evaluation in self.evaluations), default=0)
+        return self.margin_steps is not None or latest >= PATIENCE * self.solved_steps
 
 
 class Results(_Evaluations):
@@ -38,7 +58,7 @@ class Results(_Evaluations):
     best: Report
     device: str
     trained_steps: _Steps = 0
-    seconds: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = {}
+    seconds: dict[str, _Seconds] = {}
     fresh_resets: bool = False
     """Whether the five results come from other resets than the selection of the checkpoint."""
 
@@ -100,8 +120,12 @@ class Progress(_Evaluations):
         """Whether the state after this number of steps was evaluated."""
         return any(evaluation.steps == steps for evaluation in self.evaluations)
 
-    def improves(self, report: Report, steps: int) -> bool:
-        """Adds an evaluation; returns whether it is the best so far."""
+    def improves(self, report: Report, steps: int, seconds: float) -> bool:
+        """Adds an evaluation; returns whether it is the best so far.
+
+        Args:
+          seconds: time from the start of the process, without its imports, to the evaluation's end.
+        """
         # Built without validation, as a non-finite figure is allowed here and stored as null.
         new = Evaluation.model_construct(
             steps=steps,
@@ -111,7 +135,9 @@ class Progress(_Evaluations):
         )
         self.evaluations.append(new)
         if report.passed and self.solved_steps is None:
-            self.solved_steps = steps
+            self.solved_steps, self.solved_seconds = steps, seconds
+        if report.passed_with_margin and self.margin_steps is None:
+            self.margin_steps = steps
         if self.best is not None and report.score < self.best.score:
             return False
         self.best, self.best_steps = report, steps

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import pydantic
 import tensorstore
 
@@ -47,7 +48,15 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     networks = make_networks(config.ppo, size, config.env.num_joints)
     read_record(checkpoint)
     shapes = jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
-    return _read_arrays(checkpoint, "policy", shapes)
+    policy = _read_arrays(checkpoint, "policy", shapes)
+    for path, array in jax.tree_util.tree_leaves_with_path(policy):
+        if not np.all(np.isfinite(array)):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise UserError(
+                f"the policy of the checkpoint {checkpoint.folder} holds a number that is not "
+                f"finite, in {name}; give another checkpoint"
+            )
+    return policy
 
 
 def load_training_state(

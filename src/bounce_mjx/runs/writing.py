@@ -2,22 +2,34 @@
 before it replaces the older one, so a killed process always leaves one complete checkpoint."""
 
 import concurrent.futures
+import contextlib
+import functools
+import logging
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
-from bounce_mjx.runs.folders import CHECKPOINTS, REPLACED, CheckpointName, stored_checkpoints
+from bounce_mjx.runs.folders import (
+    CHECKPOINTS,
+    REPLACED,
+    CheckpointName,
+    save_config,
+    stored_checkpoints,
+)
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import RECORD_FILE
 
@@ -30,7 +42,7 @@ class CheckpointWriter:
     """
 
     def __init__(self, run: Path, config: TrainConfig):
-        self._run = run
+        self._run, self._run_config = run, config
         self._config = config.model_dump(mode="json")
         # Pending writes by name, the oldest first. A checkpoint on the disk thus never refers to
         # a best checkpoint that is not there yet, unless it holds the best state itself.
@@ -96,8 +108,21 @@ class CheckpointWriter:
 
     def _write(self) -> None:
         for name, write in list(self._pending.items()):
+            self._restore_folder()
             write()
             del self._pending[name]
+        # Also if it was moved meanwhile: orbax makes the folders that it writes to.
+        self._restore_folder()
+
+    def _restore_folder(self) -> None:
+        """Makes the run's folder again if the user has moved or removed it, so that the new state
+        is kept, and can be resumed."""
+        if not (self._run / CONFIG_FILE).exists():
+            if not self._run.exists():
+                self._run.mkdir(parents=True)
+            # The only copy of the robot may have been in the folder.
+            with contextlib.suppress(UserError):
+                save_config(self._run, self._run_config)
 
 
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
@@ -138,9 +163,7 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
 
 def _save_arrays(folder: Path, tree: Any) -> None:
     """Writes a pytree with orbax, on this host only."""
-    # The import takes a third of a second, and only writing needs it.
-    import orbax.checkpoint as ocp
-
+    ocp = _silent_orbax()
     host = jax.process_index()
     only_here = ocp.options.MultiprocessingOptions(primary_host=host, active_processes={host})
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=only_here)
@@ -148,6 +171,24 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     folder.mkdir()
     handler.save(folder, args=ocp.args.PyTreeSave(tree))
     handler.finalize(folder)
+
+
+@functools.cache
+def _silent_orbax() -> ModuleType:
+    """orbax, without the tracebacks that its threads print of an error that it raises as well."""
+    # The import takes a third of a second, and only writing needs it.
+    import orbax.checkpoint as ocp
+
+    logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
+    show = sys.unraisablehook
+
+    def show_others(unraisable: "sys.UnraisableHookArgs") -> None:
+        # After the error, the other writes end in the event loop that orbax has closed.
+        if str(unraisable.exc_value) != "Event loop is closed":
+            show(unraisable)
+
+    sys.unraisablehook = show_others
+    return ocp
 
 
 def _remove_leftovers(folder: Path) -> None:

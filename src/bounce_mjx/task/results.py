@@ -50,9 +50,9 @@ class Result:
     """The bound in words."""
     passed: bool | None
     """Whether the value meets the bound; None where the bound does not apply."""
-    with_margin: bool | None = None
-    """Whether the value meets the bound so clearly that `MARGIN_EPISODES` other episodes should
-    meet it too; None where the bound does not apply."""
+    margin: Figure = None
+    """How clearly the value meets the bound: 0 at the bound or beyond it, 1 where `MARGIN_EPISODES`
+    other episodes should meet it too; None where the bound does not apply."""
 
 
 def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
@@ -95,10 +95,9 @@ def mean_of_events(
     if not (math.isfinite(low) and math.isfinite(high)):
         bound = f"<= {high:g}" if math.isfinite(high) else f">= {low:g}"
     if condition:
-        return Result(name, measured, mean, f"{bound} ({condition})", None, None)
-    passed = mean is not None and low <= mean <= high
-    with_margin = mean is not None and low + margin <= mean <= high - margin
-    return Result(name, measured, mean, bound, passed, with_margin)
+        return Result(name, measured, mean, f"{bound} ({condition})", None)
+    distance = -1.0 if mean is None else min(mean - low, high - mean)
+    return Result(name, measured, mean, bound, distance >= 0.0, _clearness(distance, margin))
 
 
 def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:
@@ -122,5 +121,13 @@ def _at_least(name: str, measured: str, share: float | None, margin: float, leas
         None if share is None else 100.0 * share,
         f">= {100 * least:g}",
         share is not None and share >= least,
-        share is not None and share >= least + margin,
+        0.0 if share is None else _clearness(share - least, margin),
     )
+
+
+def _clearness(distance: float, margin: float) -> float:
+    """`Result.margin` of a value at a distance inside its bound."""
+    if distance <= 0.0:
+        return 0.0
+    # Rounded, as a number of failed episodes may lie exactly at the margin.
+    return min(1.0, round(distance / margin, 9)) if margin else 1.0

@@ -13,14 +13,13 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError, reason_of
-from bounce_mjx.interrupt import leave
+from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
 from bounce_mjx.task.config import EnvConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.task.env import BounceBall
-    from bounce_mjx.training.helpers import Helpers
     from bounce_mjx.training.job import Outcome
     from bounce_mjx.training.trainer import Trainer, Watcher
 
@@ -51,11 +50,18 @@ CommandT = TypeVar("CommandT", bound=TrainingCommand)
 
 
 def read_command(
-    command_class: type[CommandT], args: Sequence[str], *, prog: str, description: str, **defaults
+    command_class: type[CommandT],
+    args: Sequence[str],
+    *,
+    prog: str,
+    description: str,
+    preset: Path | None = None,
+    **defaults,
 ) -> CommandT:
     """Reads a command line on top of the preset, or of the resumed run's config.
 
     Args:
+      preset: the preset if the command line names none; by default, this machine's.
       defaults: defaults of flags that are not part of the config.
 
     Raises:
@@ -73,7 +79,7 @@ def read_command(
 
         log_dir = path_flag(args, "--log-dir") or TrainConfig().log_dir
         resume = find_run(named_run(resume, log_dir))
-    base = load_run_config(resume) if resume else read_preset(config_path, robot)
+    base = load_run_config(resume) if resume else read_preset(config_path or preset, robot)
     start = base
     if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
         start = base.model_copy(update={"stop_when_solved": False})
@@ -98,12 +104,12 @@ def read_command(
 
 
 def _is_solved(run: Path) -> bool:
-    """Whether every seed of a run has met all five results."""
+    """Whether `stop_when_solved` has ended a run."""
     from bounce_mjx.runs.folders import runs_of_seeds
     from bounce_mjx.runs.progress import load_results
 
     results = [load_results(seed) for seed in runs_of_seeds(run)]
-    return all(found is not None and found.solved_steps is not None for found in results)
+    return all(found is not None and found.solved for found in results)
 
 
 def run_command(
@@ -111,15 +117,13 @@ def run_command(
     make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
     prog: str,
     watcher: "Watcher | None" = None,
-    modules: Sequence[str] | None = None,
-    helpers: "Helpers | None" = None,
     stopped: Callable[[Sequence[Path]], None] = lambda runs: None,
 ) -> "Sequence[Outcome]":
     """Trains according to the command, and prints the results; returns each seed's outcome.
 
-    The other arguments after `prog`, and the errors, are those of `train`.
-
     Args:
+      prog: the user's command, to which `--resume` may be added.
+      watcher: receives the progress of the first seed.
       stopped: called with the folders of the seeds of a training that the user stopped, before the
         process ends; not if nothing was trained.
 
@@ -128,7 +132,7 @@ def run_command(
     """
     from bounce_mjx.training import hosts
     from bounce_mjx.training.console import say
-    from bounce_mjx.training.job import TrainingStopped, train
+    from bounce_mjx.training.job import Options, TrainingStopped, train
 
     if command.wandb is not None and importlib.util.find_spec("wandb") is None:
         raise UserError(
@@ -136,18 +140,8 @@ def run_command(
         )
     console = Console(quiet=not hosts.is_leader())
     try:
-        outcomes = train(
-            config_of(command),
-            console,
-            make_trainer,
-            command=prog,
-            resume=command.resume,
-            report=command.report,
-            wandb=command.wandb,
-            watcher=watcher,
-            modules=modules,
-            helpers=helpers,
-        )
+        options = Options(prog, command.resume, command.report, command.wandb, watcher)
+        outcomes = train(config_of(command), console, make_trainer, options)
     except TrainingStopped as stop:
         say(console, str(stop))
         if stop.runs:
@@ -156,7 +150,7 @@ def run_command(
         leave(0)
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
-        leave_report(best, console)
+        run_interruptible(leave_report, best, console)
     run = shlex.quote(str(best.run))
     say(console, f"measure it: bounce-mjx eval {run}")
     say(console, f"watch it: bounce-mjx play {run}")

@@ -2,7 +2,6 @@
 
 import math
 import time
-import typing
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -12,11 +11,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.log import Logs
+from bounce_mjx.training.log import Logs, TensorBoardLog
 from bounce_mjx.training.trainer import Watcher
-
-if typing.TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 
 class Reporter:
@@ -25,7 +21,7 @@ class Reporter:
 
     def __init__(
         self,
-        logs: Callable[[], Sequence["SummaryWriter | Logs"]],
+        logs: Callable[[], Sequence[TensorBoardLog | Logs]],
         console: Console,
         config: TrainConfig,
         first_step: int,
@@ -57,7 +53,7 @@ class Reporter:
         self._saving_problem: str | None = None
 
     @property
-    def _logs(self) -> Sequence["SummaryWriter | Logs"]:
+    def _logs(self) -> Sequence[TensorBoardLog | Logs]:
         return self._open_logs()
 
     def __enter__(self) -> "Reporter":
@@ -158,9 +154,16 @@ class Reporter:
                 f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
             )
             line = f"{report.summary} ({figures})"
+            if report.passed and not report.passed_with_margin:
+                line += ", not yet with a margin"
         else:
             solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
             line = f"{solved} of {len(reports)} seeds meet all results"
+            sure = sum(
+                r.passed_with_margin and sound for r, sound in zip(reports, healthy, strict=True)
+            )
+            if sure < solved:
+                line += f", {sure} with a margin"
         kind = "evaluation"
         if reports[0].screening:
             kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"

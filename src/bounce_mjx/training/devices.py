@@ -71,6 +71,4 @@ def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> Trai
     def batch_last(x: jax.Array) -> NamedSharding:
         return NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS))
 
-    return shardings._replace(
-        env=jax.tree.map(batch_last, state.env), memory=jax.tree.map(batch_last, state.memory)
-    )
+    return shardings._replace(env=jax.tree.map(batch_last, state.env))

@@ -19,7 +19,6 @@ from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
-from bounce_mjx.training.programs import EVALUATE, Programs, calls_lapack
 from bounce_mjx.training.setup import compiler_options
 
 Tree = TypeVar("Tree")
@@ -45,15 +44,15 @@ class Evaluators:
         config: TrainConfig,
         env: BounceBall,
         mesh: Mesh,
-        programs: Programs,
+        pool: concurrent.futures.Executor,
     ):
-        """Starts the compilation."""
+        """Starts the compilation in a pool."""
         self._config, self._env = config, env
         axes = mesh.axis_names if config.num_seeds > 1 else ()
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
-        self._program = programs.get(EVALUATE, mesh, self._lower)
+        self._program = pool.submit(self._lower().compile)
 
     def wait(self) -> None:
         """Waits until the program is compiled."""
@@ -115,7 +114,7 @@ class Evaluators:
         if mesh.size > 1 or mesh.devices.flat[0].platform != "cpu":
             return 1
         # In jaxlib, two batched calls of LAPACK may wait for each other for ever.
-        return 1 if calls_lapack(self._program.result()) else os.cpu_count() or 1
+        return 1 if "lapack" in self._program.result().as_text() else os.cpu_count() or 1
 
     def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
         config, program = self._config, self._program.result()

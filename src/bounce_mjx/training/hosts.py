@@ -9,6 +9,7 @@ import atexit
 import concurrent.futures
 import contextlib
 import ctypes
+import json
 import os
 import signal
 import sys
@@ -17,6 +18,8 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import jax
@@ -25,14 +28,19 @@ from jax._src import distributed
 from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
-from bounce_mjx.errors import UserError, reason_of
+from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Address, Peers
 
 Tree = TypeVar("Tree")
+Result = TypeVar("Result")
 
 _peers: Peers | None = None
-_host, _timeout = "", float(DEFAULT_TIMEOUT)
-_ADDRESS_BYTES = 128
+_ADDRESS = "bounce_mjx/address"
+
+
+def _advice() -> str:
+    return "start all processes again"
 
 
 def join(
@@ -41,7 +49,8 @@ def join(
     process_id: int | None = None,
     timeout: float = DEFAULT_TIMEOUT,
 ) -> None:
-    """Joins the processes of one training; it must be called before any other use of JAX.
+    """Joins the processes of one training; it must be called before any other use of JAX. From now
+    on, the death of one ends the others with an error message.
 
     Without arguments, Slurm, Open MPI or Kubernetes supply them.
 
@@ -51,9 +60,9 @@ def join(
 
     Raises:
       UserError: only some of the arguments are given, no launcher supplies the others, or the
-        processes did not find each other in time.
+        processes did not find or cannot reach each other in time.
     """
-    global _host, _timeout
+    global _peers
     given = {
         "--coordinator-address": coordinator_address,
         "--num-processes": num_processes,
@@ -66,27 +75,26 @@ def join(
             " give all three, or only --distributed under Slurm, Open MPI or Kubernetes"
         )
     _divert_native_output()
-    joined: concurrent.futures.Future[None] = concurrent.futures.Future()
 
-    def initialize() -> None:
-        try:
-            # JAX's own time limits end the process with a stack trace, so they must be longer than
-            # ours.
-            jax.distributed.initialize(
-                coordinator_address,
-                num_processes,
-                process_id,
-                initialization_timeout=int(2 * timeout + 60),
-                heartbeat_timeout_seconds=int(2 * timeout + 60),
-            )
-            joined.set_result(None)
-        except Exception as error:  # noqa: BLE001
-            joined.set_exception(error)
+    def connect() -> Peers | None:
+        # JAX's own time limits end the process with a stack trace, so they must be longer than
+        # ours.
+        jax.distributed.initialize(
+            coordinator_address,
+            num_processes,
+            process_id,
+            initialization_timeout=int(2 * timeout + 60),
+            heartbeat_timeout_seconds=int(2 * timeout + 60),
+        )
+        return _connect(timeout)
 
-    # In a thread, because the call cannot be interrupted.
-    threading.Thread(target=initialize, daemon=True).start()
     try:
-        joined.result(timeout)
+        _peers = _in_thread(connect).result(timeout)
+        # Waits for the devices of all hosts. The processes must be connected before: nothing else
+        # ends this wait if one of them has died.
+        _in_thread(jax.devices).result()
+    except UserError:
+        raise
     except concurrent.futures.TimeoutError as error:
         where = f" at {coordinator_address}" if coordinator_address else ""
         raise UserError(
@@ -100,44 +108,95 @@ def join(
             f"the processes of this training cannot be joined ({reason}); start one process per "
             "host with --coordinator-address HOST:PORT, --num-processes N and --process-id I"
         ) from error
-    # If a launcher supplied the address, only JAX knows it.
-    address = coordinator_address or distributed.global_state.coordinator_address
-    _host, _timeout = address.rpartition(":")[0].strip("[]"), timeout
 
 
-def connect(advice: Callable[[], str]) -> None:
-    """Connects the joined processes: from now on, the death of one ends the others with an error
-    message. In a training of one process this does nothing.
+def _in_thread(function: Callable[[], Result]) -> concurrent.futures.Future[Result]:
+    """Calls a function that Ctrl-C cannot interrupt; the wait for its result can be."""
+    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
 
-    Args:
-      advice: the end of that message, which says how to continue.
+    def run() -> None:
+        try:
+            future.set_result(function())
+        except Exception as error:  # noqa: BLE001
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
+
+
+def _connect(timeout: float) -> Peers | None:
+    """Connects the processes that JAX has joined; None if there is only one.
 
     Raises:
-      UserError: the processes cannot reach each other.
+      UserError: they cannot reach each other.
     """
-    global _peers
-    if jax.process_count() == 1:
-        return
-    peers = Peers(jax.process_index(), jax.process_count(), _timeout, advice, _exit)
-    server = None
-    words = np.zeros(_ADDRESS_BYTES, np.uint8)
-    if is_leader():
+    # Not through JAX's devices, which wait for all processes, the dead ones too.
+    joined = distributed.global_state
+    if joined.num_processes == 1:
+        return None
+    host = joined.coordinator_address.rpartition(":")[0].strip("[]")
+    peers = Peers(joined.process_id, joined.num_processes, timeout, lambda: _advice(), _exit)
+    if joined.process_id == 0:
         address, server = peers.listen()
-        encoded = f"{address.port} {address.token}".encode()
-        words[: len(encoded)] = np.frombuffer(encoded, np.uint8)
-    text = bytes(np.asarray(multihost_utils.broadcast_one_to_all(words), np.uint8)).decode()
-    port, token = text.rstrip("\0").split()
+        joined.client.key_value_set(_ADDRESS, f"{address.port} {address.token}")
+        connect = partial(peers.accept, server, address.token)
+    else:
+        text = joined.client.blocking_key_value_get(_ADDRESS, int(1000 * timeout))
+        port, token = text.split()
+        address = Address(int(port), token)
+        connect = partial(peers.connect, host, address)
     try:
-        if server is not None:
-            peers.accept(server, token)
-        else:
-            peers.connect(_host, Address(int(port), token))
+        connect()
     except OSError as error:
         raise UserError(
-            f"the processes of this training cannot reach each other at {_host}, port {port} "
-            f"({error}); open the ports between the hosts"
+            f"the processes of this training cannot reach each other at {host}, port "
+            f"{address.port} ({error}); open the ports between the hosts"
         ) from error
-    _peers = peers
+    return peers
+
+
+def advise(advice: Callable[[], str]) -> None:
+    """Sets the end of the message about the death of a process, which says how to continue."""
+    global _advice
+    _advice = advice
+
+
+def agree(config: TrainConfig, resume: Path | None) -> None:
+    """Compares the configs of all processes.
+
+    Args:
+      resume: the run to continue.
+
+    Raises:
+      UserError: they differ, and so would the programs and the states of the processes.
+    """
+    if _peers is None:
+        return
+    # Only the leader uses the folder of the runs.
+    plain = config.model_dump(mode="json", exclude={"log_dir"})
+    plain["resume"] = resume and os.path.abspath(resume)
+    first, *others = map(_flat, _peers.exchange(plain))
+    for i, other in enumerate(others, start=1):
+        for key in sorted(first.keys() | other.keys()):
+            ours, theirs = first.get(key), other.get(key)
+            if ours != theirs:
+                raise UserError(
+                    f"the processes of this training differ in {key}, which is {_shown(ours)} in "
+                    f"process 0 and {_shown(theirs)} in process {i}; start all with the same flags"
+                )
+
+
+def _flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested mappings by their dotted names."""
+    flat = {}
+    for key, value in plain.items():
+        inner = isinstance(value, dict)
+        flat |= _flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
+    return flat
+
+
+def _shown(value: Any) -> str:
+    return shorten(json.dumps(value))
 
 
 def disconnect() -> None:

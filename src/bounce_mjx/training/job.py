@@ -12,22 +12,23 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from rich.console import Console
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.gpu.kernel_calls import lower_elsewhere
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
     CHECKPOINTS,
     Checkpoint,
     best_checkpoint,
+    check_links,
     create_run,
     find_run,
     latest_checkpoint,
@@ -43,14 +44,8 @@ from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.helpers import Helpers
-from bounce_mjx.training.log import Logs, WandbLog, open_log
-from bounce_mjx.training.programs import Programs, kept_programs
-from bounce_mjx.training.signals import StopRequest
+from bounce_mjx.training.log import Logs, TensorBoardLog, WandbLog, open_log
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
-
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 Tree = TypeVar("Tree")
 
@@ -80,6 +75,22 @@ class Outcome(NamedTuple):
     """Seconds by phase, for all seeds together."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a training does beside its config."""
+
+    command: str
+    """The user's command, to which `--resume` may be added."""
+    resume: Path | None = None
+    """The run to continue, in place."""
+    report: bool = True
+    """Whether to import the modules of the report during the compilation."""
+    wandb: str | None = None
+    """Project of Weights & Biases to log to, beside TensorBoard."""
+    watcher: Watcher | None = None
+    """Receives the progress of the first seed."""
+
+
 class TrainingStopped(Exception):
     """The user stopped the training; the text says how to continue."""
 
@@ -93,27 +104,12 @@ def train(
     config: TrainConfig,
     console: Console,
     make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
-    *,
-    command: str,
-    resume: Path | None = None,
-    report: bool = True,
-    wandb: str | None = None,
-    watcher: Watcher | None = None,
-    modules: Sequence[str] | None = None,
-    helpers: Helpers | None = None,
+    options: Options,
 ) -> list[Outcome]:
     """Trains with a config, and returns an outcome for each seed.
 
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
-      command: the user's command, to which `--resume` may be added.
-      resume: the run to continue, in place.
-      report: whether to import the modules of the report during the compilation.
-      wandb: project of Weights & Biases to log to, beside TensorBoard.
-      watcher: receives the progress of the first seed.
-      modules: the modules that were imported before the training's (`setup.imported_modules`), with
-        which equal trainings in later processes find their compiled programs; None to trace anew.
-      helpers: processes that prepare this training, too.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -123,16 +119,8 @@ def train(
     """
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        pool = concurrent.futures.ThreadPoolExecutor()
-        stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-        job = _Job(config, console, make_trainer, command, resume, stop, pool, stack)
-        job.wandb, job.watcher, job.modules = wandb, watcher, modules
-        if helpers is not None:
-            job.helpers = helpers
-            stack.callback(helpers.close)
-            lower_elsewhere(helpers)
-            stack.callback(lower_elsewhere, None)
-        job.compile(report)
+        job = _Job(config, console, make_trainer, options, stop, stack)
+        job.compile()
         job.train()
         job.finish()
         return job.outcomes()
@@ -171,21 +159,17 @@ class _Job:
         config: TrainConfig,
         console: Console,
         make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
-        command: str,
-        resume: Path | None,
+        options: Options,
         stop: StopRequest,
-        pool: concurrent.futures.Executor,
         stack: contextlib.ExitStack,
     ):
-        self.config, self.console, self.resumed = config, console, resume is not None
-        self.command, self.stop, self.pool, self.stack = command, stop, pool, stack
-        self.run: Path | None = resume
-        self.wandb: str | None = None
-        self.watcher: Watcher | None = None
-        self.modules: Sequence[str] | None = None
-        self.helpers: Helpers | None = None
+        self.config, self.console, self.options = config, console, options
+        self.stop, self.stack = stop, stack
+        self.pool = concurrent.futures.ThreadPoolExecutor()
+        stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
+        self.run, self.resumed = options.resume, options.resume is not None
         self.clock = Clock()
-        hosts.connect(self._advice)
+        hosts.advise(self._advice)
         self.env = BounceBall(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
@@ -193,10 +177,10 @@ class _Job:
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
         self.steps = 0
-        if resume is None:
+        if options.resume is None:
             self._create()
         else:
-            self._resume(resume)
+            self._resume(options.resume)
         mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
@@ -210,7 +194,7 @@ class _Job:
 
     @property
     def _go_on(self) -> str:
-        return f"go on with: {self.command} --resume {shlex.quote(str(self.run))}"
+        return f"go on with: {self.options.command} --resume {shlex.quote(str(self.run))}"
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process."""
@@ -256,6 +240,7 @@ class _Job:
     def _resume(self, path: Path) -> None:
         self.run = find_run(path)
         self._lock()
+        check_links(self.run)
         latest = latest_checkpoint(self.run)
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
@@ -280,12 +265,12 @@ class _Job:
             goes_on = f"it goes on to {total}"
             say(self.console, f"{met}; {how if self.config.stop_when_solved else goes_on}")
 
-    def compile(self, report: bool) -> None:
+    def compile(self) -> None:
         """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
         with self.console.status("compiling"), no_garbage_collection():
-            compiling = self.pool.submit(self._compile, report)
+            compiling = self.pool.submit(self._compile)
             if not self.stop.wait_for(compiling):
                 if self.resumed:
                     raise TrainingStopped(f"stopped before anything was trained; {self._go_on}")
@@ -311,32 +296,30 @@ class _Job:
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.reporter = self.stack.enter_context(
-            Reporter(opening.result, self.console, self.config, self.steps, self.watcher)
+            Reporter(opening.result, self.console, self.config, self.steps, self.options.watcher)
         )
         self.clock.lap("compile")
 
-    def _compile(self, report: bool) -> concurrent.futures.Future:
+    def _compile(self) -> concurrent.futures.Future:
         """Returns once the training can start, with the future of its logs. The longest program is
         traced first: Python traces one program at a time while XLA compiles others."""
-        kept = kept_programs(self.config, self.env.mj_model, self.trainer.mesh, self.modules)
-        programs = Programs(self.pool, kept, self.helpers)
-        compiling = self.trainer.compile(programs)
-        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, programs)
+        compiling = self.trainer.compile(self.pool)
+        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
         self.pool.submit(importlib.import_module, "orbax.checkpoint")
-        if report:
+        if self.options.report:
             opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
         compiling.result()
         return opening
 
-    def _open_logs(self, first_step: int | None) -> list["SummaryWriter | Logs"]:
+    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog | Logs]:
         if not hosts.is_leader():
             return []
         logs = [open_log(m.run, first_step, config=m.config) for m in self.members]
-        if self.wandb is None:
+        if self.options.wandb is None:
             return logs
         return [
-            Logs([log, WandbLog(m.run, self.wandb, m.config)])
+            Logs([log, WandbLog(m.run, self.options.wandb, m.config)])
             for log, m in zip(logs, self.members, strict=True)
         ]
 
@@ -402,7 +385,7 @@ class _Job:
         return [member for member in self.members if member.progress.fault is None]
 
     def _is_solved(self) -> bool:
-        return all(member.progress.solved_steps is not None for member in self._healthy())
+        return all(member.progress.solved for member in self._healthy())
 
     def _evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())
@@ -421,11 +404,12 @@ class _Job:
             return False
         healthy = [member.progress.fault is None for member in self.members]
         self.reporter.evaluation(self.steps, reports, healthy)
-        if self.watcher is not None:
-            self.watcher.evaluation(self.steps, reports[0], self._of_seed(snapshot.policy, 0))
-        best = []
+        if self.options.watcher is not None:
+            policy = self._of_seed(snapshot.policy, 0)
+            self.options.watcher.evaluation(self.steps, reports[0], policy)
+        best, seconds = [], sum(self.clock.seconds.values())
         for i, member in enumerate(self.members):
-            if healthy[i] and member.progress.improves(reports[i], self.steps):
+            if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
                 member.best_policy = self._of_seed(snapshot.policy, i)
                 best.append(i)
         self._save(best, snapshot)
@@ -590,7 +574,9 @@ def check_library(checkpoint: Checkpoint, library: str) -> None:
     """
     began = library_of(checkpoint)
     if began != library:
-        command = "train" if began == JAX else f"train-torch --library {began}"
+        # The name is from a file, and the command is to be copied into a shell.
+        began = shorten(began)
+        command = "train" if began == JAX else f"train-torch --library {shlex.quote(began)}"
         raise UserError(
             f"{checkpoint.run} was trained with {began}, not with {library}; go on with: "
             f"bounce-mjx {command} --resume {shlex.quote(str(checkpoint.run))}"

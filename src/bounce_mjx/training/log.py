@@ -2,17 +2,22 @@
 
 import contextlib
 import hashlib
+import socket
+import struct
 import sys
-import typing
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.runs.config import TrainConfig
 
-if typing.TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
+# Time after which points appear in TensorBoard, s.
+_FLUSH_SECONDS = 10.0
 
 
 def open_log(
@@ -20,7 +25,7 @@ def open_log(
     first_step: int | None = None,
     suffix: str = "",
     config: TrainConfig | None = None,
-) -> "SummaryWriter":
+) -> "TensorBoardLog":
     """Opens a TensorBoard log in a run's folder.
 
     Args:
@@ -28,26 +33,70 @@ def open_log(
       suffix: suffix of the file's name; two logs opened in the same second need different suffixes.
       config: the run's config, to be logged as text.
     """
-    with _not_importable("torch"):
-        from tensorboardX import SummaryWriter
-        from tensorboardX.record_writer import register_writer_factory
-
-    register_writer_factory(_LOG_PREFIX, _LogFiles())
-    purge_step = None if first_step is None else first_step + 1
-    log = SummaryWriter(
-        logdir=f"{_LOG_PREFIX}:{run}",
-        purge_step=purge_step,
-        flush_secs=10,
-        filename_suffix=suffix,
-    )
+    log = TensorBoardLog(run, suffix)
+    if first_step is not None:
+        log.purge(first_step + 1)
     if config is not None:
         log.add_text("config", f"```yaml\n{dump_config(config)}```", first_step or 0)
     return log
 
 
+class TensorBoardLog:
+    """A file for TensorBoard. While the disk is full, its data waits in memory.
+
+    TensorboardX's own writer has a queue, which its `flush` does not empty, and a thread, which the
+    first error of a full disk ends.
+    """
+
+    def __init__(self, run: Path, suffix: str = ""):
+        with _not_importable("torch"):
+            from tensorboardX import summary
+            from tensorboardX.proto import event_pb2
+            from tensorboardX.record_writer import masked_crc32c
+        self._summary, self._events, self._checksum = summary, event_pb2, masked_crc32c
+        run.mkdir(parents=True, exist_ok=True)
+        started = int(time.time())
+        self._path = run / f"events.out.tfevents.{started}.{socket.gethostname()}{suffix}"
+        self._waiting, self._flushed = bytearray(), time.monotonic()
+        self._add(file_version="brain.Event:2")
+
+    def add_scalar(self, name: str, value: float, steps: int) -> None:
+        self._add(step=steps, summary=self._summary.scalar(name, value))
+
+    def add_text(self, name: str, text: str, steps: int) -> None:
+        self._add(step=steps, summary=self._summary.text(name, text))
+
+    def add_image(self, name: str, pixels: np.ndarray, steps: int) -> None:
+        """Adds a picture [height, width, 3]."""
+        self._add(step=steps, summary=self._summary.image(name, pixels, dataformats="HWC"))
+
+    def purge(self, steps: int) -> None:
+        """Makes TensorBoard drop the points of earlier files at these steps and later."""
+        start = self._events.SessionLog(status=self._events.SessionLog.START)
+        self._add(step=steps, session_log=start)
+
+    def flush(self) -> None:
+        """Writes everything to the file, as far as there is room."""
+        self._flushed = time.monotonic()
+        with contextlib.suppress(OSError), self._path.open("ab", buffering=0) as file:
+            while self._waiting:
+                del self._waiting[: file.write(self._waiting)]
+
+    def close(self) -> None:
+        self.flush()
+
+    def _add(self, **content: Any) -> None:
+        """Adds an event as a TFRecord: its length and its bytes, each with a checksum."""
+        event = self._events.Event(wall_time=time.time(), **content).SerializeToString()
+        for part in (struct.pack("<Q", len(event)), event):
+            self._waiting += part + struct.pack("<I", self._checksum(part))
+        if time.monotonic() - self._flushed > _FLUSH_SECONDS:
+            self.flush()
+
+
 class WandbLog:
-    """A run of Weights & Biases, with the methods of `SummaryWriter` that a training uses. A
-    resumed training continues its run."""
+    """A run of Weights & Biases, with the methods of `TensorBoardLog`. A resumed training
+    continues its run."""
 
     def __init__(self, run: Path, project: str, config: TrainConfig):
         """
@@ -90,7 +139,7 @@ class WandbLog:
 class Logs:
     """Several logs that receive the same."""
 
-    def __init__(self, logs: Sequence["SummaryWriter | WandbLog"]):
+    def __init__(self, logs: Sequence[TensorBoardLog | WandbLog]):
         self._logs = logs
 
     def add_scalar(self, name: str, value: float, steps: int) -> None:
@@ -123,39 +172,3 @@ def _not_importable(module: str) -> Iterator[None]:
         yield
     finally:
         del sys.modules[module]
-
-
-_LOG_PREFIX = "bounce_mjx"
-
-
-class _LogFiles:
-    """Opens the files of a log for tensorboardX."""
-
-    def directory_check(self, path: str) -> None:
-        Path(path.removeprefix(f"{_LOG_PREFIX}:")).mkdir(parents=True, exist_ok=True)
-
-    def open(self, path: str) -> "_LogFile":
-        return _LogFile(Path(path.removeprefix(f"{_LOG_PREFIX}:")))
-
-
-class _LogFile:
-    """A file that keeps its data in memory while the disk is full, and writes it later.
-
-    An ordinary file would raise in tensorboardX's thread: the thread would end, its queue would
-    fill up, and the training would hang without a message.
-    """
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._waiting = bytearray()
-
-    def write(self, data: bytes) -> None:
-        self._waiting += data
-
-    def flush(self) -> None:
-        with contextlib.suppress(OSError), self._path.open("ab", buffering=0) as file:
-            while self._waiting:
-                del self._waiting[: file.write(self._waiting)]
-
-    def close(self) -> None:
-        self.flush()

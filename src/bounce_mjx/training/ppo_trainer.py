@@ -12,7 +12,6 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.env import BounceBall
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
-from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.setup import compiler_options
 from bounce_mjx.training.trainer import JAX, Metrics, Snapshot, iterations_per_block
 
@@ -31,7 +30,8 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self._compiled_iterations = _iterations_at_once(config, env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        trainer = make_trainer(config.ppo, env, episode_steps(config))
+        sharing = self.mesh.size if config.num_seeds == 1 else 1
+        trainer = make_trainer(config.ppo, env, episode_steps(config), sharing)
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self._seeds = seeds[0] if config.num_seeds == 1 else seeds
@@ -60,14 +60,10 @@ class PPOTrainer:
     def state_template(self) -> TrainingState:
         return self._shapes
 
-    def compile(self, programs: Programs) -> concurrent.futures.Future:
-        self._run = programs.get("train", self.mesh, self._lower_run)
-        self._init = programs.get("init", self.mesh, self._lower_init)
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        self._run = pool.submit(self._lower_run().compile)
+        self._init = pool.submit(self._lower_init().compile)
         return self._run
-
-    def trace(self) -> None:
-        """Traces the training's program."""
-        jax.make_jaxpr(self._train_block)(self._shapes)
 
     def _lower_run(self) -> jax.stages.Lowered:
         sharding = self._sharding
@@ -76,7 +72,7 @@ class PPOTrainer:
             in_shardings=(sharding,),
             out_shardings=(sharding, replicated(self.mesh)),
             donate_argnums=0,
-            compiler_options=compiler_options(tunes_products=self._trainer.has_products),
+            compiler_options=compiler_options(tunes_products=True),
         )
         return run.lower(self._shapes)
 

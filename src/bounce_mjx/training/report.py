@@ -1,5 +1,6 @@
 """The report of a finished training."""
 
+import contextlib
 from pathlib import Path
 
 from bounce_mjx.evaluation.results import Report
@@ -26,6 +27,6 @@ def report_training(run: Path, report: Report, steps: int) -> Path:
     recording = report.recording or record_checkpoint(find_checkpoint(run))
     page, evaluation = write_report(run, recording)
     # A new file, because the log of the training is already closed.
-    with open_log(run, suffix=".report") as log:
-        log.add_image("evaluation", pixels(evaluation), steps, dataformats="HWC")
+    with contextlib.closing(open_log(run, suffix=".report")) as log:
+        log.add_image("evaluation", pixels(evaluation), steps)
     return page

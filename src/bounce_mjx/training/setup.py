@@ -4,11 +4,11 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 
-from bounce_mjx.training.helpers import cache_folder, module_files
+from bounce_mjx.files import private_folder
 
 
 def set_up_jax() -> None:
@@ -20,33 +20,36 @@ def set_up_jax() -> None:
 def cache_compilations() -> None:
     """Caches compiled programs in the user's cache folder, so that a second start is quick; a
     folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority. JAX's default is to cache
-    only programs that take a second to compile."""
+    only programs that take a second to compile.
+
+    A user without a home, such as a number without a name in a container, has no cache.
+    """
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        try:
+            jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        except OSError as error:
+            print(
+                f"warning: compiled programs are not kept, as {error.filename} cannot be used "
+                f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to a folder of yours",
+                file=sys.stderr,
+            )
+        except RuntimeError:
+            # No home.
+            pass
 
 
-def imported_modules(args: Sequence[str]) -> tuple[str, ...] | None:
-    """The modules imported so far, with the sizes and times of their files: a user's module that
-    adds a reward term, for example, makes other programs.
+def cache_folder() -> Path:
+    """Folder of the compiled programs in the user's cache, which is made; compiled programs are
+    code, which no other user may write.
 
-    Args:
-      args: the command's arguments.
-
-    Returns:
-      None if the process is not this command alone, such as a notebook or a test, whose own code
-      may have changed the package in memory.
+    Raises:
+      OSError: the folder cannot be made, or is a link or another user's.
+      RuntimeError: the user has no home.
     """
-    main = getattr(sys.modules["__main__"], "__file__", None)
-    if main is None or sys.argv[1:] not in ([*args], ["train", *args]):
-        return None
-    described = []
-    for name in sorted({main, *module_files()}):
-        with contextlib.suppress(OSError):
-            status = os.stat(name)
-            described.append(f"{name} {status.st_size} {status.st_mtime_ns}")
-    return tuple(described)
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return private_folder(private_folder(caches / "bounce_mjx") / "jax")
 
 
 def find_devices() -> None:

@@ -10,7 +10,6 @@ from jax.sharding import Mesh
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.programs import Programs
 
 Metrics = dict[str, np.ndarray]
 
@@ -48,8 +47,8 @@ class Trainer(Protocol):
     def state_template(self) -> Any:
         """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
 
-    def compile(self, programs: Programs) -> concurrent.futures.Future:
-        """Starts the compilation; the future is done when training can start."""
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        """Starts the compilation in a pool; the future is done when training can start."""
 
     def start(self, state: Any | None = None) -> None:
         """Starts from the seeds, or from the state of a `snapshot`."""

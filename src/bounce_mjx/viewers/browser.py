@@ -6,7 +6,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import viser
@@ -14,6 +14,7 @@ import viser.uplot
 from rich.console import Console
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.task.rewards import TERM_NAMES
 from bounce_mjx.viewers.controls import Controls
 from bounce_mjx.viewers.pace import Pace
@@ -47,16 +48,22 @@ def run_browser(
     port: int,
     title: str,
     console: Console,
+    stop: StopRequest,
     names: Sequence[str] | None = None,
+    allowed: Collection[str] = (),
 ) -> None:
-    """Serves the page until the simulated `seconds` are over (None: until Ctrl-C).
+    """Serves the page until the simulated `seconds` are over (None: without an end).
 
     Args:
       num_shown: environments shown at first; the page's slider goes up to all of the simulation.
       port: a free port of this machine.
       names: see `Scene`.
+      allowed: see `start_server`.
+
+    Raises:
+      Interrupted: a stop was requested.
     """
-    with open_server(host, port) as server:
+    with open_server(host, port, allowed) as server:
         page = LivePage(
             server, simulation, num_shown=num_shown, speed=speed, title=title, names=names
         )
@@ -67,7 +74,7 @@ def run_browser(
             highlight=False,
             soft_wrap=True,
         )
-        page.run(seconds)
+        page.run(seconds, stop.check)
 
 
 def address(host: str, port: int) -> str:

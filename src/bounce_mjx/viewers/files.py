@@ -1,9 +1,12 @@
 """Output files that a user names."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.files import new_file
 
 
 def check_writable(path: Path, flag: str, suffixes: tuple[str, ...]) -> None:
@@ -23,14 +26,16 @@ def check_writable(path: Path, flag: str, suffixes: tuple[str, ...]) -> None:
         raise UserError(f"{flag} {path} may not be written; give another file")
 
 
-def replace_file(source: Path, path: Path, flag: str) -> None:
-    """Moves a finished file to the path that the user gave.
+@contextlib.contextmanager
+def new_output(path: Path, flag: str) -> Iterator[Path]:
+    """A `new_file` at the path that the user gave.
 
     Raises:
-      UserError: the file cannot be moved there.
+      UserError: the file cannot be written.
     """
     try:
-        source.replace(path)
+        with new_file(path) as new:
+            yield new
     except OSError as error:
         raise UserError(
             f"{flag} {path} cannot be written ({error.strerror}); give another file"

@@ -11,6 +11,7 @@ import mujoco.viewer
 import numpy as np
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
@@ -61,10 +62,16 @@ def check_display() -> None:
         )
 
 
-def run_native(simulation: Simulation, *, speed: float, seconds: float | None) -> None:
+def run_native(
+    simulation: Simulation, *, speed: float, seconds: float | None, stop: StopRequest
+) -> None:
     """Shows the first environment until the window is closed, or the simulated `seconds` are
-    over."""
-    _Window(simulation, speed).run(seconds)
+    over.
+
+    Raises:
+      Interrupted: a stop was requested.
+    """
+    _Window(simulation, speed).run(seconds, stop)
 
 
 class _Window:
@@ -76,7 +83,7 @@ class _Window:
         # Keys arrive in the window's thread and take effect between two steps.
         self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
 
-    def run(self, seconds: float | None) -> None:
+    def run(self, seconds: float | None, stop: StopRequest) -> None:
         simulation, display = self._simulation, self._display
         dt = simulation.env.dt
         pace, trail = Pace(dt), [simulation.frame.ball[0]]
@@ -94,6 +101,7 @@ class _Window:
             self._camera = viewer.cam
             flags = viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS]
             while viewer.is_running() and steps_left > 0:
+                stop.check()
                 while not self._keys.empty():
                     self._press(self._keys.get())
                 due = 0 if self._paused else min(pace.due(self._speed), steps_left)

@@ -7,8 +7,8 @@ import sys
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.display import Display
 
 CAMERA = "overview"

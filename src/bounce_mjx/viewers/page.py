@@ -1,16 +1,15 @@
 """The replay page: episodes in one HTML file, for any browser, offline."""
 
 import contextlib
-import io
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import viser
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.task.env import BounceBall
-from bounce_mjx.viewers.files import replace_file
+from bounce_mjx.viewers.files import new_output
+from bounce_mjx.viewers.guard import start_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
 
@@ -37,16 +36,8 @@ def write_page(
       UserError: the file cannot be written.
     """
     text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
-    unfinished = path.with_name(f".unfinished-{path.name}")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        replace_file(unfinished, path, "--html")
-    except OSError as error:
-        raise UserError(
-            f"--html {path} cannot be written ({error.strerror}); give another file"
-        ) from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with new_output(path, "--html") as new:
+        new.write_text(text, encoding="utf-8")
 
 
 def replay(
@@ -64,17 +55,15 @@ def replay(
 
 
 @contextlib.contextmanager
-def open_server(host: str, port: int) -> Iterator[viser.ViserServer]:
-    """A viser server that prints nothing; port 0 takes any free port.
+def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator[viser.ViserServer]:
+    """A server of `start_server`; port 0 takes any free port.
 
     Closing it takes at most a second: a background thread waits for clients that do not answer.
     """
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+    server = start_server(host, port, allowed)
     try:
         yield server
     finally:
         stopping = threading.Thread(target=server.stop, daemon=True)
-        with contextlib.redirect_stdout(io.StringIO()):
-            stopping.start()
-            stopping.join(_STOP_SECONDS)
+        stopping.start()
+        stopping.join(_STOP_SECONDS)

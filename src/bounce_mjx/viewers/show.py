@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.task.config import EnvConfig
 from bounce_mjx.task.env import BounceBall
@@ -46,7 +46,6 @@ def show(
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
         of several.
-      KeyboardInterrupt: Ctrl-C came during the compilation or the recording.
     """
     recorded = options.video is not None or options.html is not None
     if recorded and options.viewer != "auto":
@@ -94,9 +93,7 @@ def show(
             # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
             if env.engine.name == "fused" and not several:
                 num_envs = MAX_ENVS
-        simulation = run_interruptible(
-            Simulation, env, one.make_controller(env), num_envs, options.seed, ranges
-        )
+        simulation = Simulation(env, one.make_controller(env), num_envs, options.seed, ranges)
         simulation.target_height = target_height
         simulation.world = None if is_drawn else {}
         return simulation
@@ -119,9 +116,9 @@ def show(
                 # rich would read brackets in a path as markup.
                 console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
         return
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(Interrupted), StopRequest() as stop:
         if viewer == "native":
-            run_native(simulation, speed=options.speed, seconds=options.seconds)
+            run_native(simulation, speed=options.speed, seconds=options.seconds, stop=stop)
         else:
             run_browser(
                 simulation,
@@ -133,4 +130,6 @@ def show(
                 title=title,
                 console=console,
                 names=names,
+                allowed=options.allow_host,
+                stop=stop,
             )

@@ -10,7 +10,7 @@ import numpy as np
 
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.state import State
-from bounce_mjx.learning.policy import Policy, forget
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters
@@ -84,7 +84,6 @@ class Simulation:
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
         self._steps = np.zeros(num_envs, np.int32)
-        self._memory = controller.start_memory((num_envs,))
         over = np.ones(num_envs, bool)
         programs = (
             jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
@@ -128,7 +127,7 @@ class Simulation:
         inputs = self._inputs()
         # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
-        self._key, self._states, self._steps, self._memory, frame = self._step_program(*inputs)
+        self._key, self._states, self._steps, frame = self._step_program(*inputs)
         self.frame = jax.device_get(frame)
         if self.frame.over.any():
             self._reset(self.frame.over)
@@ -159,8 +158,7 @@ class Simulation:
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
         changes = self._set_command(), self._push, self._world()
-        state = self._key, self._states, self._steps, self._memory
-        return self.policy, *state, *changes
+        return self.policy, self._key, self._states, self._steps, *changes
 
     def _reset(self, over: np.ndarray) -> Frame:
         """Starts a new episode in some environments [N]; the frame of all."""
@@ -179,15 +177,14 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, memory, command, push, world):
+    def _advance(self, policy, key, states, steps, command, push, world):
         key, action_key = jax.random.split(key)
         states = _influence(self.env, states, command, push, world)
-        memory = forget(memory, steps == 0)
-        actions, memory = self._controller.act(policy, states, action_key, memory)
+        actions = self._controller(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
-        return key, after, steps, memory, _view(self.env, after, steps, over)
+        return key, after, steps, _view(self.env, after, steps, over)
 
 
 class SideBySide:

@@ -10,9 +10,10 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.env.env import Env
-from bounce_mjx.viewers.files import replace_file
+from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import StopRequest
+from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 from bounce_mjx.viewers.simulation import (
     Frame,
@@ -70,28 +71,29 @@ class VideoWriter:
 
         Raises:
           UserError: the file cannot be written.
+          Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, simulation.env.dt, self.fps)
-        unfinished = self._path.with_name(f".unfinished-{self._path.name}")
-        encoder = subprocess.Popen(
-            self._command(unfinished), stdin=subprocess.PIPE, stderr=subprocess.PIPE
-        )
-        try:
-            # A broken pipe means that the encoder failed; it prints the reason.
-            with contextlib.suppress(BrokenPipeError):
-                for picture in self._pictures(simulation.env, frames):
-                    encoder.stdin.write(picture.tobytes())
-            _, errors = encoder.communicate()
-            if encoder.returncode:
-                reason = " ".join(errors.decode(errors="replace").split())
-                raise UserError(
-                    f"--video {self._path} cannot be written ({reason[-200:]}); give another file"
-                )
-            replace_file(unfinished, self._path, "--video")
-        finally:
-            encoder.kill()
-            encoder.communicate()
-            unfinished.unlink(missing_ok=True)
+        with new_output(self._path, "--video") as new:
+            encoder = subprocess.Popen(
+                self._command(new), stdin=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+            try:
+                # A broken pipe means that the encoder failed; it prints the reason.
+                with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
+                    for picture in self._pictures(simulation.env, frames):
+                        stop.check()
+                        encoder.stdin.write(picture.tobytes())
+                _, errors = encoder.communicate()
+                if encoder.returncode:
+                    reason = " ".join(errors.decode(errors="replace").split())
+                    raise UserError(
+                        f"--video {self._path} cannot be written ({reason[-200:]}); "
+                        "give another file"
+                    )
+            finally:
+                encoder.kill()
+                encoder.communicate()
 
     def _command(self, path: Path) -> list[str]:
         """The command line of an encoder that reads pictures from its standard input."""

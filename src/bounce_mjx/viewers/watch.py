@@ -4,8 +4,9 @@ import collections
 import contextlib
 import html
 import queue
+import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
@@ -35,14 +37,24 @@ class TrainingPage:
     """A `training.trainer.Watcher` that serves a page from a thread of its own. The simulation runs
     on the CPU, so that a training on a GPU keeps its speed."""
 
-    def __init__(self, config: TrainConfig, host: str, port: int, console: Console):
+    def __init__(
+        self,
+        config: TrainConfig,
+        host: str,
+        port: int,
+        console: Console,
+        allowed: Collection[str] = (),
+    ):
         """Starts the thread, which first compiles the simulation.
+
+        Args:
+          allowed: see `start_server`.
 
         Raises:
           UserError: the page cannot be served there.
         """
         self._config, self._host, self._port = config, host, free_port(host, port)
-        self._console = console
+        self._console, self._allowed = console, allowed
         self._news: queue.SimpleQueue = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -65,15 +77,15 @@ class TrainingPage:
         self._news.put(lambda _, panel: panel.end())
         if self._thread.is_alive():
             self._say(f"the page stays at {address(self._host, self._port)} until Ctrl-C")
-        with contextlib.suppress(KeyboardInterrupt):
-            while self._thread.is_alive():
+        with StopRequest(signal.SIGINT) as stop:
+            while self._thread.is_alive() and not stop.requested:
                 self._thread.join(0.2)
 
     def _serve(self) -> None:
         try:
             with _on_cpu():
                 simulation = self._simulate()
-                with open_server(self._host, self._port) as server:
+                with open_server(self._host, self._port, self._allowed) as server:
                     side = server.gui.add_panel()
                     panel = _Panel(server.gui, side, self._config.total_steps)
                     page = LivePage(

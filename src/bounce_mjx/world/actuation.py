@@ -1,5 +1,4 @@
-"""Inputs of the physics from the policy's action: servo targets with latency and lag, air drag and
-pushes."""
+"""Inputs of the physics from the policy's action: servo targets with latency and lag; pushes."""
 
 import math
 from typing import NamedTuple
@@ -82,14 +81,6 @@ def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
     for i in range(1, len(queue)):
         entry = jnp.where(index >= i, queue[i], entry)
     return entry
-
-
-def drag_force(world: World, velocity: jax.Array, mass: jax.Array | float) -> jax.Array:
-    """Drag force [3] of the air on a ball with this velocity [3] (m/s) and mass (kg), N."""
-    speed_squared = jnp.sum(jnp.square(velocity))
-    positive = speed_squared > 0.0
-    speed = jnp.where(positive, jnp.sqrt(jnp.where(positive, speed_squared, 1.0)), 0.0)
-    return -world["air_drag"] * mass * speed * velocity
 
 
 def push(

@@ -14,7 +14,7 @@ almost level.
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 Array = Any
 Repeat = Callable[[int, Callable[[Any], Any], Any], Any]
@@ -30,20 +30,24 @@ _DEEPEST = 0.025
 _CONTACT_STEPS = 5
 
 
-class Constants(NamedTuple):
-    """Constants of the filter; `EstimatorConfig` documents the first eight."""
+Acceleration = Annotated[float, (-1e3, 1e3)]
 
-    measurement_noise: float
-    process_noise: float
-    restitution: float
-    restitution_noise: float
-    contact_time: float
-    paddle_noise: float
-    air_drag: float
-    latency: float | None
-    gravity: tuple[float, float, float]
+
+class Constants(NamedTuple):
+    """Constants of the filter, with the limits within which it is stable and fast on a robot;
+    `EstimatorConfig` documents the first eight."""
+
+    measurement_noise: Annotated[float, (1e-6, 1e3)]
+    process_noise: Annotated[float, (0.0, 1e3)]
+    restitution: Annotated[float, (0.1, 1.0)]
+    restitution_noise: Annotated[float, (0.0, 1e3)]
+    contact_time: Annotated[float, (0.002, 0.05)]
+    paddle_noise: Annotated[float, (0.0, 1e3)]
+    air_drag: Annotated[float, (0.0, 4.0)]
+    latency: Annotated[float, (0.0, 10.0)] | None
+    gravity: tuple[Acceleration, Acceleration, Acceleration]
     """Acceleration of a free ball, m/s^2."""
-    contact_distance: float
+    contact_distance: Annotated[float, (0.0, 10.0)]
     """Distance from the paddle's centre to the ball's centre when they touch, m."""
 
 

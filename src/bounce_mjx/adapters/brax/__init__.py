@@ -5,19 +5,12 @@ Then `brax.envs.get_environment("bounce_ball", episode_seconds=30)` returns a
 `Env`. Needs the extra `brax`.
 """
 
-import contextlib
-import io
+from bounce_mjx.errors import needed
+from bounce_mjx.lazy import silence_mjx
 
-from bounce_mjx.errors import UserError
-
-try:
-    # brax imports MJX, which prints a line for each optional part that is not installed.
-    with contextlib.redirect_stdout(io.StringIO()):
-        import brax.envs
-except ImportError as error:
-    raise UserError(
-        f"brax cannot be imported ({error}); install it with pip install 'bounce_mjx[brax]'"
-    ) from error
+with needed("brax", "'bounce_mjx[brax]'"):
+    silence_mjx()
+    import brax.envs
 
 from bounce_mjx.adapters.brax.checkpoints import load_policy
 from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall

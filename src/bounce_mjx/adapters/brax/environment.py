@@ -1,6 +1,7 @@
 """The environment for brax, with this project's physics."""
 
 import copy
+import dataclasses
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -19,6 +20,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
+from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.world.config import WorldConfig
@@ -26,6 +28,8 @@ from bounce_mjx.world.config import WorldConfig
 ENV_NAME = "bounce_ball"
 
 
+# A dataclass without fields, because TorchRL turns the fields of a state into tensors.
+@dataclasses.dataclass(init=False, eq=False)
 class _Model:
     """A model as a static field of a state; equal only to itself."""
 
@@ -121,7 +125,11 @@ class BraxBounceBall(brax.envs.Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
-        plain = state.replace(pipeline_state=state.pipeline_state.task)
+        task_state = state.pipeline_state.task
+        if task_state.parameters is None:
+            # TorchRL drops the parts of a state that hold no arrays.
+            task_state = task_state._replace(parameters=PhysicsParameters())
+        plain = state.replace(pipeline_state=task_state)
         return self._to_brax(self.task.step(plain, action))
 
     def _to_brax(self, state: State) -> State:

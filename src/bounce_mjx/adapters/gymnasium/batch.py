@@ -165,7 +165,8 @@ class Batch:
             self._episodes, actions, self._limit, reset_before, reset_after
         )
         packed, size = np.asarray(packed), self.task.observation_size
-        numbers = packed[:, 2 * size :].T.astype(np.float64)
+        # Other libraries refuse views with strides.
+        numbers = np.ascontiguousarray(packed[:, 2 * size :].T, np.float64)
         reward, terminated, truncated, *metrics = numbers
         return StepArrays(
             observation=np.array(packed[:, :size], np.float32),

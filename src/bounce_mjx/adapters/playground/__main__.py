@@ -2,10 +2,13 @@
 `python -m bounce_mjx.adapters.playground --env_name=BounceBall`."""
 
 import imageio_ffmpeg
-import mediapy
-from learning import train_jax_ppo
 
 from bounce_mjx.adapters.brax import device_put_replicated
+from bounce_mjx.errors import exit_on_user_error, needed
+
+with exit_on_user_error(), needed("MuJoCo Playground's train-jax-ppo", "playground"):
+    import mediapy
+    from learning import train_jax_ppo
 
 if __name__ == "__main__":
     # The program writes a video at its end.

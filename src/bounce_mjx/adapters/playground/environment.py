@@ -9,27 +9,25 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from ml_collections import config_dict
-from mujoco import mjx
 
 from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env import state as core
 from bounce_mjx.env.env import Env, EnvState
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import needed
+from bounce_mjx.lazy import silence_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 
-try:
+with needed("MuJoCo Playground", "playground"):
+    silence_mjx()
+    from ml_collections import config_dict
+    from mujoco import mjx
     from mujoco_playground import MjxEnv, State
-except ImportError as error:
-    raise UserError(
-        f"MuJoCo Playground cannot be imported ({error}); install it with pip install playground"
-    ) from error
 
 ENV_NAME = "BounceBall"
 

@@ -2,10 +2,14 @@
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+
+from bounce_mjx.errors import needed
+
+with needed("Gymnasium", "'bounce_mjx[gymnasium]'"):
+    import gymnasium
+    from gymnasium.vector import AutoresetMode
 
 from bounce_mjx.adapters.gymnasium.batch import action_space, observation_space
 from bounce_mjx.adapters.gymnasium.environments import checked_options

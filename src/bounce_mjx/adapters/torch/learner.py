@@ -11,9 +11,9 @@ import torch
 from torch import nn
 
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+from bounce_mjx.files import new_file
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.runs.files import PARTIAL
 
 State = dict[str, Any]
 
@@ -120,18 +120,10 @@ class Learner(abc.ABC):
     def save_model(self, path: Path) -> None:
         """Writes networks, optimizer and iteration in the format of rsl_rl's runner, whose `load`
         reads the file of an rsl_rl learner; a complete file replaces an older one."""
-        partial = path.with_name(path.name + PARTIAL)
         names = {f"{name}_state_dict": m.state_dict() for name, m in self._modules().items()}
-        torch.save(
-            names
-            | {
-                "optimizer_state_dict": self.optimizer.state_dict(),
-                "iter": self.iteration,
-                "infos": None,
-            },
-            partial,
-        )
-        partial.rename(path)
+        others = {"optimizer_state_dict": self.optimizer.state_dict(), "iter": self.iteration}
+        with new_file(path) as new:
+            torch.save(names | others | {"infos": None}, new)
 
     @abc.abstractmethod
     def policy(self) -> Policy:

@@ -18,8 +18,7 @@ hyperparameters.
 | value at a time-out     | of the state before it (here of the last state)                     |
 """
 
-import contextlib
-import io
+import sys
 from typing import Any
 
 import numpy as np
@@ -36,19 +35,15 @@ from bounce_mjx.adapters.torch.networks import (
     to_policy,
 )
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import needed
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 
-try:
+with needed("rsl_rl", "'bounce_mjx[torch]'"):
     from rsl_rl.algorithms import PPO
     from rsl_rl.env import VecEnv
     from rsl_rl.models import MLPModel
     from tensordict import TensorDict
-except ImportError as error:
-    raise UserError(
-        f"rsl_rl cannot be imported ({error}); install it with pip install 'bounce_mjx[torch]'"
-    ) from error
 
 
 class RslRlVecEnv(VecEnv):
@@ -210,13 +205,13 @@ class RslRlLearner(Learner):
             self.env.episode_length_buf, self.env.max_episode_length
         )
         # Otherwise rsl_rl prints its networks.
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.algorithm = PPO.construct_algorithm(
-                self.env.get_observations(),
-                self.env,
-                algorithm_config(self.config),
-                str(self.env.device),
-            )
+        sys.modules[PPO.__module__].print = lambda *_: None
+        self.algorithm = PPO.construct_algorithm(
+            self.env.get_observations(),
+            self.env,
+            algorithm_config(self.config),
+            str(self.env.device),
+        )
         self.optimizer = self.algorithm.optimizer
         self.algorithm.train_mode()
 

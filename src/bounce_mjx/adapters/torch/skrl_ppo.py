@@ -29,22 +29,18 @@ from bounce_mjx.adapters.torch.networks import (
     to_policy,
 )
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import needed
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
 
-try:
+with needed("skrl", "'bounce_mjx[torch]'"):
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.envs.wrappers.torch import Wrapper
     from skrl.envs.wrappers.torch import wrap_env as _skrls_wrap_env
     from skrl.memories.torch import RandomMemory
     from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
     from skrl.resources.schedulers.torch import KLAdaptiveLR
-except ImportError as error:
-    raise UserError(
-        f"skrl cannot be imported ({error}); install it with pip install 'bounce_mjx[torch]'"
-    ) from error
 
 
 class SkrlEnv(Wrapper):

@@ -18,7 +18,6 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.devices import make_mesh
-from bounce_mjx.training.programs import Programs
 from bounce_mjx.training.trainer import Metrics, Snapshot
 
 MODEL_FILE = "model.pt"
@@ -59,7 +58,7 @@ class TorchTrainer:
         seeds = (len(self.learners),) if len(self.learners) > 1 else ()
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), one)
 
-    def compile(self, programs: Programs) -> concurrent.futures.Future:
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         # The step of the environments is compiled at its first call.
         done = concurrent.futures.Future()
         done.set_result(None)

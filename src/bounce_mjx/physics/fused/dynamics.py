@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
-from bounce_mjx.physics.control import Control, servo_target
+from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, friction, joint_friction
 from bounce_mjx.physics.fused.contact import normal_force, sphere_box
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
@@ -22,6 +22,7 @@ from bounce_mjx.physics.fused.scalars import (
     Vec3,
     add,
     dot,
+    is_constant,
     matmul,
     matvec,
     mul,
@@ -156,8 +157,8 @@ def _substeps(
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
         world = in_world(model, parameters)
-        if control.ball_force is not None:
-            world = dataclasses.replace(world, ball_force=control.ball_force)
+        if control.air_drag is not None:
+            world = dataclasses.replace(world, air_drag=control.air_drag)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
@@ -267,8 +268,9 @@ def constraint_response(
         _paddle_origin(model, pose),
         matmul(pose.world_rotation[-1], model.paddle_rotation),
     )
-    ball_gravity = scale(model.gravity, model.ball_weight)
-    ball_free = vadd(ball_gravity, scale(model.ball_force, 1.0 / model.ball_mass))
+    ball_free = scale(model.gravity, model.ball_weight)
+    if not is_constant(model.air_drag):
+        ball_free = vadd(ball_free, drag(model.air_drag, motion.ball_velocity))
     if motion.turning is not None:
         factor = stored(chain.cholesky(inertia))
         response = friction.contact_response(

@@ -91,8 +91,8 @@ class FusedModel:
     """Whether the integrator is implicit in the joints' damping."""
     dry_friction: bool = True
     """Whether the joints' dry friction acts (the flag `frictionloss`)."""
-    ball_force: Vec3 = ZERO3
-    """External force on the ball, N."""
+    air_drag: Scalar = 0.0
+    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
@@ -131,7 +131,7 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
         nq=m.nq,
         nv=m.nv,
         weight=1.0 - (compensated or 0.0),
-        ball_weight=1.0 - float(m.body_gravcomp[addresses.ball_body]),
+        ball_weight=1.0 - float(_gravity_compensation(m)[addresses.ball_body]),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
         dry_friction=_has_dry_friction(m),
@@ -314,7 +314,7 @@ def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Fra
     principal = rotation @ np.array(inertial.rotation)
     about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
     about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    floating = float(mj_model.body_gravcomp[body])
+    floating = float(_gravity_compensation(mj_model)[body])
     return dataclasses.replace(
         link,
         mass=link.mass + mass,
@@ -353,6 +353,12 @@ def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
     return Frame(origin, rotation)
 
 
+def _gravity_compensation(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Compensated share [nbody] of each body's weight. MuJoCo ignores negative shares if none is
+    positive, which `ngravcomp` counts."""
+    return mj_model.body_gravcomp if mj_model.ngravcomp else np.zeros(mj_model.nbody)
+
+
 def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float | None:
     """Share of the arm's weight that gravity compensation carries; None if it differs between
     bodies or counts for a joint's `actuatorfrcrange`. A common share costs no operation."""
@@ -360,7 +366,7 @@ def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float 
     joints = list(addresses.arm_joints)
     counts = m.jnt_actgravcomp[joints].astype(bool) & m.jnt_actfrclimited[joints].astype(bool)
     moving = np.isin(m.body_weldid, m.jnt_bodyid[joints])
-    shares = np.unique(m.body_gravcomp[moving & (m.body_mass > 0.0)])
+    shares = np.unique(_gravity_compensation(m)[moving & (m.body_mass > 0.0)])
     return float(shares[0]) if len(shares) == 1 and not (np.any(counts) and shares[0]) else None
 
 

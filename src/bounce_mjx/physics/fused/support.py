@@ -51,7 +51,8 @@ def _check_options(m: mujoco.MjModel) -> None:
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
     _require(
         integrator in _INTEGRATORS,
-        f"the integrator {integrator.name} (only implicitfast and Euler)",
+        f"the integrator {integrator.name.removeprefix('mjINT_').lower()} "
+        "(only implicitfast and Euler)",
     )
     disabled = _flags(m.opt.disableflags, mujoco.mjtDisableBit) - _HARMLESS_DISABLED
     _require(not disabled, f"disabled parts of the engine ({', '.join(sorted(disabled))})")
@@ -139,7 +140,7 @@ def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
     _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
     _require(m.pair_adhesion[0] == 0.0, "adhesion")
     solref, width = m.pair_solref[0], m.pair_solimp[0, 2]
-    _require((solref[0] > 0.0) == (solref[1] > 0.0), "a solref of mixed signs")
+    _require((solref[0] > 0.0) == (solref[1] > 0.0), "a solref with exactly one positive number")
     _require(width > _MIN_WIDTH, "a solimp without a width")
 
 

@@ -1,5 +1,5 @@
 """Makes the policy that comes with the package from a run, for maintainers:
-`python -m bounce_mjx.commands.ship RUN`."""
+`python benchmarks/ship.py RUN`."""
 
 import shutil
 import sys
@@ -51,7 +51,7 @@ def main(args: Sequence[str] | None = None) -> None:
         command = parse(
             ShipCommand,
             sys.argv[1:] if args is None else args,
-            prog="python -m bounce_mjx.commands.ship",
+            prog="benchmarks/ship.py",
             description="Makes the policy that comes with the package from a run.",
         )
         set_up_jax()

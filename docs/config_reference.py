@@ -1,6 +1,6 @@
 """Prints the reference of every config key, generated from the types of the settings:
 
-python -m bounce_mjx.commands.config_reference > docs/config.md
+python docs/config_reference.py > docs/config.md
 """
 
 import re
@@ -25,7 +25,7 @@ by spaces or commas (`256 256` or `256,256`), and a switch has three forms, such
 This page is generated from the types of the settings (`TrainConfig` in
 `src/bounce_mjx/runs/config.py`, and the groups in it):
 
-    python -m bounce_mjx.commands.config_reference > docs/config.md
+    python docs/config_reference.py > docs/config.md
 
 These rules concern several keys:
 

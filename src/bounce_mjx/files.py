@@ -1,0 +1,68 @@
+"""Files and folders in which someone else may have had a hand: they are read with a limit, and
+nothing is written through a link."""
+
+import contextlib
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def read_regular(path: Path, limit: int) -> bytes:
+    """Reads a regular file, or one that a link leads to.
+
+    Args:
+      limit: most bytes that it may have.
+
+    Raises:
+      OSError: the file cannot be read.
+      ValueError: it is a pipe, a device or a folder, or it is longer.
+    """
+    # Opening a pipe would wait for a writer, and a device may have no end.
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError("it is not a regular file")
+    with path.open("rb") as file:
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise ValueError(f"it is longer than {limit} bytes")
+    return content
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yields a new, empty file beside `path`, with its suffix, which replaces it at the end of the
+    block; after an exception, the new file is removed.
+
+    A link at `path` is replaced, too, and what it leads to stays as it is.
+
+    Raises:
+      OSError: the file cannot be made, or cannot replace the other.
+    """
+    new = path.with_name(f".unfinished-{os.urandom(8).hex()}{path.suffix}")
+    # Fails if there is anything with this name, even a link that leads nowhere.
+    os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    try:
+        yield new
+        new.replace(path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+
+
+def private_folder(path: Path) -> Path:
+    """Makes a folder, or takes an existing one, that this user alone can open.
+
+    Raises:
+      OSError: it cannot be made, or it is a link or another user's.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    status = path.lstat()
+    if not stat.S_ISDIR(status.st_mode):
+        raise NotADirectoryError(errno.ENOTDIR, "it is a link or a file", str(path))
+    if status.st_uid != os.getuid():
+        raise PermissionError(errno.EPERM, "it is another user's", str(path))
+    path.chmod(0o700)
+    return path
