@@ -18,7 +18,7 @@ from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.robot.adopt import Adoption
@@ -56,12 +56,12 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         with no_garbage_collection():
             from bounce_mjx.robot.adopt import adopt
-            from bounce_mjx.task.env import BounceBall
+            from bounce_mjx.env.env import Env
             from bounce_mjx.training.setup import set_up_jax
 
         set_up_jax()
         console = Console(soft_wrap=True, highlight=False)
-        default = EnvConfig()
+        default = WorldConfig()
         paddle = command.paddle
         fixed = (paddle.position, paddle.quaternion) != (
             PaddleConfig().position,
@@ -71,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> None:
         adoption = adopt(command.mjcf, robot, default.control_dt, fixed)
         values = {"env": env_values(command.mjcf, adoption)}
         config = validate(TrainConfig, values, str(command.mjcf))
-        env = BounceBall(config.env)
+        env = Env(config.env)
         for line in described(adoption):
             console.print(line, markup=False)
         console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
@@ -86,17 +86,17 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def env_values(mjcf: Path, adoption: "Adoption") -> dict[str, Any]:
-    """The settings of `EnvConfig` that belong to an adopted arm.
+    """The settings of `WorldConfig` that belong to an adopted arm.
 
     The task keeps its heights relative to the paddle's home; those of the default config are for a
     home height of 0.05 m.
     """
-    default, pose = EnvConfig(), adoption.pose
+    default, pose = WorldConfig(), adoption.pose
     x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle)
     lift = z - default.reward.paddle_home_height
     reward = default.reward
     farthest = default.max_horizontal_distance - default.reward.target_x
-    path = EnvConfig(mjcf=mjcf).mjcf
+    path = WorldConfig(mjcf=mjcf).mjcf
     return {
         "mjcf": str(path),
         "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),

@@ -15,14 +15,14 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.randomization import RandomizationConfig
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import RandomizationConfig
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 
 if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
-    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.env.env import Env
     from bounce_mjx.viewers.controllers import Controller
     from bounce_mjx.viewers.show import Shown
 
@@ -86,7 +86,7 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization
-    env = validate(EnvConfig, dict(config.env) | changes, "play")
+    env = validate(WorldConfig, dict(config.env) | changes, "play")
     return config.model_copy(update={"env": env})
 
 
@@ -100,7 +100,7 @@ def _load(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "S
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
     policy = load_policy(checkpoint, config)
 
-    def make_controller(env: "BounceBall") -> "Controller":
+    def make_controller(env: "Env") -> "Controller":
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         return make_policy_controller(networks, policy)
 

@@ -52,7 +52,7 @@ def main(args: Sequence[str] | None = None) -> None:
             from bounce_mjx.runs.config import load_run_config
             from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
-            from bounce_mjx.task.env import BounceBall
+            from bounce_mjx.env.env import Env
 
         runs = [named_run(run, command.log_dir) for run in command.runs or (None,)]
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
@@ -60,7 +60,7 @@ def main(args: Sequence[str] | None = None) -> None:
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:
-            env = BounceBall(load_run_config(checkpoints[0].run).env)
+            env = Env(load_run_config(checkpoints[0].run).env)
             figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
         for name, figure in figures.items():
             for suffix in command.formats:

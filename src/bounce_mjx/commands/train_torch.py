@@ -25,7 +25,7 @@ from bounce_mjx.training.command import (
 from bounce_mjx.training.loop_fusion import join_loops
 
 if TYPE_CHECKING:
-    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.env.env import Env
     from bounce_mjx.training.trainer import Trainer
 
 PROG = "bounce-mjx train-torch"
@@ -71,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> None:
         trainer = importlib.import_module("bounce_mjx.adapters.torch.trainer")
         made = []
 
-        def make_trainer(config: TrainConfig, env: "BounceBall") -> "Trainer":
+        def make_trainer(config: TrainConfig, env: "Env") -> "Trainer":
             made.append(trainer.TorchTrainer(command.library, config, env))
             return made[0]
 

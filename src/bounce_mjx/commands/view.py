@@ -14,7 +14,7 @@ from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import ROBOTS, load_config, named_file
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import ViewerOptions
@@ -29,7 +29,7 @@ class ViewCommand(StrictModel):
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
+    env: Annotated[WorldConfig, tyro.conf.arg(name="")] = WorldConfig()
 
 
 @interruptible

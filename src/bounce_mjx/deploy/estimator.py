@@ -8,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.task.ball_filter import BallFilter
+from bounce_mjx.world.ball_filter import BallFilter
 
 # Time of control steps whose planes of the paddle are kept, s.
 _MEMORY = 0.3

@@ -21,9 +21,9 @@ from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.estimator import filter_constants, paddle_normal
-from bounce_mjx.task.observation import parts
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.estimator import filter_constants, paddle_normal
+from bounce_mjx.world.observation import parts
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
@@ -133,7 +133,7 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
     )
 
 
-def _parts(env: EnvConfig) -> tuple[Part, ...]:
+def _parts(env: WorldConfig) -> tuple[Part, ...]:
     return tuple(
         Part(_INPUT_NAMES.get(q.name, q.name), history, q.size, q.unit)
         for q in parts(env.num_joints)

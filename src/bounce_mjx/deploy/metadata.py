@@ -8,7 +8,7 @@ import math
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from bounce_mjx.deploy.strict import read
-from bounce_mjx.task.ball_filter import Constants
+from bounce_mjx.world.ball_filter import Constants
 
 FORMAT = 2
 """Version of the entries; readers refuse other versions."""

@@ -21,8 +21,8 @@ from bounce_mjx.physics import (
     servo_targets,
 )
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.randomization import Ranges
+from bounce_mjx.env.env import Env
+from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
@@ -30,7 +30,7 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 
 def make_mujoco_evaluator(
-    env: BounceBall,
+    env: Env,
     networks: Networks,
     episodes: int,
     progress: Callable[[float], None] | None = None,
@@ -96,7 +96,7 @@ class _Inputs(NamedTuple):
     """Deceleration [N] of the balls by the air divided by their squared speed, 1/m."""
 
 
-def _inputs(env: BounceBall, control: Control) -> _Inputs:
+def _inputs(env: Env, control: Control) -> _Inputs:
     """Inputs from controls whose batch is last."""
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
     push = jnp.zeros((len(targets), 3)) if control.ball_push is None else control.ball_push.T
@@ -132,7 +132,7 @@ def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.array(find_addresses(mj_model).ball_qvel[:3]) + 1 + mj_model.nq
 
 
-def episode_models(env: BounceBall, parameters: PhysicsParameters) -> list[mujoco.MjModel]:
+def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjModel]:
     """One model for all episodes, or one model per episode where parameters [..., N] are given."""
     parameters = jax.tree.map(np.asarray, parameters)
     given = jax.tree.leaves(parameters)

@@ -10,9 +10,9 @@ import numpy as np
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.randomization import Ranges
-from bounce_mjx.task.state import State
+from bounce_mjx.env.env import Env
+from bounce_mjx.world.randomization import Ranges
+from bounce_mjx.env.state import State
 
 
 class _Episodes(NamedTuple):
@@ -25,7 +25,7 @@ class _Episodes(NamedTuple):
     """Control steps so far [], int32."""
 
 
-def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callable[..., Statistics]:
+def make_evaluator(env: Env, networks: Networks, episodes: int) -> Callable[..., Statistics]:
     """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
     each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
     limit is reached. The ranges are optional.
@@ -39,7 +39,7 @@ def make_evaluator(env: BounceBall, networks: Networks, episodes: int) -> Callab
 
 
 def make_recording_evaluator(
-    env: BounceBall, networks: Networks, episodes: int, recorded: int
+    env: Env, networks: Networks, episodes: int, recorded: int
 ) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `make_evaluator`, but also returns a recording of the first `recorded` episodes."""
 
@@ -53,7 +53,7 @@ def make_recording_evaluator(
 
 
 def run_episodes(
-    env: BounceBall, networks: Networks, policy: Policy, states: State, recorded: int
+    env: Env, networks: Networks, policy: Policy, states: State, recorded: int
 ) -> tuple[Statistics, Recording]:
     """Runs one deterministic episode from each of E initial states (batch last), until all have
     ended or their time limit is reached.
@@ -65,7 +65,7 @@ def run_episodes(
     return ended.statistics, ended.recording
 
 
-def _begin(env: BounceBall, states: State, recorded: int) -> _Episodes:
+def _begin(env: Env, states: State, recorded: int) -> _Episodes:
     episodes = states.done.shape[-1]
     return _Episodes(
         states=states,
@@ -78,7 +78,7 @@ def _begin(env: BounceBall, states: State, recorded: int) -> _Episodes:
 
 
 def _run_until(
-    env: BounceBall,
+    env: Env,
     networks: Networks,
     policy: Policy,
     progress: _Episodes,
@@ -103,7 +103,7 @@ def _run_until(
 
 
 def reset_episodes(
-    env: BounceBall, key: jax.Array, episodes: int, ranges: Ranges | None = None
+    env: Env, key: jax.Array, episodes: int, ranges: Ranges | None = None
 ) -> State:
     """The initial states of N episodes, batch last; consumes the key.
 
@@ -123,7 +123,7 @@ def reset_episodes(
 
 
 def make_reporting_evaluator(
-    env: BounceBall, networks: Networks, episodes: int, progress: Callable[[float], None]
+    env: Env, networks: Networks, episodes: int, progress: Callable[[float], None]
 ) -> Callable[[Policy, jax.Array], Statistics]:
     """Like `make_evaluator`, but calls `progress` every second of simulated time with the share of
     the time limit that is simulated."""

@@ -13,9 +13,9 @@ from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evalua
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.randomization import RandomizationConfig
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.env.env import Env
+from bounce_mjx.world.randomization import RandomizationConfig
 
 
 class Evaluation(NamedTuple):
@@ -30,7 +30,7 @@ class Evaluation(NamedTuple):
 
 def evaluate_policy(
     policy: Policy,
-    env_config: EnvConfig,
+    env_config: WorldConfig,
     ppo_config: PPOConfig,
     *,
     episodes: int = DEFAULT_EPISODES,
@@ -67,7 +67,7 @@ def evaluate_policy(
         changes["target_height_range"] = (target_height, target_height)
     if physics in ("fused", "mjx"):
         changes["physics"] = physics
-    env = BounceBall(validate(EnvConfig, dict(env_config) | changes, "evaluation"))
+    env = Env(validate(WorldConfig, dict(env_config) | changes, "evaluation"))
     networks = make_networks(ppo_config, env.observation_size, env.action_size)
     on_c = physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name

@@ -19,9 +19,9 @@ from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.suite import Condition, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.randomization import RandomizationConfig, Ranges
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.env.env import Env
+from bounce_mjx.world.randomization import RandomizationConfig, Ranges
 
 # Terms without a neutral value, or with a high cost in the physics: only the conditions that need
 # such a term are simulated with it.
@@ -120,7 +120,7 @@ def measure_conditions(
     done = 0
     for (_, separate), indices in programs.items():
         members = [conditions[index] for index in indices]
-        env = BounceBall(_spanning_config(members, physics))
+        env = Env(_spanning_config(members, physics))
         dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
         on_c = physics == "mujoco" or dry_in_mjx
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
@@ -152,7 +152,7 @@ def measure_conditions(
     return outcomes
 
 
-def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> EnvConfig:
+def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> WorldConfig:
     """Task with all terms of the conditions active, in ranges that contain all their ranges."""
     env = conditions[0].env
     spans = {}
@@ -173,7 +173,7 @@ def _range(condition: Condition, term: str) -> tuple[np.ndarray, np.ndarray]:
     return neutral_range(term, condition.env) if given is None else given
 
 
-def _stacked_ranges(env: BounceBall, conditions: Sequence[Condition]) -> Ranges | None:
+def _stacked_ranges(env: Env, conditions: Sequence[Condition]) -> Ranges | None:
     """Ranges of C conditions, each end [C, ...]; None if no term is active."""
     terms = env.config.randomization.terms
     return {

@@ -15,9 +15,9 @@ from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.task.actuation import DEFAULT_PUSH_INTERVAL
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.randomization import TERMS, RandomizationConfig
+from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
 UNITS = {
     "": 1.0,
@@ -79,7 +79,7 @@ class Condition(NamedTuple):
     perturbation: Perturbation
     strength: float | None
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
-    env: EnvConfig
+    env: WorldConfig
     """Task of the policy, without randomisation."""
     ranges: dict[str, Bounds]
     """Lower and upper ends of the perturbed terms' ranges, in the shapes of the terms."""
@@ -93,7 +93,7 @@ class Condition(NamedTuple):
         return float(low), float(high)
 
 
-def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
+def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
     """Reads the conditions of a suite file, the nominal condition first.
 
     Args:
@@ -121,7 +121,7 @@ def load_suite(path: Path, trained: EnvConfig) -> list[Condition]:
     return conditions
 
 
-def neutral_range(term: str, env: EnvConfig) -> Bounds | None:
+def neutral_range(term: str, env: WorldConfig) -> Bounds | None:
     """Range of a term without effect on the world; None if the term has no such value."""
     low = high = TERMS[term].nominal
     if term == "push_interval":
@@ -158,7 +158,7 @@ def _check(p: Perturbation, source: str) -> None:
 
 
 def _condition(
-    perturbation: Perturbation, strength: float | None, trained: EnvConfig, source: str
+    perturbation: Perturbation, strength: float | None, trained: WorldConfig, source: str
 ) -> Condition:
     scale = UNITS[perturbation.unit]
     value = None if strength is None else strength * scale
@@ -175,7 +175,7 @@ def _condition(
         }
     spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
     # Raises an error for values outside a term's limits.
-    validate(EnvConfig, dict(env) | {"randomization": spans}, source)
+    validate(WorldConfig, dict(env) | {"randomization": spans}, source)
     contained = not differing_keys(env, plain) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
     )
@@ -183,8 +183,8 @@ def _condition(
 
 
 def _with_settings(
-    env: EnvConfig, settings: dict[str, Any], strength: float | None, source: str
-) -> EnvConfig:
+    env: WorldConfig, settings: dict[str, Any], strength: float | None, source: str
+) -> WorldConfig:
     """Task with changed settings."""
     if not settings:
         return env
@@ -200,7 +200,7 @@ def _with_settings(
                 "terms of the randomisation under terms"
             )
         group[key] = _filled_in(value, strength)
-    changed = validate(EnvConfig, values, source)
+    changed = validate(WorldConfig, values, source)
     if changed.layout != env.layout:
         raise UserError(
             f"{source}: it changes the quantities of the observation, which the policy's network "
@@ -264,7 +264,7 @@ def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     return shaped(low), shaped(high)
 
 
-def _contains(trained: EnvConfig, term: str, bounds: Bounds) -> bool:
+def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
     """Whether the training range of a term contains other bounds."""
     drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
     if drawn is None:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.task import vector
+from bounce_mjx.env import vector
 
 Metrics = dict[str, jax.Array]
 

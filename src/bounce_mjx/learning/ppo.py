@@ -29,8 +29,8 @@ from bounce_mjx.learning.metrics import (
 )
 from bounce_mjx.learning.policy import Networks, Policy, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
-from bounce_mjx.task import vector
-from bounce_mjx.task.state import Env
+from bounce_mjx.env import vector
+from bounce_mjx.env.state import Env
 
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1

@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
 from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.task.rewards import TERM_NAMES
 
 # Tags of the log, their titles in the figure, and the factor to the displayed unit.
@@ -91,7 +91,7 @@ def rewards_figure(groups: Sequence[Group]) -> Figure:
     return figure
 
 
-def evaluation_figure(env: BounceBall, recording: Recording) -> Figure:
+def evaluation_figure(env: Env, recording: Recording) -> Figure:
     """The ball's height and its target over the first recorded episode, and the apex errors and
     the hits on the paddle of all recorded episodes."""
     recording = jax.device_get(recording)
@@ -192,7 +192,7 @@ def _add_legend(figure: Figure, groups: Sequence[Group], *, solved: bool) -> Non
     figure.legend(handles=handles, loc="lower center", ncols=min(3, len(handles)))
 
 
-def _draw_heights(axes: Axes, env: BounceBall, recording: Recording) -> None:
+def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     """The first recorded episode, up to its end."""
     steps = int(np.asarray(recording.running[:, 0]).sum())
     time = env.dt * (1 + np.arange(steps))
@@ -223,7 +223,7 @@ def _draw_apex_errors(axes: Axes, errors: np.ndarray) -> None:
     axes.axvline(0.0, color=_GREY, linewidth=0.8)
 
 
-def _draw_hits(axes: Axes, env: BounceBall, points: np.ndarray) -> None:
+def _draw_hits(axes: Axes, env: Env, points: np.ndarray) -> None:
     """The paddle's outline with a dot for each hit."""
     half_x, half_y = env.mj_model.geom("blocker").size[:2]
     axes.set_title(f"hits on the paddle, cm ({len(points):,})")

@@ -32,7 +32,7 @@ from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 
 REPORT_FILE = "report.html"
 
@@ -41,7 +41,7 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
-    env = BounceBall(config.env)
+    env = Env(config.env)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
     return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
@@ -65,7 +65,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
         raise UserError(f"{run} has no results yet; wait for the end of its training")
     config = load_run_config(run)
     groups = group_runs([run])
-    evaluation = evaluation_figure(BounceBall(config.env), recording)
+    evaluation = evaluation_figure(Env(config.env), recording)
     robustness = load_robustness(run)
     figures = {
         "Learning curves": curves_figure(groups),

@@ -235,7 +235,7 @@ def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
     if fingerprint(mj_model) != built_from:
         raise UserError(
             "env.mj_model was edited after the environment had been built, and the physics would "
-            "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to BounceBall"
+            "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to Env"
         )
 
 

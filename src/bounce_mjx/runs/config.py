@@ -14,7 +14,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.robot import check_robot
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.world.config import WorldConfig
 
 CONFIG_FILE = "config.yaml"
 ROBOTS = "configs/robots"
@@ -24,7 +24,7 @@ ROBOTS = "configs/robots"
 class TrainConfig(StrictModel):
     """A training run: the task, the trainer, the length and the evaluations."""
 
-    env: EnvConfig = EnvConfig()
+    env: WorldConfig = WorldConfig()
     """The task."""
     ppo: PPOConfig = PPOConfig()
     """The trainer."""

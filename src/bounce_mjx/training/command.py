@@ -16,10 +16,10 @@ from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
-    from bounce_mjx.task.env import BounceBall
+    from bounce_mjx.env.env import Env
     from bounce_mjx.training.job import Outcome
     from bounce_mjx.training.trainer import Trainer, Watcher
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class TrainingCommand(TrainConfig):
     """The command line: the config's keys as flags, and the preset or run to start from."""
 
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
+    env: Annotated[WorldConfig, tyro.conf.arg(name="")] = WorldConfig()
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
     """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
@@ -114,7 +114,7 @@ def _is_solved(run: Path) -> bool:
 
 def run_command(
     command: TrainingCommand,
-    make_trainer: "Callable[[TrainConfig, BounceBall], Trainer]",
+    make_trainer: "Callable[[TrainConfig, Env], Trainer]",
     prog: str,
     watcher: "Watcher | None" = None,
     stopped: Callable[[Sequence[Path]], None] = lambda runs: None,

@@ -17,7 +17,7 @@ from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
 
@@ -42,7 +42,7 @@ class Evaluators:
     def __init__(
         self,
         config: TrainConfig,
-        env: BounceBall,
+        env: Env,
         mesh: Mesh,
         pool: concurrent.futures.Executor,
     ):
@@ -148,7 +148,7 @@ def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:
     return jax.tree.map(lambda *x: np.concatenate(x, axis=-1)[..., :episodes], *parts)
 
 
-def policy_shapes(config: TrainConfig, env: BounceBall) -> Policy:
+def policy_shapes(config: TrainConfig, env: Env) -> Policy:
     """Shapes of a training's policy; with several seeds, the seeds are the first axis."""
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     shapes = jax.eval_shape(

@@ -40,7 +40,7 @@ from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
@@ -103,7 +103,7 @@ class TrainingStopped(Exception):
 def train(
     config: TrainConfig,
     console: Console,
-    make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+    make_trainer: Callable[[TrainConfig, Env], Trainer],
     options: Options,
 ) -> list[Outcome]:
     """Trains with a config, and returns an outcome for each seed.
@@ -158,7 +158,7 @@ class _Job:
         self,
         config: TrainConfig,
         console: Console,
-        make_trainer: Callable[[TrainConfig, BounceBall], Trainer],
+        make_trainer: Callable[[TrainConfig, Env], Trainer],
         options: Options,
         stop: StopRequest,
         stack: contextlib.ExitStack,
@@ -170,7 +170,7 @@ class _Job:
         self.run, self.resumed = options.resume, options.resume is not None
         self.clock = Clock()
         hosts.advise(self._advice)
-        self.env = BounceBall(config.env)
+        self.env = Env(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps

@@ -8,12 +8,12 @@ benchmarks/RESULTS.md). XLA aborts the process on a few programs with it, such a
 
 import os
 
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.world.config import WorldConfig
 
 OPTION = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
 
 
-def join_loops(*configs: EnvConfig) -> None:
+def join_loops(*configs: WorldConfig) -> None:
     """Switches the option on for this process if all these environments have the fused physics.
     XLA reads it when JAX starts its devices. `XLA_FLAGS` of the user has priority.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
 from bounce_mjx.training.setup import compiler_options
@@ -22,7 +22,7 @@ class PPOTrainer:
     library = JAX
     checked = CHECKED
 
-    def __init__(self, config: TrainConfig, env: BounceBall):
+    def __init__(self, config: TrainConfig, env: Env):
         """
         Raises:
           UserError: the config does not fit the devices or the environment.
@@ -105,7 +105,7 @@ class PPOTrainer:
         return Snapshot(policy_of(state, self._observation_size), state)
 
 
-def _iterations_at_once(config: TrainConfig, env: BounceBall) -> int:
+def _iterations_at_once(config: TrainConfig, env: Env) -> int:
     """Iterations in one program: a whole block, but one on MJX, which may take minutes for a block
     and could not be stopped before its end."""
     return 1 if env.engine.name == "mjx" else iterations_per_block(config)

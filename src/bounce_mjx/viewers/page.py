@@ -7,7 +7,7 @@ from pathlib import Path
 
 import viser
 
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.guard import start_server
 from bounce_mjx.viewers.scene import Scene
@@ -41,7 +41,7 @@ def write_page(
 
 
 def replay(
-    env: BounceBall, recording: Frame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
+    env: Env, recording: Frame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
 ) -> str:
     """A page (HTML) that replays a recording [T, N, ...]."""
     frames = resample(recording, env.dt, fps)

@@ -10,8 +10,8 @@ from rich.console import Console
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
@@ -25,8 +25,8 @@ _RECORDED_SECONDS = 10.0
 class Shown(NamedTuple):
     """An environment to show, and its controller."""
 
-    config: EnvConfig
-    make_controller: Callable[[BounceBall], Controller]
+    config: WorldConfig
+    make_controller: Callable[[Env], Controller]
     title: str
 
 
@@ -87,9 +87,9 @@ def show(
 
     def simulate(one: Shown) -> Simulation:
         config, num_envs = one.config, each if several else options.num_envs
-        env, ranges = BounceBall(config), None
+        env, ranges = Env(config), None
         if on_page:
-            env, ranges = BounceBall(with_sliders(config)), drawn_ranges(config)
+            env, ranges = Env(with_sliders(config)), drawn_ranges(config)
             # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
             if env.engine.name == "fused" and not several:
                 num_envs = MAX_ENVS

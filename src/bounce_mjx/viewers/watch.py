@@ -19,7 +19,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.browser import AXIS, LivePage, address, free_port
 from bounce_mjx.viewers.controllers import make_exchangeable_controller
 from bounce_mjx.viewers.page import open_server
@@ -100,7 +100,7 @@ class TrainingPage:
 
     def _simulate(self) -> Simulation:
         config = self._config
-        env = BounceBall(config.env)
+        env = Env(config.env)
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         untrained = untrained_policy(
             networks, env.observation_size, jax.random.PRNGKey(config.seed)

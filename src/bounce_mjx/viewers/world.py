@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from bounce_mjx.evaluation.suite import neutral_range
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.randomization import TERMS, RandomizationConfig, Ranges
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
 
 class WorldSlider(NamedTuple):
@@ -46,7 +46,7 @@ SLIDERS = (
 )
 
 
-def with_sliders(config: EnvConfig) -> EnvConfig:
+def with_sliders(config: WorldConfig) -> WorldConfig:
     """Task with the sliders' terms active, in ranges that contain both the sliders' and the task's.
 
     The nominal restitution holds only for the project's own model; other models get no slider for
@@ -62,7 +62,7 @@ def with_sliders(config: EnvConfig) -> EnvConfig:
     return config.model_copy(update={"randomization": randomization})
 
 
-def drawn_ranges(config: EnvConfig) -> Ranges:
+def drawn_ranges(config: WorldConfig) -> Ranges:
     """Ranges with which a reset of `with_sliders(config)` draws the worlds of `config`."""
     ranges = config.randomization.ranges()
     for name in with_sliders(config).randomization.terms:
