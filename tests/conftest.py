@@ -8,6 +8,7 @@ import importlib
 import importlib.util
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -39,6 +40,10 @@ os.environ.setdefault("XLA_FLAGS", OPTION)
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # A shell script starts a process in the background with SIGINT ignored, and the processes of
+    # the tests about Ctrl-C would inherit that.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # The workers of pytest-xdist inherit the folder.
     if not hasattr(config, "workerinput"):
         os.environ[CACHE] = tempfile.mkdtemp(prefix="bounce_mjx_tests_")

@@ -79,7 +79,7 @@ def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeyp
     parameters.source = f"SOURCE, TRAINING, VIDEO = '', '--stop-when-solved', '{video}'"
     (tmp_path / "train.py").write_text(TRAINED)
     for cell in code:
-        cell.source = cell.source.replace("{COMMAND}.train", "{sys.executable} train.py")
+        cell.source = cell.source.replace("{COMMAND} train", "{sys.executable} train.py")
     nbclient.NotebookClient(
         notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     ).execute()

@@ -94,7 +94,7 @@ main(sys.argv[1:])
         ("train --config {run}/config.yaml", False),
         ("view --html {run}/page.html --mjcf {rk4}", False),
         ("play pretrained --html {run}/page.html", True),
-        ("play {run} --html {run}/page.html", False),
+        ("play pretrained --physics mjx --html {run}/page.html", False),
         ("eval pretrained --physics mjx", False),
         ("robustness pretrained --out {run}", True),
     ],

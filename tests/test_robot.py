@@ -555,9 +555,9 @@ def test_speed_is_judged_at_targets_above_the_arms_own_home(written) -> None:
     low, high = config.target_height_range
     home = config.reward.paddle_home_height
     assert home != HOME_HEIGHT
-    assert _speed_result(1.0, (low, high), home).passed
-    assert _speed_result(1.0, (low, high + 0.1), home).passed is None
-    assert _speed_result(1.0, (0.4, 0.6), HOME_HEIGHT).passed
+    assert _speed_result((1.0, 0.0), (low, high), home).passed
+    assert _speed_result((1.0, 0.0), (low, high + 0.1), home).passed is None
+    assert _speed_result((1.0, 0.0), (0.4, 0.6), HOME_HEIGHT).passed
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
@@ -152,10 +153,9 @@ def make_trainer(
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam on clipped gradients. It works on one array of all parameters, because on a GPU each
-    array costs kernels."""
+    """Adam on clipped gradients."""
     clip = optax.clip_by_global_norm(config.max_grad_norm)
-    return optax.flatten(optax.chain(clip, optax.scale_by_adam(eps=1e-5)))
+    return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
 
 
 def init(ppo: PPO, key: jax.Array) -> TrainingState:
@@ -171,7 +171,7 @@ def init(ppo: PPO, key: jax.Array) -> TrainingState:
     clock = jax.random.randint(clock_key, (config.num_envs,), 0, ppo.episode_steps)
     return TrainingState(
         params=params,
-        optimizer=ppo.optimizer.init(params),
+        optimizer=ppo.optimizer.init(ravel_pytree(params)[0]),
         statistics=statistics.init_statistics(env.observation_size + len(ppo.critic_metrics)),
         learning_rate=jnp.float32(config.learning_rate),
         env=env_state._replace(clock=clock),
@@ -182,7 +182,13 @@ def init(ppo: PPO, key: jax.Array) -> TrainingState:
 
 def run(ppo: PPO, state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
     """Iterations; see `TrainingFunctions`."""
-    return jax.lax.scan(lambda state, _: iterate(ppo, state), state, length=num_iterations)
+
+    def step(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
+        state, metrics = iterate(ppo, state._replace(env=unpack(state.env)))
+        return state._replace(env=pack(state.env)), metrics
+
+    state, metrics = jax.lax.scan(step, state._replace(env=pack(state.env)), length=num_iterations)
+    return state._replace(env=unpack(state.env)), metrics
 
 
 def iterate(ppo: PPO, state: TrainingState) -> tuple[TrainingState, Metrics]:
@@ -303,6 +309,15 @@ def advantages(
     return advantage, advantage + values[:-1]
 
 
+class Learner(NamedTuple):
+    """What a minibatch step changes."""
+
+    params: jax.Array
+    """All parameters in one array: on a GPU, each array costs kernels in every step."""
+    optimizer: optax.OptState
+    learning_rate: jax.Array
+
+
 def update(
     ppo: PPO, state: TrainingState, samples: Samples, key: jax.Array
 ) -> tuple[TrainingState, Metrics]:
@@ -311,16 +326,18 @@ def update(
     samples = jax.tree.map(lambda x: group(x, groups), samples)
     size = samples.log_prob.shape[1]
     limit = max_learning_rate(config, state.iteration)
+    flat, unravel = ravel_pytree(state.params)
 
-    def step(state, minibatch):
+    def step(learner, minibatch):
         order, advantage = minibatch
         batch = jax.tree.map(lambda x: chosen(x, order), samples)._replace(advantage=advantage)
         # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
         batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
-        state, metrics = minibatch_step(ppo, state, batch, limit)
-        return state, pack(metrics)
+        batch_loss = lambda flat: loss(ppo, unravel(flat), batch)  # noqa: E731
+        learner, metrics = minibatch_step(ppo, batch_loss, learner, limit)
+        return learner, pack(metrics)
 
-    def epoch(state, key):
+    def epoch(learner, key):
         orders = jax.vmap(lambda key: random_order(key, size))(jax.random.split(key, groups))
         orders = jnp.moveaxis(orders.reshape((groups, config.num_minibatches, -1)), 1, 0)
         # All minibatches at once: on several devices each reduction is a message, and every
@@ -328,26 +345,32 @@ def update(
         advantage = jax.vmap(lambda order: chosen(samples.advantage, order))(orders)
         mean = jnp.mean(advantage, axis=(1, 2), keepdims=True)
         deviation = jnp.std(advantage, axis=(1, 2), keepdims=True)
-        return jax.lax.scan(step, state, (orders, (advantage - mean) / (deviation + 1e-8)))
+        return jax.lax.scan(step, learner, (orders, (advantage - mean) / (deviation + 1e-8)))
 
-    state, metrics = jax.lax.scan(epoch, state, jax.random.split(key, config.num_epochs))
-    return state, unpack(metrics)
+    learner = Learner(flat, state.optimizer, state.learning_rate)
+    learner, metrics = jax.lax.scan(epoch, learner, jax.random.split(key, config.num_epochs))
+    return state._replace(
+        params=unravel(learner.params),
+        optimizer=learner.optimizer,
+        learning_rate=learner.learning_rate,
+    ), unpack(metrics)
 
 
 def minibatch_step(
-    ppo: PPO, state: TrainingState, samples: Samples, limit: jax.Array
-) -> tuple[TrainingState, Metrics]:
+    ppo: PPO, batch_loss: Callable, learner: Learner, limit: jax.Array
+) -> tuple[Learner, Metrics]:
     """One step of the optimizer.
 
     Args:
+      batch_loss: parameters in one array -> the loss of the minibatch [], and its parts.
       limit: upper limit of the learning rate [].
     """
-    gradient, metrics = jax.grad(loss, argnums=1, has_aux=True)(ppo, state.params, samples)
-    direction, optimizer = ppo.optimizer.update(gradient, state.optimizer)
-    rate = state.learning_rate
+    gradient, metrics = jax.grad(batch_loss, has_aux=True)(learner.params)
+    direction, optimizer = ppo.optimizer.update(gradient, learner.optimizer)
+    rate = learner.learning_rate
     metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
-    return state._replace(
-        params=jax.tree.map(lambda x, d: x - rate * d, state.params, direction),
+    return Learner(
+        params=learner.params - rate * direction,
         optimizer=optimizer,
         learning_rate=adapt_learning_rate(ppo.config, rate, metrics["policy/kl"], limit),
     ), metrics

@@ -99,6 +99,8 @@ def read_record(checkpoint: Checkpoint) -> Record:
 def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
+    # JAX's own error, not a damaged file's.
+    jax.devices()
     # Read with tensorstore, as the readers of orbax print tracebacks from their threads for damaged
     # files.
     try:

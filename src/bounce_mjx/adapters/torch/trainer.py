@@ -40,11 +40,6 @@ class TorchTrainer:
                 f"num_devices is {config.num_devices}, but PyTorch trains on one device here; "
                 "leave it out, or train with bounce-mjx train"
             )
-        if config.ppo.network != "mlp":
-            raise UserError(
-                f"ppo.network is {config.ppo.network}, but PyTorch trains an mlp here; choose mlp, "
-                "or train with bounce-mjx train"
-            )
         self.library = library
         self.mesh: Mesh = make_mesh(1, config.ppo)
         first = make_vector_env(config.ppo, env, config.seed)
