@@ -32,7 +32,7 @@ from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task import rewards
-from bounce_mjx.task.randomization import TERMS
+from bounce_mjx.world.randomization import TERMS
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.training import hosts
 

@@ -22,7 +22,8 @@ from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import offscreen
 
 NUM_ENVS = 3
@@ -130,7 +131,7 @@ def test_single_environment_truncates_and_reports(single):
     *_, (_, reward, terminated, truncated, info) = episode(single, 0, LIMIT)
     assert truncated and not terminated
     terms = [value for name, value in info.items() if name.startswith("reward/")]
-    assert len(terms) == len(TERM_NAMES)
+    assert len(terms) == len(term_names(BounceReward))
     assert sum(terms) == pytest.approx(float(reward), rel=1e-4)
 
 

@@ -13,9 +13,10 @@ from bounce_mjx.learning import policy, ppo
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import normalize
-from bounce_mjx.task import vector
-from bounce_mjx.task.observation import OBSERVATION
-from bounce_mjx.task.state import State
+from bounce_mjx.env import vector
+from bounce_mjx.env.state import State
+
+OBSERVATION = EnvConfig().layout
 
 
 def all_finite(tree) -> bool:

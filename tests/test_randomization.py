@@ -25,10 +25,10 @@ from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_config
-from bounce_mjx.task import noise
-from bounce_mjx.task.actuation import delayed, start_actuation
+from bounce_mjx.world import noise
+from bounce_mjx.world.actuation import delayed, start_actuation
 from bounce_mjx.task.observation import BOUNCE_QUANTITIES
-from bounce_mjx.task.randomization import (
+from bounce_mjx.world.randomization import (
     TERMS,
     RandomizationConfig,
     draw_world,
@@ -378,7 +378,7 @@ def free_run() -> Run:
                 physics = env.engine.step(pipeline.parameters, pipeline.physics, control, 10)
                 after = env.finish_step(before, action, physics)
                 pipeline = after.pipeline_state
-                seen = (physics, control, pipeline.task.target_height, pipeline.memory.target_age)
+                seen = (physics, control, pipeline.command["target_height"], pipeline.memory.command_age)
                 return after, seen
 
             def steps(state, action):
@@ -475,7 +475,7 @@ def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
 
 def test_targets_change_at_their_interval(free_run: Run) -> None:
     world = free_run.starts.pipeline_state.world
-    start = free_run.starts.pipeline_state.task.target_height
+    start = free_run.starts.pipeline_state.command["target_height"]
     np.testing.assert_array_equal(start, world["target_height"])
     heights = np.concatenate([start[None], free_run.target_height])
     assert 0.3 <= heights.min() < 0.35 and 0.75 < heights.max() <= 0.8

@@ -11,7 +11,7 @@ from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, rows
 from bounce_mjx.gpu.rows import Rows
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
-from bounce_mjx.task import vector
+from bounce_mjx.env import vector
 
 # Not a multiple of the block size.
 BATCH = 70

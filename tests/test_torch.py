@@ -38,7 +38,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
-from bounce_mjx.task import vector
+from bounce_mjx.env import vector
 
 NUM_ENVS = 4
 # Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.
