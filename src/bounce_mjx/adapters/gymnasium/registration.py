@@ -7,15 +7,17 @@ import sys
 import types
 from collections.abc import Sequence
 
-ENV_IDS = ("bounce_mjx/BounceBall-v0", "bounce_mjx/Task-v0")
-"""Names of the environments: the specification's, and any other by the argument `task`."""
+ENV_ID = "bounce_mjx/BounceBall-v0"
+"""Name of the specification's environment."""
+TASK_ID = "bounce_mjx/Task-v0"
+"""Name of any other one, with the argument `task`."""
 MAX_EPISODE_STEPS = 2000
 """The tasks' episode of 20 s. A constant, because reading a config would import JAX."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
 def register_when_imported() -> None:
-    """Makes `gymnasium.make` and `gymnasium.make_vec` work for `ENV_IDS`.
+    """Makes `gymnasium.make` and `gymnasium.make_vec` work for `ENV_ID` and `TASK_ID`.
 
     Gymnasium is optional and takes half a second to import, so it is not imported here. If it is
     not loaded yet, the registration follows its import.
@@ -30,7 +32,7 @@ def register() -> None:
     """Adds the environment to Gymnasium's registry; its classes are imported on first use."""
     import gymnasium
 
-    for name in ENV_IDS:
+    for name in (ENV_ID, TASK_ID):
         gymnasium.register(
             name,
             entry_point=f"{_MODULE}:TaskEnv",
