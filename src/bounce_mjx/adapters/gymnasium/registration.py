@@ -1,11 +1,8 @@
 """Registers the environment with Gymnasium, before or after Gymnasium is imported."""
 
-import importlib.abc
-import importlib.machinery
-import importlib.util
 import sys
-import types
-from collections.abc import Sequence
+
+from bounce_mjx.lazy import around_import
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
@@ -25,7 +22,7 @@ def register_when_imported() -> None:
     if "gymnasium" in sys.modules:
         register()
     else:
-        sys.meta_path.insert(0, _RegisterAfterImport())
+        around_import("gymnasium", after=lambda module: register())
 
 
 def register() -> None:
@@ -39,28 +36,3 @@ def register() -> None:
             vector_entry_point=f"{_MODULE}:TaskVectorEnv",
             max_episode_steps=MAX_EPISODE_STEPS,
         )
-
-
-class _RegisterAfterImport(importlib.abc.MetaPathFinder):
-    """Import hook that finds nothing itself, but runs `register` after Gymnasium's import."""
-
-    def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: types.ModuleType | None = None,
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Gymnasium's own spec, with a loader that registers the environment at its end."""
-        if fullname != "gymnasium":
-            return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(fullname)
-        if spec is not None and spec.loader is not None:
-            load = spec.loader.exec_module
-
-            def load_and_register(module: types.ModuleType) -> None:
-                load(module)
-                register()
-
-            spec.loader.exec_module = load_and_register
-        return spec
