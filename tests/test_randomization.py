@@ -731,18 +731,15 @@ def test_the_first_observation_is_measured_like_the_others(watch) -> None:
     sizes = {"ball_position": 0.02, "joint_angle": 0.01, "joint_velocity": 0.2}
     noisy = {f"{name}_noise": (size, size) for name, size in sizes.items()}
     seen, clean = watch(**noisy), watch()
-    for part, size in zip(("ball_position", "joint_angles", "joint_velocities"), sizes.values()):
-        error = (seen.first[part] - clean.first[part])[:, 0].ravel()
+    names = ("ball_position", "joint_angles", "joint_velocities")
+    for name, size in zip(names, sizes.values(), strict=True):
+        first = seen.first[name]
+        error = (first - clean.first[name])[:, 0].ravel()
         assert stats.kstest(error / size, "norm").pvalue > 1e-3
-        np.testing.assert_array_equal(
-            seen.first[part], seen.first[part][:, :1].repeat(PARTS[part], 1)
-        )
+        np.testing.assert_array_equal(first, first[:, :1].repeat(PARTS[name], axis=1))
     bias = watch(encoder_bias=(-0.05, 0.05))
-    np.testing.assert_allclose(
-        bias.first["joint_angles"][:, 0] - trajectory()[0][0, :6],
-        bias.world["encoder_bias"],
-        atol=1e-9,
-    )
+    error = bias.first["joint_angles"][:, 0] - trajectory()[0][0, :6]
+    np.testing.assert_allclose(error, bias.world["encoder_bias"], atol=1e-9)
 
 
 def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
