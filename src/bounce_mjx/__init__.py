@@ -6,8 +6,8 @@ from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
-    from bounce_mjx.world.config import WorldConfig
-    from bounce_mjx.env.env import Env
+    from bounce_mjx.tasks.bounce import BounceBall
+    from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 
     __version__: str
 
@@ -20,13 +20,13 @@ def __getattr__(name: str) -> Any:
     """Imports the public names on first use (PEP 562): JAX takes two seconds to import, and a
     deployed policy does not need it."""
     if name == "BounceBall":
-        from bounce_mjx.env.env import Env
+        from bounce_mjx.tasks.bounce import BounceBall
 
         return BounceBall
     if name == "EnvConfig":
-        from bounce_mjx.world.config import WorldConfig
+        from bounce_mjx.tasks.bounce import BounceConfig
 
-        return EnvConfig
+        return BounceConfig
     if name == "__version__":
         from importlib.metadata import version
 

@@ -17,7 +17,8 @@ from bounce_mjx.errors import UserError, exit_on_user_error, on_one_line
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import train_config
+from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ class AdoptCommand(StrictModel):
     """Site or body that holds the paddle; its z points away from the arm."""
     joints: tuple[str, ...] | None = None
     """Acting joints; all hinges and slides from the world to the site by default."""
+    task: str = DEFAULT
+    """Task whose settings are written; other tasks can use the file too."""
     out: Path | None = None
     """File for the config; by default, my_arm.yaml for my_arm.xml."""
     paddle: PaddleConfig = PaddleConfig()
@@ -55,11 +58,12 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Finds the start pose and the servos of an arm, and writes its config.",
         )
         with no_garbage_collection():
-            from bounce_mjx.robot.adopt import adopt
             from bounce_mjx.env.env import Env
+            from bounce_mjx.robot.adopt import adopt
             from bounce_mjx.training.setup import set_up_jax
 
         set_up_jax()
+        task = find_task(command.task)
         console = Console(soft_wrap=True, highlight=False)
         default = WorldConfig()
         paddle = command.paddle
@@ -69,8 +73,10 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         robot = RobotConfig(site=command.site, joints=command.joints, paddle=paddle)
         adoption = adopt(command.mjcf, robot, default.control_dt, fixed)
-        values = {"env": env_values(command.mjcf, adoption)}
-        config = validate(TrainConfig, values, str(command.mjcf))
+        values = {"env": env_values(command.mjcf, adoption, task.Config)}
+        if command.task != DEFAULT:
+            values = {"task": command.task, **values}
+        config = validate(train_config(task), values, str(command.mjcf))
         env = Env(config.env)
         for line in described(adoption):
             console.print(line, markup=False)
@@ -85,33 +91,20 @@ def main(args: Sequence[str] | None = None) -> None:
             view.main(["--robot", str(out), "--actions", "zero"])
 
 
-def env_values(mjcf: Path, adoption: "Adoption") -> dict[str, Any]:
-    """The settings of `WorldConfig` that belong to an adopted arm.
+def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:
+    """The settings of a task that belong to an adopted arm.
 
-    The task keeps its heights relative to the paddle's home; those of the default config are for a
-    home height of 0.05 m.
+    Args:
+      config_class: the settings' class.
     """
-    default, pose = WorldConfig(), adoption.pose
+    pose = adoption.pose
     x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle)
-    lift = z - default.reward.paddle_home_height
-    reward = default.reward
-    farthest = default.max_horizontal_distance - default.reward.target_x
-    path = WorldConfig(mjcf=mjcf).mjcf
     return {
-        "mjcf": str(path),
+        "mjcf": str(WorldConfig(mjcf=mjcf).mjcf),
         "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
         "action_scale": adoption.action_scale,
         "default_joint_angles": [round(angle, 5) for angle in pose.angles],
-        "ball_init_pos": [x, y, round(default.ball_init_pos[2] + lift, 4)],
-        "target_height_range": [round(h + lift, 4) for h in default.target_height_range],
-        "min_ball_height": round(default.min_ball_height + lift, 4),
-        "max_horizontal_distance": round(max(abs(x), abs(y)) + farthest, 4),
-        "reward": {
-            "target_x": x,
-            "target_y": y,
-            "paddle_home_height": z,
-            "height_progress": {"base_height": round(reward.height_progress.base_height + lift, 4)},
-        },
+        **config_class.settings_at((x, y, z)),
     }
 
 

@@ -1,4 +1,4 @@
-"""Measures the five results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
+"""Measures the results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
 
 import os
 import sys
@@ -18,8 +18,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from bounce_mjx.config.command_line import parse
-from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
+from bounce_mjx.commands.run_options import RunOptions, parse_with_commands
+from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.garbage import no_garbage_collection
@@ -41,16 +41,13 @@ class EvalCommand(StrictModel):
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
-    target_height: Positive | None = None
-    """One target height for all episodes, m. The default is the range of the run's config."""
     nominal: bool = False
     """Whether the worlds are the model's own; else each episode draws one, as in the training."""
     physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 
 @interruptible
@@ -58,26 +55,26 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        command = parse(
+        command, flags = parse_with_commands(
             EvalCommand,
             args,
             prog="bounce-mjx eval",
-            description="Measures the five results of a trained policy.",
+            description="Measures the results of a trained policy.",
         )
         if command.json_file is not None:
             _check_writable(command.json_file)
         with no_garbage_collection():
             from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
             from bounce_mjx.reports.tables import details_line, results_table
-            from bounce_mjx.runs.config import load_run_config
             from bounce_mjx.runs.files import to_json, write_output
             from bounce_mjx.runs.folders import choose_checkpoint
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
 
         console = Console()
-        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
-        config = load_run_config(checkpoint.run)
+        checkpoint = choose_checkpoint(command.checkpoint, command.of_run.folder, console)
+        config = command.of_run.config(checkpoint.run)
+        commands = flags.values(config.env)
         engine = {"physics": command.physics} if command.physics in ("fused", "mjx") else {}
         join_loops(config.env.model_copy(update=engine))
         set_up_jax()
@@ -93,7 +90,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 config.ppo,
                 episodes=command.episodes,
                 seed=command.seed,
-                target_height=command.target_height,
+                commands=commands,
                 nominal=command.nominal,
                 physics=command.physics,
                 started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
@@ -101,12 +98,11 @@ def main(args: Sequence[str] | None = None) -> None:
             )
         for warning in warnings:
             console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
-        console.print(results_table(report, "the five results"))
+        console.print(results_table(report, "the results"))
         console.print(details_line(report), highlight=False)
         if command.json_file is not None:
             plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
-            plain |= {"seed": command.seed, "target_height": command.target_height}
-            plain |= {"nominal": command.nominal}
+            plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
             try:
                 write_output(command.json_file, to_json(plain))
             except OSError as error:

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from bounce_mjx.commands.run_options import RunOptions
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -27,8 +28,7 @@ class ExportCommand(StrictModel):
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
     jax: Path | None = None
     """File for the same function by jax.export, for the CPU and CUDA."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 
 @interruptible
@@ -57,10 +57,11 @@ def main(args: Sequence[str] | None = None) -> None:
                 raise UserError(f"{flag} {path} is a folder; give a file")
         set_up_jax()
         console = Console()
-        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
+        checkpoint = choose_checkpoint(command.checkpoint, command.of_run.folder, console)
         console.out(
             f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False
         )
+        command.of_run.config(checkpoint.run)
         for flag, (path, export) in files.items():
             if path is None:
                 continue

@@ -14,9 +14,9 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 
 COMMANDS = {
-    "train": "train a policy that keeps the ball bouncing",
-    "eval": "measure the five results of a trained policy",
-    "robustness": "measure the five results in perturbed worlds",
+    "train": "train a policy",
+    "eval": "measure the results of a trained policy",
+    "robustness": "measure the results in perturbed worlds",
     "play": "show a trained policy",
     "view": "show the environment under random, zero or scripted actions",
     "adopt": "write the config of another robot arm",
@@ -27,7 +27,7 @@ COMMANDS = {
 }
 _HELP = """usage: bounce-mjx COMMAND [ARGUMENTS]
 
-A robot arm learns to bounce a ball.
+A robot arm learns tasks with a ball, such as bouncing it on a paddle.
 
 {commands}
 

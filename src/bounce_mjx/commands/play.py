@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from bounce_mjx.config.command_line import parse
-from bounce_mjx.config.settings import Positive, StrictModel
+from bounce_mjx.commands.run_options import RunOptions, parse_with_commands
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
+from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
-    from bounce_mjx.runs.folders import Checkpoint
     from bounce_mjx.env.env import Env
+    from bounce_mjx.runs.folders import Checkpoint
     from bounce_mjx.viewers.controllers import Controller
     from bounce_mjx.viewers.show import Shown
 
@@ -34,14 +33,11 @@ class PlayCommand(StrictModel):
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained or robust. Several are shown side by side. The
     default is the newest run, or pretrained if there is no run."""
-    target_height: Positive | None = None
-    """Target height, m. By default each reset draws it from the range of the run's config."""
     physics: Literal["config", "fused", "mjx"] = "config"
     """Physics engine; config is the engine of the training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
@@ -49,7 +45,7 @@ class PlayCommand(StrictModel):
 def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
-        command = parse(
+        command, flags = parse_with_commands(
             PlayCommand,
             sys.argv[1:] if args is None else args,
             prog="bounce-mjx play",
@@ -66,27 +62,28 @@ def main(args: Sequence[str] | None = None) -> None:
 
         console = Console()
         chosen = [
-            choose_checkpoint(path, command.log_dir, console)
+            choose_checkpoint(path, command.of_run.folder, console)
             for path in command.checkpoints or (None,)
         ]
         configs = [_config(checkpoint, command) for checkpoint in chosen]
+        (commands, *_) = [flags.values(config.env) for config in configs]
         join_loops(*(config.env for config in configs))
         set_up_jax()
         show(
             [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
             command.viewing,
-            target_height=command.target_height,
+            commands=commands,
             console=console,
         )
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the engine and the world that are to be shown."""
-    config = load_run_config(checkpoint.run)
+    config = command.of_run.config(checkpoint.run)
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization
-    env = validate(WorldConfig, dict(config.env) | changes, "play")
+    env = validate(type(config.env), dict(config.env) | changes, "play")
     return config.model_copy(update={"env": env})
 
 

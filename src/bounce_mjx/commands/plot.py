@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 from pydantic import Field
 
+from bounce_mjx.commands.run_options import RunOptions
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -26,8 +27,7 @@ class PlotCommand(StrictModel):
     """Folder for the pictures: curves, rewards and, for one run, evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
     """File formats of each picture."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 
 @interruptible
@@ -41,6 +41,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Draws the learning curves of runs, and the evaluation of a checkpoint.",
         )
         with no_garbage_collection():
+            from bounce_mjx.env.env import Env
             from bounce_mjx.reports.curves import group_runs
             from bounce_mjx.reports.figures import (
                 curves_figure,
@@ -49,18 +50,17 @@ def main(args: Sequence[str] | None = None) -> None:
                 rewards_figure,
             )
             from bounce_mjx.reports.page import record_checkpoint
-            from bounce_mjx.runs.config import load_run_config
             from bounce_mjx.runs.files import write_output
             from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
-            from bounce_mjx.env.env import Env
 
-        runs = [named_run(run, command.log_dir) for run in command.runs or (None,)]
+        runs = [named_run(run, command.of_run.folder) for run in command.runs or (None,)]
         seeds = [seed for run in runs for seed in runs_of_seeds(run)]
         checkpoints = [find_checkpoint(seed) for seed in seeds]
+        configs = [command.of_run.config(checkpoint.run) for checkpoint in checkpoints]
         groups = group_runs([checkpoint.run for checkpoint in checkpoints])
         figures = {"curves": curves_figure(groups), "rewards": rewards_figure(groups)}
         if len(checkpoints) == 1:
-            env = Env(load_run_config(checkpoints[0].run).env)
+            env = Env(configs[0].env)
             figures["evaluation"] = evaluation_figure(env, record_checkpoint(checkpoints[0]))
         for name, figure in figures.items():
             for suffix in command.formats:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from bounce_mjx.commands.run_options import RunOptions
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
@@ -19,8 +20,7 @@ class ReportCommand(StrictModel):
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """A run's folder; latest, the default, is the newest run."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 
 @interruptible
@@ -37,7 +37,8 @@ def main(args: Sequence[str] | None = None) -> None:
             from bounce_mjx.reports.page import record_checkpoint, write_report
             from bounce_mjx.runs.folders import find_checkpoint, named_run
 
-        checkpoint = find_checkpoint(named_run(command.run, command.log_dir))
+        checkpoint = find_checkpoint(named_run(command.run, command.of_run.folder))
+        command.of_run.config(checkpoint.run)
         recording = record_checkpoint(checkpoint)
         path, _ = write_report(checkpoint.run, recording)
         print(path)

@@ -1,4 +1,4 @@
-"""Measures the five results in perturbed worlds: `bounce-mjx robustness [CHECKPOINT]`."""
+"""Measures the results of a policy in perturbed worlds: `bounce-mjx robustness [CHECKPOINT]`."""
 
 import sys
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from bounce_mjx.commands.run_options import RunOptions
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -43,8 +44,7 @@ class RobustnessCommand(StrictModel):
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
     for a policy that comes with the package."""
-    log_dir: Path = Path("runs/bounce_ball")
-    """Folder in which to look for the newest run."""
+    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 
 @interruptible
@@ -57,20 +57,19 @@ def main(args: Sequence[str] | None = None) -> None:
             RobustnessCommand,
             args,
             prog="bounce-mjx robustness",
-            description="Measures the five results of a trained policy in perturbed worlds.",
+            description="Measures the results of a trained policy in perturbed worlds.",
         )
         with no_garbage_collection():
             from bounce_mjx.evaluation.robustness import RobustnessReport
             from bounce_mjx.evaluation.suite import load_suite
             from bounce_mjx.reports.robustness import robustness_table
-            from bounce_mjx.runs.config import load_run_config
             from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
             from bounce_mjx.runs.reading import load_policy
             from bounce_mjx.training.setup import set_up_jax
 
         console = Console()
-        checkpoint = choose_checkpoint(command.checkpoint, command.log_dir, console)
-        config = load_run_config(checkpoint.run)
+        checkpoint = choose_checkpoint(command.checkpoint, command.of_run.folder, console)
+        config = command.of_run.config(checkpoint.run)
         suite = command.suite or resource_path("configs/robustness.yaml")
         conditions = load_suite(suite, config.env)
         engine = {"physics": command.physics} if command.physics in ("fused", "mjx") else {}

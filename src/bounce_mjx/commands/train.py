@@ -40,7 +40,7 @@ class TrainCommand(TrainingCommand):
     process_id: Annotated[int, Field(ge=0)] | None = None
     """Number of this process, from 0; with coordinator-address."""
     watch: bool = False
-    """Serve a page beside the training, with the newest policy, the curves and the five results."""
+    """Serve a page beside the training, with the newest policy, the curves and the results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
     watch_allow_host: tuple[HostName, ...] = ()
@@ -93,7 +93,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
-    description = "Trains a policy that keeps the ball bouncing."
+    description = "Trains a policy; by default, one that keeps the ball bouncing."
     return read(TrainCommand, args, prog=PROG, description=description, preset=preset)
 
 

@@ -14,10 +14,17 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
-from bounce_mjx.runs.config import TrainConfig, default_preset, has_accelerator, has_plugin
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    default_preset,
+    has_accelerator,
+    has_plugin,
+    load_run_config,
+)
 from bounce_mjx.training.command import (
     TrainingCommand,
     asks_for_help,
+    early_flag,
     path_flag,
     read_command,
     run_command,
@@ -56,10 +63,12 @@ def main(args: Sequence[str] | None = None) -> None:
             from bounce_mjx.runs.folders import find_run, latest_checkpoint
             from bounce_mjx.training.job import library_of
 
-            library = library_of(latest_checkpoint(find_run(resume)))
+            run = find_run(resume)
+            load_run_config(run, early_flag(args, "--task"))
+            library = library_of(latest_checkpoint(run))
             if library in get_args(Library):
                 defaults = {"library": library}
-        description = "Trains a policy that keeps the ball bouncing, with PyTorch."
+        description = "Trains a policy with PyTorch; by default, one that keeps the ball bouncing."
         read = functools.partial(
             read_command, TorchTrainCommand, args, prog=PROG, description=description, **defaults
         )

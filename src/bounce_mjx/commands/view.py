@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import pydantic
 import tyro
 from rich.console import Console
 
@@ -13,23 +14,26 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.runs.config import ROBOTS, load_config, named_file
-from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.training.command import path_flag
+from bounce_mjx.runs.config import read_preset, train_config
+from bounce_mjx.tasks.registry import DEFAULT
+from bounce_mjx.training.command import early_flag, path_flag
 from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import ViewerOptions
+from bounce_mjx.world.config import WorldConfig
 
 
 class ViewCommand(StrictModel):
     """The command line."""
 
     actions: Literal["random", "zero", "scripted"] = "random"
-    """random: uniform; zero: the servos hold their angles; scripted: a hand-written juggler."""
+    """random: uniform; zero: the servos hold their angles; scripted: the task's own controller."""
+    task: str = DEFAULT
+    """Name of the task, or FILE.py:CLASS for one of your own."""
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
-    env: Annotated[WorldConfig, tyro.conf.arg(name="")] = WorldConfig()
+    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
 
 
 @interruptible
@@ -37,14 +41,15 @@ def main(args: Sequence[str] | None = None) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     with exit_on_user_error():
         args = sys.argv[1:] if args is None else args
-        robot = path_flag(args, "--robot")
-        robot = robot and named_file(robot, ROBOTS)
+        robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
+        env = read_preset(Path("default"), robot, task).env
+        command_class = train_config(env.task, ViewCommand)
         command = parse(
-            ViewCommand,
+            command_class,
             args,
             prog="bounce-mjx view",
             description="Shows the environment under random, zero or scripted actions.",
-            default=ViewCommand() if robot is None else ViewCommand(env=load_config(robot).env),
+            default=command_class(env=env, robot=robot),
         )
         with no_garbage_collection():
             join_loops(command.env)
@@ -65,6 +70,6 @@ def main(args: Sequence[str] | None = None) -> None:
         show(
             [Shown(command.env, controllers[command.actions], f"{command.actions} actions")],
             command.viewing,
-            target_height=None,
+            commands={},
             console=Console(),
         )

@@ -38,7 +38,7 @@ def parse(
       UserError: a flag is unknown or has a bad value.
     """
 
-    words = _usual_spelling(args, _flags(command_class))
+    words = _usual_spelling(args, flags_of(command_class))
 
     def raise_user_error(event: tyro_errors.ParseErrorEvent) -> None:
         raise UserError(f"{_mistake(event, command_class, args)} (see {prog} --help)")
@@ -105,7 +105,7 @@ def _mistake(
 ) -> str:
     if isinstance(event, tyro_errors.UnrecognizedArgs):
         given = event.tokens[0].split("=")[0].replace("_", "-")
-        near = difflib.get_close_matches(given, _flags(command_class), n=1)
+        near = difflib.get_close_matches(given, flags_of(command_class), n=1)
         return f"unknown argument {event.tokens[0]}" + (
             f"; did you mean {near[0]}?" if near else ""
         )
@@ -144,7 +144,7 @@ def _given(args: Sequence[str], flag: str) -> str:
     return ""
 
 
-def _flags(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | None]:
+def flags_of(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | None]:
     """The settings of a command, keyed by the flags that tyro gives them; None for the negation of
     a switch."""
     flags: dict[str, FieldInfo | None] = {}

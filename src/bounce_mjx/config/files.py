@@ -67,7 +67,7 @@ def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:
     keys = set()
     for name in type(one).model_fields:
         a, b = getattr(one, name), getattr(other, name)
-        if isinstance(a, StrictModel):
+        if isinstance(a, StrictModel) and type(a) is type(b):
             keys |= {f"{name}.{inner}" for inner in differing_keys(a, b)}
         elif a != b:
             keys.add(name)

@@ -159,8 +159,8 @@ class Env:
           UserError: always.
         """
         raise UserError(
-            "BounceBall has no sys, which brax's randomization_fn changes; use "
-            "brax.envs.get_environment('bounce_ball'), or give BounceBall a function randomize"
+            "this environment has no sys, which brax's randomization_fn changes; use "
+            "brax.envs.get_environment('bounce_ball'), or give it a function randomize"
         )
 
     @property

@@ -5,6 +5,8 @@ from typing import Any, Protocol
 
 import jax
 
+from bounce_mjx.task import Task
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +32,11 @@ class State:
 
 
 class Env(Protocol):
-    """One environment, unbatched and pure: the part of brax's `Env` that training needs."""
+    """One environment, unbatched and pure: the part of brax's `Env` that training needs, and the
+    task, which names what to log."""
+
+    task: Task | type[Task]
+    """The task, of which a training reads `curves` and `critic_metrics`."""
 
     @property
     def observation_size(self) -> int:

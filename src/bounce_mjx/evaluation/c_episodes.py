@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
@@ -21,7 +22,6 @@ from bounce_mjx.physics import (
     servo_targets,
 )
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.env.env import Env
 from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bounce_mjx.env.env import Env
+from bounce_mjx.env.state import State
 from bounce_mjx.evaluation.recording import Recording, empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
-from bounce_mjx.env.env import Env
 from bounce_mjx.world.randomization import Ranges
-from bounce_mjx.env.state import State
 
 
 class _Episodes(NamedTuple):
@@ -102,9 +102,7 @@ def _run_until(
     return jax.lax.while_loop(unfinished, advance, progress)
 
 
-def reset_episodes(
-    env: Env, key: jax.Array, episodes: int, ranges: Ranges | None = None
-) -> State:
+def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | None = None) -> State:
     """The initial states of N episodes, batch last; consumes the key.
 
     Args:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
@@ -14,7 +15,6 @@ from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.world.randomization import RandomizationConfig
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pydantic
 from pydantic import Field
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -20,7 +21,6 @@ from bounce_mjx.evaluation.suite import Condition, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.world.randomization import RandomizationConfig, Ranges
 
 # Terms without a neutral value, or with a high cost in the physics: only the conditions that need

@@ -64,9 +64,9 @@ class PPOConfig(StrictModel):
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers during training; bfloat16 is faster on a GPU. Parameters, outputs,
     losses, the optimizer and all evaluations are float32."""
-    critic_metrics: tuple[str, ...] = ("n_bounces",)
+    critic_metrics: tuple[str, ...] | None = None
     """Metrics of the environment that are inputs of the value network in addition to the
-    observation. The reward depends on the bounce count, which the observation does not contain."""
+    observation; null for those that the task names, because its reward depends on them."""
 
     @pydantic.model_validator(mode="before")
     @classmethod

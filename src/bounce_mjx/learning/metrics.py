@@ -6,13 +6,17 @@ from collections.abc import Iterable, Sequence
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.env import vector
+from bounce_mjx.errors import UserError
+from bounce_mjx.task import Curve
 
 Metrics = dict[str, jax.Array]
 
 PRIVILEGED = ("world/", "true/")
 """Prefixes of metrics that only a critic may use."""
+
+SUM = "sum/"
+"""Prefix of the metrics of a step that are sums; a mean of them over steps has no meaning."""
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
@@ -34,43 +38,56 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
     return tuple(names)
 
 
-def step_metrics(result: vector.StepResult, groups: int) -> Metrics:
-    """Metrics of one step over each group of environments [G]: means, and sums over the episodes
-    that ended on the step."""
+def step_metrics(result: vector.StepResult, groups: int, curves: Sequence[Curve]) -> Metrics:
+    """Metrics of one step over each group of environments [G]: means, and sums under the names
+    `SUM`... for means over episodes and events."""
     ended = result.terminated | result.truncated
     logged = {n: v for n, v in result.metrics.items() if not n.startswith(PRIVILEGED)}
     means = logged | {"reward": result.reward}
-    totals = {
+    sums = {
         "ended": ended,
         "return": jnp.where(ended, result.episode_return, 0.0),
         "length": jnp.where(ended, result.episode_length, 0),
-        "bounces": jnp.where(ended, result.metrics["n_bounces"], 0.0),
-        "apex_error": result.metrics["apex_error"],
-        "bounced": result.metrics["bounced"],
         "non_finite": result.metrics["non_finite"],
     }
+    for curve in curves:
+        value = result.metrics[curve.metric]
+        if curve.over == "episodes":
+            sums[f"last/{curve.metric}"] = jnp.where(ended, value, 0.0)
+        elif curve.over != "steps":
+            sums |= {curve.metric: value, curve.over: result.metrics[curve.over]}
+    totals = {SUM + name: value for name, value in sums.items()}
     # One array, because on a GPU each small array costs a kernel.
     rows = jnp.stack([x.astype(result.reward.dtype) for x in (means | totals).values()])
-    sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
+    row_sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
     count = result.reward.size // groups
     return {
         name: total if name in totals else total / count
-        for name, total in zip(means | totals, sums, strict=True)
+        for name, total in zip(means | totals, row_sums, strict=True)
     }
 
 
-def rollout_metrics(steps: Metrics) -> Metrics:
-    """Metrics of a rollout from the metrics of its steps and groups [T, G]. Means over episodes are
-    NaN if none ended, means over bounces if there were none."""
-    ended, bounced = jnp.sum(steps["ended"]), jnp.sum(steps["bounced"])
+def rollout_metrics(steps: Metrics, curves: Sequence[Curve]) -> Metrics:
+    """Metrics of a rollout from the metrics of its steps and groups [T, G]: the rewards, the
+    episodes and a task's curves. Means over episodes are NaN if none ended, means over events if
+    there were none."""
+
+    def total(name: str) -> jax.Array:
+        return jnp.sum(steps[SUM + name])
+
+    ended = total("ended")
     rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
-    return rewards | {
-        "episode/return": jnp.sum(steps["return"]) / ended,
-        "episode/length": jnp.sum(steps["length"]) / ended,
-        "episode/bounces": jnp.sum(steps["bounces"]) / ended,
+    metrics = rewards | {
+        "episode/return": total("return") / ended,
+        "episode/length": total("length") / ended,
         "episode/ended": ended,
-        "task/apex_error": jnp.sum(steps["apex_error"]) / bounced,
-        "task/ball_xy_error": jnp.mean(steps["ball_xy_error"]),
-        "task/n_bounces": jnp.mean(steps["n_bounces"]),
-        "task/non_finite": jnp.sum(steps["non_finite"]),
+        "task/non_finite": total("non_finite"),
     }
+    for curve in curves:
+        if curve.over == "steps":
+            metrics[curve.tag] = jnp.mean(steps[curve.metric])
+        elif curve.over == "episodes":
+            metrics[curve.tag] = total(f"last/{curve.metric}") / ended
+        else:
+            metrics[curve.tag] = total(curve.metric) / total(curve.over)
+    return metrics

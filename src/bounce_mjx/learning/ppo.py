@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
+from bounce_mjx.env import vector
+from bounce_mjx.env.state import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
 from bounce_mjx.learning import statistics
@@ -30,8 +32,6 @@ from bounce_mjx.learning.metrics import (
 )
 from bounce_mjx.learning.policy import Networks, Policy, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
-from bounce_mjx.env import vector
-from bounce_mjx.env.state import Env
 
 # Factor by which one update may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
@@ -143,7 +143,10 @@ def make_trainer(
             "control steps; choose a shorter rollout or longer episodes"
         )
     known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
-    critic_metrics = matching_metrics(config.critic_metrics, known_metrics)
+    wanted = config.critic_metrics
+    critic_metrics = matching_metrics(
+        env.task.critic_metrics if wanted is None else wanted, known_metrics
+    )
     sizes = env.observation_size, env.action_size, len(critic_metrics)
     networks = make_networks(config, *sizes, dtype=config.compute_dtype)
     ppo = PPO(
@@ -259,7 +262,7 @@ def collect(
             terminated=result.terminated,
             truncated=result.truncated,
         )
-        metrics = step_metrics(result, num_groups(config))
+        metrics = step_metrics(result, num_groups(config), env.task.curves)
         return (pack(env_state), timeout_inputs), (step, pack(metrics))
 
     no_inputs = jnp.zeros((config.num_envs, state.statistics.mean.size))
@@ -270,7 +273,7 @@ def collect(
     env_state = unpack(packed)
     last_inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)
     ends = jnp.stack([last_inputs, timeout_inputs])
-    return env_state, rollout, ends, rollout_metrics(unpack(metrics))
+    return env_state, rollout, ends, rollout_metrics(unpack(metrics), ppo.env.task.curves)
 
 
 def network_inputs(ppo: PPO, observation: jax.Array, metrics: Metrics) -> jax.Array:

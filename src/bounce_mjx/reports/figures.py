@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
 from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.env.env import Env
 from bounce_mjx.task.rewards import TERM_NAMES
 
 # Tags of the log, their titles in the figure, and the factor to the displayed unit.

@@ -12,6 +12,7 @@ import jax
 from matplotlib.figure import Figure
 
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
@@ -32,7 +33,6 @@ from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.env.env import Env
 
 REPORT_FILE = "report.html"
 

@@ -103,6 +103,25 @@ def load_model(
     return mj_model
 
 
+def paddle_home(
+    mjcf: Path | None, robot: RobotConfig, joint_angles: Sequence[float]
+) -> tuple[float, float, float]:
+    """Centre of the paddle at joint angles [n] (rad), m.
+
+    Args:
+      mjcf, robot: as for `load_model`.
+
+    Raises:
+      UserError: as `load_model`.
+    """
+    mj_model = load_model(mjcf, 0.001, visual=False, robot=robot)
+    addresses, data = find_addresses(mj_model), mujoco.MjData(mj_model)
+    data.qpos[list(addresses.arm_qpos)] = joint_angles
+    mujoco.mj_kinematics(mj_model, data)
+    x, y, z = (round(float(c), 4) for c in data.geom_xpos[addresses.paddle_geom])
+    return x, y, z
+
+
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Refuses actuators whose control is not a target position of their joint.
 

@@ -1,31 +1,55 @@
 """The settings of a training run, and their YAML file."""
 
+import functools
 import importlib.metadata
 import importlib.util
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+from pydantic import Field
 
 from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
 from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.robot import check_robot
+from bounce_mjx.runs.task import task_of_run
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import (
+    DEFAULT,
+    find_task,
+    is_file,
+    known_task,
+    source_file,
+    task_name,
+)
 from bounce_mjx.world.config import WorldConfig
 
 CONFIG_FILE = "config.yaml"
 ROBOTS = "configs/robots"
 """Folder of the package with configs of robots."""
 
+_EXAMPLE = "configs/default.yaml"
+
+ConfigT = TypeVar("ConfigT", bound=StrictModel)
+
 
 class TrainConfig(StrictModel):
-    """A training run: the task, the trainer, the length and the evaluations."""
+    """A training run: the task, the trainer, the length and the evaluations.
 
-    env: WorldConfig = WorldConfig()
-    """The task."""
+    The settings of the environment are those of the task: `train_config` makes the class for one.
+    """
+
+    task: str = DEFAULT
+    """Name of the task, or FILE.py:CLASS for one of your own."""
+    env: pydantic.SerializeAsAny[WorldConfig]
+    """The world and the task."""
     ppo: PPOConfig = PPOConfig()
     """The trainer."""
     seed: NonNegativeInt = 0
@@ -43,50 +67,137 @@ class TrainConfig(StrictModel):
     eval_every: Steps = 2_000_000
     """Environment steps between two evaluations, rounded to whole blocks."""
     eval_episodes: Count = 1024
-    """Episodes of an evaluation of the five results."""
+    """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
     """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
     eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during the training."""
     stop_when_solved: bool = False
-    """End once an evaluation meets all five results with a margin, so that 64 other episodes should
-    meet them too: means over steps and bounces by two standard errors of 64 episodes, shares of
-    episodes with at most half of the failures that are allowed. At the latest it ends after 1.5
-    times the steps of the first evaluation that meets all five."""
-    log_dir: PlainPath = Path("runs/bounce_ball")
+    """End once an evaluation meets all results with a margin, so that 64 other episodes should meet
+    them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
+    with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
+    steps of the first evaluation that meets all."""
+    log_dir: PlainPath
     """Folder in which the run makes its own, named by the time."""
 
+    @pydantic.field_validator("task")
+    @classmethod
+    def _make_absolute(cls, name: str) -> str:
+        """A run's config is read from other folders too."""
+        return f"{source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
 
-def load_run_config(run: Path) -> TrainConfig:
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _complete(cls, values: Any) -> Any:
+        """The task and the settings that belong to it determine each other."""
+        if not isinstance(values, dict) or not cls.model_fields["env"].is_required():
+            return values
+        env = values.get("env")
+        if "task" not in values and isinstance(env, WorldConfig) and env.task is not None:
+            values = values | {"task": task_name(env.task)}
+        task = env.task if isinstance(env, WorldConfig) else find_task(values.get("task", DEFAULT))
+        return {"env": task.Config(), "log_dir": runs_folder(task)} | values
+
+
+@functools.cache
+def train_config(task: type[Task], base: type[ConfigT] = TrainConfig) -> type[ConfigT]:
+    """The class `base` with the settings of a task: the field `env`, and defaults of others.
+
+    Args:
+      task: the task, as from `find_task`.
+      base: `TrainConfig`, or a command line with a field `env`.
+    """
+    kinds = {"task": str, "log_dir": PlainPath}
+    kinds["env"] = Annotated[task.Config, *base.model_fields["env"].metadata]
+    defaults = {"task": task_name(task), "env": task.Config(), "log_dir": runs_folder(task)}
+    return pydantic.create_model(
+        base.__name__,
+        __base__=base,
+        __module__=base.__module__,
+        __doc__=base.__doc__,
+        **{
+            name: (kind, Field(defaults[name], description=base.model_fields[name].description))
+            for name, kind in kinds.items()
+            if name in base.model_fields
+        },
+    )
+
+
+def runs_folder(task: type[Task]) -> Path:
+    """Default folder of a task's runs."""
+    return Path("runs") / (task.folder or task.__name__.lower())
+
+
+def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
     """Reads the resolved config of a run.
 
+    Args:
+      task: the task as the user names it. A run whose task is a file needs the name once in a
+        process, because the file is code.
+
     Raises:
-      UserError: the file is missing or damaged, or the run's copy of its robot was edited.
+      UserError: the file is missing or damaged, the run's copy of its robot was edited, or its task
+        is a file that the user has not named.
     """
-    config = load_config(run / CONFIG_FILE)
+    path = run / CONFIG_FILE
+    values = _with_paths_from(run, read_mapping(path, "config file", _EXAMPLE))
+    name = _task_of(values, path)
+    config = validate(train_config(task_of_run(name, run, task)), values, str(path))
     if config.env.mjcf is not None:
         check_robot(config.env.mjcf, run)
     return config
 
 
-def load_config(path: Path, robot: Path | None = None) -> TrainConfig:
+def load_config(path: Path, robot: Path | None = None, task: str | None = None) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
     MJCF file starts at the folder of the YAML file.
 
     Args:
       robot: config of a robot, whose keys win over those of the file.
+      task: the task as the user names it; by default, the file's.
 
     Raises:
-      UserError: the file is missing, is not a YAML mapping, or has an unknown key or a bad value.
+      UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
+        its task is a file that the user has not named.
     """
-    values = read_mapping(path, "config file", "configs/default.yaml")
-    values = _with_mjcf_from(path.parent, values)
+    values = _with_paths_from(path.parent, read_mapping(path, "config file", _EXAMPLE))
+    name = task or _task_of(values, path)
+    if task is None and is_file(name):
+        raise UserError(
+            f"{path} has its task in the file {name}, which is code; name it yourself to run it: "
+            f"--task {name}"
+        )
+    config_class = train_config(find_task(name))
+    values |= {"task": name}
     if robot is None:
-        return validate(TrainConfig, values, str(path))
-    own = read_mapping(robot, "robot's config file", "configs/robots/ur5e.yaml")
-    own = _with_mjcf_from(robot.parent, own)
-    validate(TrainConfig, own, str(robot))
-    return validate(TrainConfig, _merged(values, own), f"{path} with {robot}")
+        return validate(config_class, values, str(path))
+    own = read_mapping(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
+    own = _robot_for(config_class, _with_paths_from(robot.parent, own), robot)
+    return validate(config_class, _merged(values, own), f"{path} with {robot}")
+
+
+def _robot_for(
+    config_class: type[TrainConfig], values: dict[str, Any], robot: Path
+) -> dict[str, Any]:
+    """The values of a robot's config for a task. Those of another task are replaced by the task's
+    own for an arm with this paddle."""
+    name, task = _task_of(values, robot), config_class().env.task
+    its_task = known_task(name) if is_file(name) else find_task(name)
+    if its_task is None:
+        raise UserError(
+            f"{robot} is of a task in the file {name}, which is code; adopt the arm again without "
+            "--task"
+        )
+    values = {key: value for key, value in values.items() if key != "task"}
+    known = validate(train_config(its_task), values, str(robot)).env
+    if issubclass(task, its_task):
+        return values
+    of_world = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
+    # Imports JAX, which a command line alone does not need.
+    from bounce_mjx.robot.model import paddle_home
+
+    home = paddle_home(known.mjcf, known.robot, known.default_joint_angles)
+    return values | {"env": of_world | task.Config.settings_at(home)}
 
 
 def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
@@ -98,20 +209,23 @@ def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def read_preset(path: Path | None, robot: Path | None = None) -> TrainConfig:
+def read_preset(
+    path: Path | None, robot: Path | None = None, task: str | None = None
+) -> TrainConfig:
     """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
     this machine.
 
     Args:
       robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
         in configs/robots/.
+      task: the task as the user names it; by default, the preset's.
 
     Raises:
       UserError: the file is missing or invalid.
     """
     if path is None:
         path = default_preset(has_accelerator())
-    return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS))
+    return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS), task)
 
 
 def default_preset(accelerator: bool) -> Path:
@@ -140,9 +254,19 @@ def has_plugin() -> bool:
     return bool(plugins) or any(importlib.util.find_spec(name) for name in names)
 
 
-def _with_mjcf_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """A config's values with an absolute path of the MJCF file."""
-    env = values.get("env")
+def _task_of(values: dict[str, Any], path: Path) -> str:
+    """Name of the task in a config's values."""
+    name = values.get("task", DEFAULT)
+    if not isinstance(name, str):
+        raise UserError(f"{path}: task is {shorten(repr(name))}; give the name of a task")
+    return name
+
+
+def _with_paths_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """A config's values with absolute paths of the MJCF file and of the task's file."""
+    name, env = values.get("task"), values.get("env")
+    if isinstance(name, str) and is_file(name) and not name.startswith("~"):
+        values = values | {"task": str((folder / name).absolute())}
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if not isinstance(mjcf, str) or mjcf.startswith("~") or is_packaged(Path(mjcf)):
         return values

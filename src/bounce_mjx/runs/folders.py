@@ -1,8 +1,9 @@
 """Folders of runs and checkpoints, and functions that find them.
 
-    runs/bounce_ball/<time stamp>/
+    runs/<task>/<time stamp>/
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files (`runs.robot`)
+        task/                           a copy of the task's file (`runs.task`)
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/latest/<steps>/     the newest state
@@ -23,6 +24,7 @@ import datetime
 import itertools
 import os
 import re
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -32,10 +34,12 @@ from rich.console import Console
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
+from bounce_mjx.runs.task import copy_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 CheckpointName = Literal["latest", "best"]
 PRETRAINED = "pretrained"
@@ -79,7 +83,7 @@ def create_run(config: TrainConfig) -> Path:
             try:
                 save_config(folder, config)
             except UserError:
-                folder.rmdir()
+                shutil.rmtree(folder)
                 raise
             return folder
     except OSError as error:
@@ -90,7 +94,10 @@ def create_run(config: TrainConfig) -> Path:
 
 
 def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config, and a copy of its robot unless the run has one."""
+    """Writes the run's resolved config, and copies of its robot and of its task's file unless the
+    run has them."""
+    if is_file(config.task):
+        config = config.model_copy(update={"task": copy_task(config.task, run)})
     if (mjcf := config.env.mjcf) is not None:
         if not mjcf.is_relative_to((run / ROBOT).absolute()):
             mjcf = copy_robot(mjcf, run).absolute()
@@ -218,7 +225,7 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     try:
         run = named_run(path, log_dir)
     except UserError:
-        if path is not None or log_dir != TrainConfig().log_dir:
+        if path is not None or log_dir != runs_folder(find_task(DEFAULT)):
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint()

@@ -14,7 +14,7 @@ RESULTS_FILE = "results.json"
 
 PATIENCE = 1.5
 """Length of a training that waits in vain for a margin, in steps of the first evaluation that met
-all five results."""
+all results."""
 
 _Steps = Annotated[int, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(allow_inf_nan=False)]
@@ -33,12 +33,12 @@ class Evaluation(pydantic.BaseModel, extra="allow"):
 class _Evaluations(pydantic.BaseModel):
     best_steps: _Steps = 0
     solved_steps: _Steps | None = None
-    """Steps at the first evaluation that met all five results: the end of the time "to all five
+    """Steps at the first evaluation that met all results: the end of the time "to all five
     results" in every measurement."""
     solved_seconds: _Seconds | None = None
     """Seconds from the start of the process, without its imports, to the end of that evaluation."""
     margin_steps: _Steps | None = None
-    """Steps at the first evaluation that met all five with a margin
+    """Steps at the first evaluation that met all with a margin
     (`Report.passed_with_margin`)."""
     evaluations: list[Evaluation] = []
 
@@ -60,7 +60,7 @@ class Results(_Evaluations):
     trained_steps: _Steps = 0
     seconds: dict[str, _Seconds] = {}
     fresh_resets: bool = False
-    """Whether the five results come from other resets than the selection of the checkpoint."""
+    """Whether the results of `best` come from other resets than the selection of the checkpoint."""
 
     @pydantic.model_validator(mode="before")
     @classmethod

@@ -19,8 +19,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.files import check_integrity, read_json
+from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.tasks.registry import is_file
 
 RECORD_FILE = "run.json"
 
@@ -38,7 +39,7 @@ class Record(pydantic.BaseModel):
     """Content of run.json."""
 
     steps: int
-    config: TrainConfig
+    config: dict[str, Any]
     progress: dict[str, Any]
 
 
@@ -78,15 +79,20 @@ def load_training_state(
 
 def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
+    run_config = load_run_config(checkpoint.run)
     try:
         check_integrity(checkpoint.folder)
         record = read_json(checkpoint.folder / RECORD_FILE, Record)
         if record.steps != checkpoint.steps:
             raise ValueError(f"it was written after {record.steps} steps")
+        is_copy = is_file(run_config.task) and is_file(str(record.config.get("task")))
+        its_task = {"task": run_config.task} if is_copy else {}
+        config = type(run_config).model_validate(record.config | its_task)
+    except pydantic.ValidationError as error:
+        raise _damaged(checkpoint, ValueError(first_mistake(error))) from error
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
-    differing = differing_keys(load_run_config(checkpoint.run), record.config)
-    differing -= RESUMABLE_KEYS | {_MJCF_KEY}
+    differing = differing_keys(run_config, config) - RESUMABLE_KEYS - {_MJCF_KEY}
     if differing:
         raise UserError(
             f"the checkpoint {checkpoint.folder} is of another config than "

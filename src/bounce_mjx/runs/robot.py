@@ -1,6 +1,6 @@
 """The copy of a robot's MJCF in the run that trains it.
 
-    runs/bounce_ball/<time stamp>/robot/
+    runs/<task>/<time stamp>/robot/
         my_robot.xml        the MJCF, and every file that it names, in their own subfolders
         manifest.json       size and SHA-256 of every file
 

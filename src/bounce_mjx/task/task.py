@@ -88,6 +88,8 @@ class Task:
 
     Config: ClassVar[type[WorldConfig]]
     """The settings of an environment with this task: those of the world, and the task's own."""
+    folder: ClassVar[str] = ""
+    """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
     """What a training logs and a report draws of the metrics; the first is the progress line's."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()

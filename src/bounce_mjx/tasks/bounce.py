@@ -151,6 +151,26 @@ class BounceConfig(WorldConfig):
             )
         return heights
 
+    @classmethod
+    def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        """The heights follow the paddle; the reach stays what it is beyond the paddle's home."""
+        default = cls()
+        x, y, z = paddle
+        reward, lift = default.reward, z - default.reward.paddle_home_height
+        beyond = default.max_horizontal_distance - reward.target_x
+        base_height = reward.height_progress.base_height + lift
+        return super().settings_at(paddle) | {
+            "target_height_range": [round(h + lift, 4) for h in default.target_height_range],
+            "min_ball_height": round(default.min_ball_height + lift, 4),
+            "max_horizontal_distance": round(max(abs(x), abs(y)) + beyond, 4),
+            "reward": {
+                "target_x": x,
+                "target_y": y,
+                "paddle_home_height": z,
+                "height_progress": {"base_height": round(base_height, 4)},
+            },
+        }
+
     @property
     def commands(self) -> dict[str, Command]:
         """The target height."""
@@ -188,6 +208,7 @@ class Bounce(Task):
 
     Config = BounceConfig
     config: BounceConfig
+    folder = "bounce_ball"
     curves = (
         Curve("episode/bounces", "n_bounces", "episodes", "bounces in a row at its end"),
         Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),

@@ -1,6 +1,7 @@
 """Tasks by name: those of the package, those of installed packages, and those in a file.
 
-A task in a file is code. It runs only if the user names the file.
+A task in a file is code, which runs only if the user names the file. Code is known by its content:
+a run's copy of a file that the user has named is the same task.
 """
 
 import difflib
@@ -8,11 +9,14 @@ import hashlib
 import importlib
 import importlib.metadata
 import importlib.util
+import inspect
 import sys
 import traceback
+import types
 from pathlib import Path
 
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.files import read_regular
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -21,6 +25,8 @@ DEFAULT = "bounce"
 
 GROUP = "bounce_mjx.tasks"
 """Entry points of installed packages that have tasks."""
+
+_MAX_BYTES = 2**20
 
 _OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce"}
 
@@ -33,8 +39,7 @@ def find_task(name: str) -> type[Task]:
     """
     if is_file(name):
         return _from_file(name)
-    known = {entry.name: entry.value for entry in importlib.metadata.entry_points(group=GROUP)}
-    known |= _OWN
+    known = _registered()
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         advice = f"did you mean {near[0]}?" if near else "give FILE.py:CLASS or a known name"
@@ -48,6 +53,15 @@ def find_task(name: str) -> type[Task]:
         raise UserError(
             f"the task {name} cannot be imported ({error}); install the package that has it again"
         ) from error
+
+
+def task_name(task: type[Task]) -> str:
+    """The name under which `find_task` finds a task: its registered name, or FILE.py:CLASS."""
+    place = f"{task.__module__}:{task.__qualname__}"
+    for name, value in _registered().items():
+        if value == place:
+            return name
+    return f"{inspect.getsourcefile(task)}:{task.__qualname__}"
 
 
 def task_config(task: str | type[Task]) -> type[WorldConfig]:
@@ -65,22 +79,56 @@ def source_file(name: str) -> Path:
     return Path(name.rpartition(":")[0]).expanduser().absolute()
 
 
-def _from_file(name: str) -> type[Task]:
-    path, attribute = source_file(name), name.rpartition(":")[2]
+def read_source(name: str) -> bytes:
+    """Content of the file in FILE.py:CLASS.
+
+    Raises:
+      UserError: the file cannot be read.
+    """
+    path = source_file(name)
     try:
-        source = path.read_bytes()
-    except OSError as error:
+        return read_regular(path, _MAX_BYTES)
+    except (OSError, ValueError) as error:
         raise UserError(
-            f"the task's file {path} cannot be read ({error.strerror}); give FILE.py:CLASS"
+            f"the task's file {shorten(str(path))} cannot be read ({reason_of(error)}); give "
+            "FILE.py:CLASS"
         ) from error
-    # The same file gives the same classes, which a config compares.
-    module_name = f"bounce_mjx_task_{hashlib.sha256(bytes(path) + source).hexdigest()[:16]}"
+
+
+def known_task(name: str) -> type[Task] | None:
+    """The task of FILE.py:CLASS if code with the same content has been named in this process;
+    nothing of the file is run."""
+    module = sys.modules.get(_module_name(read_source(name)))
+    return None if module is None else _class_in(module, name)
+
+
+def admit(name: str, task: type[Task]) -> None:
+    """Lets a task stand for FILE.py:CLASS, whose code is another one."""
+    attribute = name.rpartition(":")[2]
+    module = types.ModuleType(_module_name(read_source(name)))
+    setattr(module, attribute, task)
+    sys.modules[module.__name__] = module
+
+
+def _registered() -> dict[str, str]:
+    """MODULE:CLASS by name."""
+    entries = importlib.metadata.entry_points(group=GROUP)
+    return {entry.name: entry.value for entry in entries} | _OWN
+
+
+def _module_name(source: bytes) -> str:
+    return f"bounce_mjx_task_{hashlib.sha256(source).hexdigest()[:16]}"
+
+
+def _from_file(name: str) -> type[Task]:
+    path, source = source_file(name), read_source(name)
+    module_name = _module_name(source)
     if module_name not in sys.modules:
         spec = importlib.util.spec_from_file_location(module_name, path)
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module
         try:
-            spec.loader.exec_module(module)
+            exec(compile(source, str(path), "exec"), vars(module))
         except Exception as error:
             del sys.modules[module_name]
             frames = [
@@ -91,15 +139,21 @@ def _from_file(name: str) -> type[Task]:
                 f"the task's file {path} cannot be imported ({type(error).__name__} in "
                 f"line {line}: {shorten(str(error), 300)}); correct it"
             ) from error
-    found = getattr(sys.modules[module_name], attribute, None)
-    if not (isinstance(found, type) and issubclass(found, Task)):
-        classes = [
-            key
-            for key, value in vars(sys.modules[module_name]).items()
-            if isinstance(value, type) and issubclass(value, Task) and value is not Task
-        ]
-        raise UserError(
-            f"the task's file {path} has no task {shorten(attribute)!r} (its subclasses of Task: "
-            f"{', '.join(classes) or 'none'}); give FILE.py:CLASS"
-        )
-    return found
+    return _class_in(sys.modules[module_name], name)
+
+
+def _class_in(module: types.ModuleType, name: str) -> type[Task]:
+    """The task of FILE.py:CLASS in the file's module."""
+    attribute = name.rpartition(":")[2]
+    found = getattr(module, attribute, None)
+    if isinstance(found, type) and issubclass(found, Task):
+        return found
+    classes = [
+        key
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Task) and value is not Task
+    ]
+    raise UserError(
+        f"the task's file {source_file(name)} has no task {shorten(attribute)!r} (its subclasses "
+        f"of Task: {', '.join(classes) or 'none'}); give FILE.py:CLASS"
+    )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
+import pydantic
 import tyro
 from rich.console import Console
 
@@ -15,7 +16,15 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    load_run_config,
+    read_preset,
+    runs_folder,
+    train_config,
+)
+from bounce_mjx.runs.task import is_same_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
@@ -27,7 +36,7 @@ if TYPE_CHECKING:
 class TrainingCommand(TrainConfig):
     """The command line: the config's keys as flags, and the preset or run to start from."""
 
-    env: Annotated[WorldConfig, tyro.conf.arg(name="")] = WorldConfig()
+    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
     """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
@@ -69,7 +78,7 @@ def read_command(
         stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
-    robot = path_flag(args, "--robot")
+    robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
     for given, flag in ((config_path, "--config"), (robot, "--robot")):
         if given and resume:
             raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
@@ -77,23 +86,31 @@ def read_command(
         from bounce_mjx.runs.folders import find_run, named_run
         from bounce_mjx.runs.reading import RESUMABLE_KEYS
 
-        log_dir = path_flag(args, "--log-dir") or TrainConfig().log_dir
+        log_dir = path_flag(args, "--log-dir") or runs_folder(find_task(task or DEFAULT))
         resume = find_run(named_run(resume, log_dir))
-    base = load_run_config(resume) if resume else read_preset(config_path or preset, robot)
+        base = load_run_config(resume, task)
+        if task is not None and not is_same_task(base.task, task):
+            raise UserError(
+                f"--resume cannot change the task, and {task} differs from {base.task}; restore "
+                "it, name the run's copy, or start a new run"
+            )
+    else:
+        base = read_preset(config_path or preset, robot, task)
     start = base
     if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
         start = base.model_copy(update={"stop_when_solved": False})
+    own_class = train_config(base.env.task, command_class)
     command = parse(
-        command_class,
+        own_class,
         args,
         prog=prog,
         description=description,
-        default=command_class(
+        default=own_class(
             **dict(start), config=config_path, robot=robot, resume=resume, **defaults
         ),
     )
     if resume:
-        command = command.model_copy(update={"resume": resume})
+        command = command.model_copy(update={"resume": resume, "task": base.task})
         changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS
         if changed:
             raise UserError(

@@ -49,7 +49,8 @@ class Reporter:
             "training", total=config.total_steps, completed=first_step, figures="", left=""
         )
         unknown = np.full(config.num_seeds, math.nan)
-        self._last = {"episode/return": unknown, "episode/bounces": unknown}
+        self._last = {"episode/return": unknown}
+        self._last |= dict.fromkeys((c.tag for c in config.env.task.curves[:1]), unknown)
         self._saving_problem: str | None = None
 
     @property
@@ -86,11 +87,9 @@ class Reporter:
         for name, last in self._last.items():
             self._last[name] = np.where(np.isfinite(means[name]), means[name], last)
         rate = means["speed/steps_per_second"][0]
-        figures = (
-            f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s  "
-            f"return {_mean_and_deviation(self._last['episode/return'], 0)}  "
-            f"bounces {_mean_and_deviation(self._last['episode/bounces'], 1)}"
-        )
+        figures = f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s"
+        for digits, (tag, values) in enumerate(self._last.items()):
+            figures += f"  {tag.rpartition('/')[2]} {_mean_and_deviation(values, digits)}"
         left = self._time_left(steps)
         self._progress.update(self._task, completed=steps, figures=figures, left=left)
         if not self._console.is_terminal:

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
 

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
@@ -40,7 +41,6 @@ from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
     best_steps: int
     """Environment steps at the best checkpoint."""
     solved_steps: int | None
-    """Environment steps at the first evaluation that met all five results."""
+    """Environment steps at the first evaluation that met all results."""
     fault: str | None
     """If the training diverged, the first quantity that was not finite, and the iteration."""
     seconds: dict[str, float]

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
 from bounce_mjx.training.setup import compiler_options

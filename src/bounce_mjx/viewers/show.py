@@ -7,17 +7,17 @@ from typing import NamedTuple
 
 from rich.console import Console
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
+from bounce_mjx.world.config import WorldConfig
 
 _RECORDED_SECONDS = 10.0
 
@@ -34,7 +34,7 @@ def show(
     shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    target_height: float | None,
+    commands: dict[str, float],
     console: Console,
 ) -> None:
     """Shows or records environments under their controllers; Ctrl-C closes a viewer.
@@ -94,7 +94,7 @@ def show(
             if env.engine.name == "fused" and not several:
                 num_envs = MAX_ENVS
         simulation = Simulation(env, one.make_controller(env), num_envs, options.seed, ranges)
-        simulation.target_height = target_height
+        simulation.command = commands
         simulation.world = None if is_drawn else {}
         return simulation
 

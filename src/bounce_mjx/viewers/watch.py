@@ -13,13 +13,13 @@ import numpy as np
 import viser
 from rich.console import Console
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.browser import AXIS, LivePage, address, free_port
 from bounce_mjx.viewers.controllers import make_exchangeable_controller
 from bounce_mjx.viewers.page import open_server

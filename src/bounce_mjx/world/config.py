@@ -12,6 +12,9 @@ from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import RandomizationConfig
 
+PADDLE_HOME = (0.58856, 0.0, 0.05)
+"""Where the project's own arm holds the paddle at a reset, m."""
+
 
 class Command(NamedTuple):
     """A number that is wished of the policy: drawn at a reset and after each interval
@@ -107,6 +110,18 @@ class WorldConfig(StrictModel):
             return path.expanduser().absolute()
         except RuntimeError as error:
             raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
+
+    @classmethod
+    def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        """The settings that depend on where an arm holds the paddle at a reset. A task adds its
+        own.
+
+        Args:
+          paddle: centre of the level paddle at `default_joint_angles`, m.
+        """
+        default = cls.model_fields["ball_init_pos"].default
+        moved = zip(default, paddle, PADDLE_HOME, strict=True)
+        return {"ball_init_pos": [round(b + p - h, 4) + 0.0 for b, p, h in moved]}
 
     @property
     def num_joints(self) -> int:

@@ -37,6 +37,7 @@ from bounce_mjx.adapters.torch.networks import (
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv
 from bounce_mjx.errors import needed
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.metrics import SUM
 from bounce_mjx.learning.policy import Policy
 
 with needed("rsl_rl", "'bounce_mjx[torch]'"):
@@ -143,7 +144,7 @@ class RslRlVecEnv(VecEnv):
         result = self._result = self.env.step(actions)
         self._observations = self._groups(result.observation, result.critic_metrics)
         means = zip(self.env.metric_names, result.metrics.unbind(), strict=True)
-        log = {f"task/{name}": mean for name, mean in means if name not in _SUMS}
+        log = {f"task/{name}": mean for name, mean in means if not name.startswith(SUM)}
         extras = {"time_outs": result.truncated, "log": log}
         return self._observations, result.reward, result.done, extras
 
@@ -164,10 +165,6 @@ class RslRlVecEnv(VecEnv):
             batch_size=torch.Size([self.num_envs]),
             device=self.device,
         )
-
-
-# Sums over the episodes that ended on a step; a mean of them over steps is not meaningful.
-_SUMS = frozenset({"ended", "return", "length", "bounces", "apex_error", "bounced", "non_finite"})
 
 
 class Network(MLPModel):

@@ -74,7 +74,7 @@ class TorchTrainer:
             parts.append([learner.learn(1) for learner in self.learners])
             if stopping():
                 break
-        blocks = [summarize(_joined(metrics)) for metrics in zip(*parts, strict=True)]
+        blocks = [summarize(_joined(metrics), curves) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
@@ -112,14 +112,14 @@ def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
     )
 
 
-def summarize(metrics: Metrics) -> Metrics:
+def summarize(metrics: Metrics, curves: Sequence[Curve]) -> Metrics:
     """Metrics of each iteration [I] from a learner's metrics. The environment's metrics [I, T] are
-    summarised as in the JAX trainer; the learner's own [I] are kept."""
+    summarised as in the JAX trainer, with the curves of the task; the learner's own [I] are
+    kept."""
     own = {name: values for name, values in metrics.items() if values.ndim == 1}
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}
-    return own | {
-        name: np.asarray(value) for name, value in jax.vmap(rollout_metrics)(steps).items()
-    }
+    summary = jax.vmap(lambda steps: rollout_metrics(steps, curves))(steps)
+    return own | {name: np.asarray(value) for name, value in summary.items()}
 
 
 def _joined(parts: Sequence[Metrics]) -> Metrics:

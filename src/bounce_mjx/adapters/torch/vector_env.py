@@ -217,7 +217,7 @@ class TorchVectorEnv:
             terminated=result.terminated,
             truncated=result.truncated,
             done=result.terminated | result.truncated,
-            metrics=step_metrics(result, groups=1),
+            metrics=step_metrics(result, 1, self.env.task.curves),
         )
         return _Carried(_slim(state), key, steps), arrays
 
