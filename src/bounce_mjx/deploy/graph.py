@@ -24,8 +24,8 @@ _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
 _INLINED |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 # Operations that only move numbers, and which of their operands are indices.
 _MOVES = dict.fromkeys(
-    "broadcast_in_dim concatenate copy pad reshape rev slice split squeeze stack stop_gradient tile "
-    "transpose".split(),
+    "broadcast_in_dim concatenate copy pad reshape rev slice split squeeze stack stop_gradient "
+    "tile transpose".split(),
     (),
 )
 _MOVES |= {"dynamic_slice": range(1, 9), "dynamic_update_slice": range(2, 9)}
@@ -80,11 +80,10 @@ def onnx_graph(
     """
     with needed("onnx", EXTRA):
         from onnx import helper
+    closed, outputs = jax.make_jaxpr(function, return_shape=True)(inputs)
     graph = _Graph(owner)
-    with jax.enable_x64(False):
-        closed, outputs = jax.make_jaxpr(function, return_shape=True)(inputs)
-        # JAX sorts the names of a dict.
-        results = graph.run(closed.jaxpr, closed.consts, sorted(inputs))
+    # JAX sorts the names of a dict.
+    results = graph.run(closed.jaxpr, closed.consts, sorted(inputs))
     for name, result in zip(sorted(outputs), results, strict=True):
         graph.node("Identity", result, output=name)
     used = {name for node in graph.nodes for name in node.input}
