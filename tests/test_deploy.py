@@ -1,5 +1,6 @@
 """Exported policies: the ONNX graph against JAX, a deployed policy against the environment."""
 
+import inspect
 import json
 import math
 import random
@@ -21,6 +22,7 @@ from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy import loading
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import export_jax, export_onnx, policy_metadata
+from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import CommandRange, from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
@@ -241,6 +243,95 @@ def session_of(run: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
 
 
+# Functions of a vector x [3], a matrix a [2, 3], a number s, whole numbers i [3], and truth values
+# b [3] and p. Together they have every operation that a graph may have.
+FUNCTIONS = {
+    "arithmetic": lambda x, s: -x * s + 2.0 - x / 3.0,
+    "functions": lambda x: jnp.sin(x) + jnp.cos(x) * jnp.tanh(x) + jnp.tan(x) - jnp.exp(x),
+    "of positive": lambda x: jnp.sqrt(jnp.abs(x)) + jnp.log(jnp.abs(x)) + jnp.abs(x) ** 0.7,
+    "powers": lambda x: x**2 + x**3 + jnp.square(x) + 1.0 / x**2,
+    "rounding": lambda x: jnp.floor(x) + jnp.ceil(x) + jnp.sign(x) + x % 0.3,
+    "limits": lambda x: jnp.clip(x, -0.5, 0.5) + jax.lax.clamp(-0.3, x, 0.7) + jnp.maximum(x, 0.1),
+    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x),
+    "no gradient": lambda x: jax.lax.stop_gradient(x) + jnp.copy(x),
+    "whole numbers": lambda i: jnp.abs(i) + i * 2 - jnp.minimum(i, 1) + jnp.sign(-i) + i * i,
+    "reductions": lambda i, x: jnp.sum(i) + i.max() - i.min() + jnp.mean(x) + x.max() - x.min(),
+    "of a matrix": lambda a: a.sum(0) + a.max(1).min() + jnp.var(a) + jnp.linalg.norm(a),
+    "truth": lambda b, i: jnp.any(b) & jnp.all(i < 2) | (b[0] != b[1]) ^ ~b[2],
+    "comparisons": lambda x, i: jnp.stack([x > 0.1, x >= i, x < i, x <= 0, i == 1, i != 2]),
+    "conversions": lambda x, b: x.astype(jnp.int32) + b.astype(jnp.int32) + x.astype(bool),
+    "a choice": lambda p, a, s: jnp.where(p, a, s) + jnp.where(a > 0, 1.0, a),
+    "a choice of truth": lambda p, b: jnp.where(p, b, ~b[::-1]),
+    "constants": lambda x: jnp.arange(3.0) * 2 + x + jnp.ones((2, 3))[0],
+    "slices": lambda x, a: jnp.concatenate([x[:1], a[1], x[:0], x[::-1], x[np.array([0, 2])]]),
+    "changes": lambda x: x.at[0].set(x[2]) + x.at[1:].set(4.0),
+    "moves": lambda x: jnp.concatenate([jnp.roll(x, 1), jnp.pad(x, 1), jnp.tile(x, 2), x]),
+    "shapes": lambda a: jnp.repeat(a, 2, 0).reshape(3, 4).T[:, None] + jnp.zeros((4, 2, 3)),
+    "parts": lambda x: sum(jnp.split(x, 3)) + jnp.append(x, 1.0)[3:],
+    "windows": lambda x: jax.lax.dynamic_slice(x, (1,), (2,)),
+    "an update": lambda x: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)),
+    "products": lambda a, x: a @ x + jnp.einsum("ij,ij->i", a, a) + x @ jnp.ones((3, 2)),
+    "outer products": lambda a, x: jnp.outer(x, x)[:2] + a @ a.T @ a + jnp.ones((2, 2)) @ a,
+    "cross": lambda x: jnp.cross(x, x[::-1]) + jnp.hypot(x[0], x[1]),
+}
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, np.ndarray]:
+    """Seven rows of the arguments of `FUNCTIONS`."""
+    rng = np.random.default_rng(0)
+    numbers = {"x": (7, 3), "a": (7, 2, 3), "s": (7,)}
+    floats = {k: rng.normal(size=shape).astype(np.float32) for k, shape in numbers.items()}
+    truths = {"b": rng.random((7, 3)) < 0.5, "p": rng.random(7) < 0.5}
+    return floats | truths | {"i": rng.integers(-3, 4, (7, 3)).astype(np.int32)}
+
+
+def graph_of(function, rows: dict[str, np.ndarray]) -> tuple[onnx.GraphProto, dict]:
+    """The graph of a function with the output `result`, and its inputs."""
+    given = {name: rows[name] for name in inspect.signature(function).parameters}
+    shapes = {k: jax.ShapeDtypeStruct(v.shape[1:], v.dtype) for k, v in given.items()}
+    graph = onnx_graph(lambda named: {"result": function(**named)}, shapes, "the task Test")
+    return graph, given
+
+
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_a_graph_computes_what_jax_computes(function, rows) -> None:
+    graph, given = graph_of(function, rows)
+    opset = [onnx.helper.make_opsetid("", 17)]
+    model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=8)
+    onnx.checker.check_model(model, full_check=True)
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    (result,) = session.run(["result"], given)
+    expected = np.asarray(jax.vmap(lambda named: function(**named))(given))
+    assert result.dtype == expected.dtype
+    np.testing.assert_allclose(result, expected, rtol=2e-5, atol=2e-6)
+
+
+REFUSED = {
+    "sort": lambda x: jnp.sort(x),
+    "atan2": lambda x: jnp.arctan2(x, x),
+    "scan": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: 2.0 * y, x),
+    "dynamic_slice": lambda x, i: x[i[0]],
+    "div of int32": lambda i: jax.lax.div(i, i),
+    "mul of float16": lambda x: x.astype(jnp.float16) * 2,
+}
+
+
+@pytest.mark.parametrize("operation", REFUSED)
+def test_an_operation_without_a_counterpart_is_named(operation: str, rows) -> None:
+    with pytest.raises(UserError, match=f"^the task Test uses the operation {operation}.*; use "):
+        graph_of(REFUSED[operation], rows)
+
+
+def test_a_command_with_the_name_of_a_measurement_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(VISITS.replace("ceiling", "time"), encoding="utf-8")
+    run = make_run(tmp_path / "run", {}, f"{tmp_path / 'mine.py'}:Visits")
+    with pytest.raises(UserError, match="the command time has the name of a measurement"):
+        export_onnx(find_checkpoint(run))
+
+
 @pytest.mark.parametrize("name", ["specification", "pretrained"])
 def test_onnx_equals_jax(name: str, runs: dict[str, Path]) -> None:
     inputs, expected = draw_inputs(name, runs)
@@ -258,10 +349,9 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
     config = load_run_config(checkpoint.run)
     inputs, _ = draw_inputs(name, runs)
     own, rng = config.env.observation.seen("task"), np.random.default_rng(0)
-    tensors = {tensor.name: tensor for tensor in session.get_inputs()}
     given = {input_name(quantity): values for quantity, values in inputs.items()}
     measured, remembered = {}, {}
-    for tensor in tensors.values():
+    for tensor in session.get_inputs():
         shape = 1000, *tensor.shape[1:]
         kind, _, quantity = tensor.name.partition("/")
         if kind == "measured":
@@ -280,17 +370,12 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
     results = dict(zip((output.name for output in session.get_outputs()), results, strict=True))
 
     task = config.env.task(config.env)
-    nothing = dict.fromkeys(QUANTITIES, np.zeros((1000, 6), np.float32)) | measured
-    _, tree = jax.tree.flatten(
-        jax.eval_shape(task.first_quantities, jax.tree.map(lambda x: x[0], nothing))[0]
-    )
-    # The names of a memory are in the order of its leaves.
-    memory = tree.unflatten(
-        [remembered[name] for name in sorted(remembered, key=list(tensors).index)]
-    )
+    newest = dict.fromkeys(QUANTITIES, np.zeros((1000, 6), np.float32)) | measured
+    start, first = jax.vmap(task.first_quantities)(newest)
+    # The inputs of a memory are in the order of its leaves.
+    memory = jax.tree.structure(start).unflatten(remembered.values())
     past = {quantity: inputs[quantity] for quantity in own}
-    start, first = jax.vmap(task.first_quantities)(nothing)
-    after, later = jax.vmap(task.next_quantities)(memory, past, nothing)
+    after, later = jax.vmap(task.next_quantities)(memory, past, newest)
     seen = {
         name: np.where(
             is_first[:, None, None], np.asarray(first[name])[:, None], np.asarray(later[name])
@@ -301,7 +386,7 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
         np.testing.assert_allclose(results[f"next/{quantity}"], values, rtol=1e-6, atol=1e-5)
         assert np.mean(values != inputs[quantity]) > 0.05
     leaves = zip(jax.tree.leaves(start), jax.tree.leaves(after), strict=True)
-    for name, (new, old) in zip(sorted(remembered, key=list(tensors).index), leaves, strict=True):
+    for name, (new, old) in zip(remembered, leaves, strict=True):
         shape = -1, *[1] * (np.ndim(new) - 1)
         values = np.where(is_first.reshape(shape), new, old)
         np.testing.assert_allclose(results[f"next/{name}"], values, rtol=1e-6, atol=1e-6)
@@ -468,6 +553,7 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     targets, ages = rng.uniform(0.4, 0.6, (200, 1)), 0.03 - 0.0001 * np.arange(200)[:, None]
     measured = truth._asdict() | {"target_height": targets, "ball_age": ages, "ball_picture": ball}
     task, own, action, intervals = env.task(env), env.observation.seen("task"), np.zeros(6), set()
+    memory = seen = None
 
     def first(measured: dict) -> tuple:
         memory, values = task.first_quantities(measured)
@@ -620,10 +706,45 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["pretrained", "robust"])
 def test_the_shipped_file_is_a_fresh_export(name: str, runs: dict[str, Path]) -> None:
+    """Another version of JAX may write other nodes, but they compute the same."""
     file = runs[name] / f"{name}.onnx"
-    assert onnx.load(file) == onnx.load_from_string(export_onnx(find_checkpoint(runs[name]))), (
-        f"{file} is stale; write it with bounce-mjx export {name} --onnx {file}"
-    )
+    fresh = export_onnx(find_checkpoint(runs[name]))
+    stale = f"{file} is stale; write it with bounce-mjx export {name} --onnx {file}"
+    assert onnx.load(file).metadata_props == onnx.load_from_string(fresh).metadata_props, stale
+    policies = [DeployedPolicy(content, name) for content in (file.read_bytes(), fresh)]
+    for i in range(100):
+        time = 0.01 * i
+        height = 0.1 + abs(math.sin(5.0 * time)) / 3.0
+        measured = falling(time) | {"ball_position": [0.6, 0.01 * math.cos(time), height]}
+        actions = [policy.step(measured) for policy in policies]
+        np.testing.assert_allclose(*actions, atol=1e-5, err_msg=stale)
+
+
+def test_a_file_of_format_2_acts_as_before_unless_the_task_must_remember(
+    runs: dict[str, Path],
+) -> None:
+    new = onnx.load_from_string(export_onnx(find_checkpoint(runs["pretrained"])))
+    old = onnx.ModelProto.FromString(new.SerializeToString())
+    edit_entries(old, {"format": "2", "commands": None})
+    edit_entries(old, {"target_height_range": "[0.4, 0.6]", "bounce_max_distance": "0.12"})
+    policies = [DeployedPolicy(model.SerializeToString(), "a.onnx") for model in (old, new)]
+    assert policies[0].metadata.commands == policies[1].metadata.commands
+    for time in (0.0, 0.01, 0.03):
+        actions = [policy.step(falling(time)) for policy in policies]
+        np.testing.assert_array_equal(*actions)
+
+    entry = next(prop.value for prop in old.metadata_props if prop.key == "observation")
+    edit_entries(old, {"observation": entry.replace("ball_velocity", "apex_error")})
+    with pytest.raises(UserError, match="apex_error is unknown here; export the policy again"):
+        DeployedPolicy(old.SerializeToString(), "a.onnx")
+
+
+def edit_entries(model: onnx.ModelProto, texts: dict[str, str | None]) -> None:
+    """Sets entries of the metadata, or removes those that are None."""
+    entries = {prop.key: prop.value for prop in model.metadata_props} | texts
+    del model.metadata_props[:]
+    known = {name: text for name, text in entries.items() if text is not None}
+    onnx.helper.set_model_props(model, known)
 
 
 def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
@@ -711,7 +832,7 @@ def test_a_wrong_entry_is_refused_by_name(name: str, filtered: onnx.ModelProto) 
         with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file") as refusal:
             DeployedPolicy(edited(filtered, name, json.dumps(value)), "a.onnx")
         reason = str(refusal.value)
-        words = (name, "estimator", "joints", "inputs", "length than 1")
+        words = (name, "estimator", "joints", "input", "length than 1", "measurement")
         assert len(reason) < 400 and any(word in reason for word in words), (value, reason)
 
 
@@ -775,6 +896,53 @@ def test_a_network_that_gives_no_number_is_refused(filtered: onnx.ModelProto) ->
         if array.shape == (6,) and array.dtype == np.float32:
             tensor.CopyFrom(onnx.numpy_helper.from_array(array * np.nan, tensor.name))
     with pytest.raises(UserError, match="a.onnx is no policy .*not finite"):
+        DeployedPolicy(copy.SerializeToString(), "a.onnx")
+
+
+HOSTILE_MEMORY = {
+    "endless": lambda model: tensor_shape(model, "memory/lowest").add(dim_value=10**9),
+    "huge": lambda model: [
+        tensor_shape(model, name).add(dim_value=10**15)
+        for name in ("memory/lowest", "next/memory/lowest")
+    ],
+    "of any size": lambda model: [
+        tensor_shape(model, name).add(dim_param="M")
+        for name in ("memory/lowest", "next/memory/lowest")
+    ],
+    "of text": lambda model: retype(model, onnx.TensorProto.STRING),
+    "of wide numbers": lambda model: retype(model, onnx.TensorProto.DOUBLE),
+    "without an end": lambda model: model.graph.output.remove(
+        next(o for o in model.graph.output if o.name == "next/memory/lowest")
+    ),
+}
+
+
+def tensor_shape(model: onnx.ModelProto, name: str):
+    """Dimensions of an input or an output."""
+    tensors = (*model.graph.input, *model.graph.output)
+    return next(t for t in tensors if t.name == name).type.tensor_type.shape.dim
+
+
+def retype(model: onnx.ModelProto, kind: int) -> None:
+    """Another type of a memory."""
+    for tensor in (*model.graph.input, *model.graph.output):
+        if tensor.name.endswith("memory/lowest"):
+            tensor.type.tensor_type.elem_type = kind
+
+
+@pytest.mark.parametrize("edit", HOSTILE_MEMORY.values(), ids=HOSTILE_MEMORY)
+def test_a_memory_of_another_size_is_refused(edit, filtered: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+    edit(copy)
+    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
+        DeployedPolicy(copy.SerializeToString(), "a.onnx")
+
+
+def test_an_unknown_output_is_refused(filtered: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+    copy.graph.output.append(onnx.helper.make_empty_tensor_value_info("more"))
+    copy.graph.node.append(onnx.helper.make_node("Identity", ["action"], ["more"]))
+    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
@@ -878,8 +1046,8 @@ def test_the_example_has_a_late_camera() -> None:
 def test_command_writes_both_files(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     export_command.main("pretrained --onnx policy.onnx --jax policy.jax".split())
-    shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
-    assert (tmp_path / "policy.onnx").read_bytes() == shipped
+    fresh = export_onnx(pretrained_checkpoint())
+    assert (tmp_path / "policy.onnx").read_bytes() == fresh
     artefact = jax.export.deserialize((tmp_path / "policy.jax").read_bytes())
     assert artefact.out_avals[0].shape[1:] == (6,)
     assert "written: policy.onnx" in capsys.readouterr().out

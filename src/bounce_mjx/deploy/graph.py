@@ -163,8 +163,8 @@ class _Graph:
     def _refuse(self, equation: JaxprEqn) -> None:
         raise UserError(
             f"{self._owner} uses the operation {equation.primitive.name} of "
-            f"{equation.invars[-1].aval.str_short()}, which an exported policy cannot compute; "
-            "use arithmetic, comparisons, jnp.where and fixed indices"
+            f"{equation.invars[-1].aval.dtype}, which an exported policy cannot compute; use "
+            "arithmetic, comparisons, jnp.where and fixed indices"
         )
 
     def _aligned(self, value: Value, atom: Var | Literal, equation: JaxprEqn) -> Value:
