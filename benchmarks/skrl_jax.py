@@ -21,8 +21,8 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
-from bounce_mjx.task import vector
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.env import vector
+from bounce_mjx.tasks.bounce import BounceBall
 
 
 class SkrlJaxLearner:

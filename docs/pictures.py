@@ -338,7 +338,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
     from bounce_mjx.runs.reading import load_policy
-    from bounce_mjx.task.config import EnvConfig
+    from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
     from bounce_mjx.task.observation import OBSERVATION
 
     checkpoint = pretrained_checkpoint()

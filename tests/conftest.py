@@ -21,7 +21,7 @@ import pytest
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.loop_fusion import OPTION
 from bounce_mjx.viewers.offscreen import choose_backend
 

@@ -27,7 +27,8 @@ from bounce_mjx.adapters.brax import (
     pmap_support,
 )
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +205,7 @@ def train(trainer, env, networks, **settings):
 
 def assert_evaluated(metrics):
     """The evaluation reports the return and its terms, and the terms sum to the return."""
-    terms = [float(metrics[f"eval/episode_reward/{name}"]) for name in TERM_NAMES]
+    terms = [float(metrics[f"eval/episode_reward/{name}"]) for name in term_names(BounceReward)]
     np.testing.assert_allclose(metrics["eval/episode_reward"], sum(terms), rtol=1e-4)
     assert 0.0 < metrics["eval/avg_episode_length"] <= 20.0
     assert all_finite(list(metrics.values()))

@@ -29,8 +29,9 @@ from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.reading import load_policy, load_training_state
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.env import BounceBall
-from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.tasks.bounce import BounceBall, BounceConfig
+
+OBSERVATION = BounceConfig().layout
 
 SOURCES = Path(bounce_mjx.__file__).parent
 CONFIG = TrainConfig(

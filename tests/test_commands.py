@@ -26,7 +26,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.training.setup import set_up_jax
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents
 
@@ -441,7 +442,7 @@ def test_run_logs_to_tensorboard(trained: Path) -> None:
         "policy/learning_rate",
         "policy/action_std",
         "speed/steps_per_second",
-        *(f"reward/{name}" for name in TERM_NAMES),
+        *(f"reward/{name}" for name in term_names(BounceReward)),
         *(f"results/{name.replace(' ', '_')}" for name in measured),
     }
     tags = set(log.Tags()["scalars"])

@@ -12,9 +12,10 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task.env import TaskState, update_task
-from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.tasks.bounce import Bounce, BounceState
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
+
+OBSERVATION = EnvConfig().layout
 
 JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
 TARGET_XY = np.array([0.58856, 0.0])
@@ -56,9 +57,11 @@ def mj_data(model, physics) -> mujoco.MjData:
     return data
 
 
-def with_task(state, **changes):
-    """`state` with other task fields."""
+def with_task(state, target_height=None, **changes):
+    """`state` with another target height, and other fields of the task."""
     pipeline = state.pipeline_state
+    if target_height is not None:
+        pipeline = pipeline._replace(command={"target_height": jnp.float32(target_height)})
     changes = {
         name: jnp.asarray(value, getattr(pipeline.task, name).dtype)
         for name, value in changes.items()
@@ -151,7 +154,7 @@ def test_layout_names_the_parts_of_the_observation(walked, model):
     for name, value in kinematics.items():
         np.testing.assert_array_equal(walked.obs[OBSERVATION[name]], value, err_msg=name)
     np.testing.assert_array_equal(
-        walked.obs[OBSERVATION["target_height"]], walked.pipeline_state.task.target_height
+        walked.obs[OBSERVATION["target_height"]], walked.pipeline_state.command["target_height"]
     )
 
 
@@ -171,7 +174,7 @@ def test_task_page_has_the_layout():
 def test_observation_ends_with_the_target_height(walked):
     assert walked.obs.shape == (29,)
     assert walked.obs.dtype == jnp.float32
-    assert walked.obs[28] == walked.pipeline_state.task.target_height
+    assert walked.obs[28] == walked.pipeline_state.command["target_height"]
 
 
 # Reset
@@ -224,7 +227,7 @@ def test_reset_has_a_resting_ball_and_no_history(resets):
     np.testing.assert_array_equal(resets.obs[:, 9:13], np.tile([1, 0, 0, 0], (N_RESETS, 1)))
     np.testing.assert_array_equal(resets.obs[:, 19:25], 0)
     np.testing.assert_array_equal(task.n_bounces, 0)
-    np.testing.assert_array_equal(task.last_action, 0)
+    np.testing.assert_array_equal(resets.pipeline_state.last_action, 0)
     np.testing.assert_array_equal(task.rising, False)
     np.testing.assert_array_equal(task.apex, resets.obs[:, 8])
     np.testing.assert_array_equal(resets.done, 0)
@@ -281,7 +284,7 @@ def test_action_is_clipped_to_one(reset, step):
     assert_identical(step(state, 5.0 * signs), at_limit)
     assert_identical(step(state, jnp.inf * signs), at_limit)
     assert not np.allclose(step(state, 0.5 * signs).obs[:6], at_limit.obs[:6], atol=1e-4)
-    np.testing.assert_array_equal(at_limit.pipeline_state.task.last_action, signs)
+    np.testing.assert_array_equal(at_limit.pipeline_state.last_action, signs)
 
 
 def c_step(model, physics, action) -> mujoco.MjData:
@@ -360,11 +363,11 @@ def test_reward_terms_follow_the_state(episodes, model):
                 "ball_position": data.body("ball_link").xpos.copy(),
                 "ball_velocity": data.joint("ball_link").qvel[:3].copy(),
                 "paddle_position": data.geom("blocker").xpos.copy(),
-                "target_height": before.pipeline_state.task.target_height,
+                "target_height": before.pipeline_state.command["target_height"],
                 "n_bounces": after.metrics["n_bounces"],
                 "bounced": after.metrics["bounced"] > 0,
                 "action": np.clip(action, -1, 1),
-                "last_action": before.pipeline_state.task.last_action,
+                "last_action": before.pipeline_state.last_action,
                 "joint_velocity": [data.joint(name).qvel[0] for name in JOINTS],
             }
         )
@@ -379,7 +382,7 @@ def test_reward_terms_follow_the_state(episodes, model):
 
 def test_state_remembers_the_clipped_action(episodes):
     for _, action, after in episodes:
-        np.testing.assert_array_equal(after.pipeline_state.task.last_action, np.clip(action, -1, 1))
+        np.testing.assert_array_equal(after.pipeline_state.last_action, np.clip(action, -1, 1))
 
 
 def test_ball_xy_error_is_the_distance_from_the_target_point(episodes):
@@ -394,31 +397,27 @@ PADDLE_Z = 0.05
 
 
 def drive(steps, start_height=0.45, target=0.5, config=None):
-    """Feeds ball heights and vertical velocities, one pair per step, to `update_task`.
+    """Feeds ball heights and vertical velocities, one pair per step, to `Bounce.detect`.
 
     Returns:
-      bounced and n_bounces after each step, and the last task state.
+      bounced and n_bounces after each step, and the last state of the task.
     """
-    update = jax.jit(functools.partial(update_task, config or EnvConfig()))
-    task = TaskState(
-        target_height=jnp.float32(target),
-        last_action=jnp.zeros(6),
-        rising=jnp.asarray(False),
-        n_bounces=jnp.float32(0),
-        apex=jnp.float32(start_height),
+    detect = jax.jit(Bounce(config or EnvConfig()).detect)
+    state = BounceState(
+        rising=jnp.asarray(False), n_bounces=jnp.float32(0), apex=jnp.float32(start_height)
     )
     bounced, counts = [], []
     for z, vz in steps:
-        task, is_bounce = update(
-            task,
+        state, is_bounce = detect(
+            state,
+            target,
             jnp.array([0.5, 0.0, z]),
             jnp.array([0.0, 0.0, vz]),
             jnp.array([0.55, 0.0, PADDLE_Z]),
-            jnp.ones(6),
         )
         bounced.append(bool(is_bounce))
-        counts.append(float(task.n_bounces))
-    return bounced, counts, task
+        counts.append(float(state.n_bounces))
+    return bounced, counts, state
 
 
 def flights(*apexes):
@@ -503,12 +502,6 @@ def test_ball_that_began_to_rise_far_away_does_not_bounce_near_the_paddle():
 )
 def test_rising_starts_at_one_centimetre_per_second(velocities, expected):
     assert drive([(0.1, v) for v in velocities])[0] == expected
-
-
-def test_update_task_keeps_the_target_and_the_action():
-    task = drive([(0.45, 0.0)], target=0.55)[2]
-    assert task.target_height == np.float32(0.55)
-    np.testing.assert_array_equal(task.last_action, np.ones(6))
 
 
 @pytest.mark.parametrize(("apex", "error"), [(0.47, 0.03), (0.58, 0.08)])

@@ -18,15 +18,17 @@ from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.task.ball_filter import BallFilter, Constants
-from bounce_mjx.task.estimator import Estimator, filter_constants
-from bounce_mjx.task.observation import OBSERVATION, QUANTITIES
-from bounce_mjx.task.sensing import Picture
+from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.world.ball_filter import BallFilter, Constants
+from bounce_mjx.world.estimator import Estimator, filter_constants
+from bounce_mjx.world.sensing import Picture
+
+OBSERVATION = BounceConfig().layout
 
 BALLS, STEPS, DT = 8, 500, 0.01
 SEEN = {"ball_position": 1, "ball_velocity": 1}
 ENV = {
-    "observation": dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
+    "observation": dict.fromkeys(BounceConfig().observation.quantities(), 0)
     | SEEN
     | {"position": "filter", "velocity": "filter"},
     "randomization": {
@@ -65,7 +67,7 @@ def watched(env: BounceBall) -> Watched:
     def step(state, _):
         pipeline = state.pipeline_state
         truth, picture = env.kinematics(pipeline), pipeline.memory.sensing.picture
-        height = {"target_height": pipeline.task.target_height[None]}
+        height = {"target_height": pipeline.command["target_height"][None]}
         action = act(networks, policy, OBSERVATION.pack(truth._asdict() | height))
         kinematics = truth.ball_position, truth.ball_velocity, truth.joint_angles
         seen = Watched(*kinematics, picture.position, picture.age, state.obs)

@@ -22,7 +22,8 @@ from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import offscreen
 
 NUM_ENVS = 3
@@ -130,7 +131,7 @@ def test_single_environment_truncates_and_reports(single):
     *_, (_, reward, terminated, truncated, info) = episode(single, 0, LIMIT)
     assert truncated and not terminated
     terms = [value for name, value in info.items() if name.startswith("reward/")]
-    assert len(terms) == len(TERM_NAMES)
+    assert len(terms) == len(term_names(BounceReward))
     assert sum(terms) == pytest.approx(float(reward), rel=1e-4)
 
 
@@ -229,7 +230,7 @@ def test_wrong_arguments_give_one_sentence(opengl, arguments, sentence):
 
 
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
-    single, vector = environments.BounceBallEnv(), make_vec()
+    single, vector = environments.TaskEnv(), make_vec()
     for env in (single, vector):
         with pytest.raises(gymnasium.error.ResetNeeded, match="before its reset"):
             env.step(env.action_space.sample())
@@ -373,7 +374,7 @@ def test_rendering_failure_gives_one_sentence(monkeypatch):
 
 
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
-    env = environments.BounceBallEnv()
+    env = environments.TaskEnv()
     monkeypatch.setattr(batch, "_jax_process", 1)
     with pytest.raises(UserError, match='context="forkserver"'):
         env.reset()

@@ -12,12 +12,12 @@ import yaml
 
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import default_preset, read_preset
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.loop_fusion import OPTION, join_loops
 
 # Two results of one value: with the option, one loop computes both.
 PROGRAM = """
-from bounce_mjx.task.config import EnvConfig
+from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.loop_fusion import join_loops
 join_loops(EnvConfig(physics="{physics}"))
 import jax

@@ -120,29 +120,28 @@ except ImportError as error:
 
 
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
-    """In a copy of the package, one more term is added after the others in rewards.py. The config,
-    the metrics, the reward, the viewer's bars and the report's figure then have it."""
+    """In a copy of the package, one more term is added to those of bouncing. The config, the
+    metrics, the reward, the viewer's bars and the report's figure then have it."""
     copy = tmp_path / "src" / "bounce_mjx"
     shutil.copytree(CHECKOUT / "src" / "bounce_mjx", copy)
     for folder in ("mjcf", "configs"):
         shutil.copytree(CHECKOUT / folder, tmp_path / folder)
-    rewards = copy / "task" / "rewards.py"
+    rewards = copy / "tasks" / "bounce_rewards.py"
     term = """
-class SpinReward(StrictModel):
+class SpinReward(RewardTerm):
     weight: Finite = -0.5
     offset: Finite = 3.0
 
-
-@term(SpinReward)
-def spin(config: SpinReward, inputs: RewardInputs, geometry: Geometry) -> jax.Array:
-    return geometry.vz - config.offset
+    def value(self, inputs: RewardInputs) -> jax.Array:
+        return inputs.vz - self.offset
 
 
-class SharedRewardConfig(StrictModel):
+class BounceReward(StrictModel):
 """
     source = rewards.read_text(encoding="utf-8")
-    assert source.count("class SharedRewardConfig(StrictModel):\n") == 1
-    source = source.replace("class SharedRewardConfig(StrictModel):\n", term)
+    assert source.count("class BounceReward(StrictModel):\n") == 1
+    source = source.replace("class BounceReward(StrictModel):\n", term)
+    source += "    spin: SpinReward = SpinReward()\n"
     rewards.write_text(source, encoding="utf-8")
     script = """
 import jax
@@ -151,7 +150,9 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.reports.curves import Curve, Group, RunCurves
 from bounce_mjx.reports.figures import image, rewards_figure
 from bounce_mjx.viewers.browser import reward_bars
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
+TERM_NAMES = term_names(BounceReward)
 env = BounceBall(EnvConfig(reward={"spin": {"offset": 4.0}}))
 state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.numpy.zeros(6))
 terms = {k: v for k, v in state.metrics.items() if k.startswith("reward/")}

@@ -23,7 +23,9 @@ from bounce_mjx.learning.statistics import (
     normalize,
     update,
 )
-from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.tasks.bounce import BounceConfig
+
+OBSERVATION = BounceConfig().layout
 
 CONSTANT = OBSERVATION["ball_quaternion"]
 N = OBSERVATION.size

@@ -48,7 +48,7 @@ from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.tasks.bounce import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training.command import config_of
@@ -516,14 +516,14 @@ from pathlib import Path
 import jax
 from bounce_mjx.commands.train import main
 from bounce_mjx.learning.gaussian import Gaussian
-from bounce_mjx.task import rewards
-from bounce_mjx.task.env import BounceBall
+from bounce_mjx.tasks.bounce_rewards import PaddleHomeReward
+from bounce_mjx.tasks.bounce import BounceBall
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
-kind, formula = rewards.TERMS["paddle_home"]
+formula = PaddleHomeReward.value
 def from_file(*args):
     return formula(*args) * float(Path(__file__).with_name("factor").read_text())
-rewards.TERMS["paddle_home"] = rewards.Term(kind, from_file)
+PaddleHomeReward.value = from_file
 step = BounceBall.step
 def from_variable(self, state, action, *args):
     return step(self, state, action * float(os.environ["FACTOR"]), *args)

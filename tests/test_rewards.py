@@ -8,8 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from bounce_mjx.task.config import EnvConfig
-from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig, RewardInputs, weighted_terms
+from bounce_mjx import EnvConfig
+from bounce_mjx.task import term_names, weighted_terms
+from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = (
@@ -33,10 +34,15 @@ N_STATES = 10_000
 X_TARGET = 0.58856
 
 
-def evaluate(config: RewardConfig, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def terms_of(config: BounceReward, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """The package's weighted terms of one state."""
+    return weighted_terms(config, RewardInputs(**inputs, home=config))
+
+
+def evaluate(config: BounceReward, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the package's weighted terms `[N]` of a batch of states, in float64."""
     with jax.enable_x64(True):
-        terms = jax.jit(jax.vmap(partial(weighted_terms, config)))(RewardInputs(**states))
+        terms = jax.jit(jax.vmap(partial(terms_of, config)))(states)
         return {name: np.asarray(term) for name, term in terms.items()}
 
 
@@ -205,7 +211,7 @@ def test_term_equals_reference(name, random_comparison):
 
 def test_names_equal_the_specification(random_comparison):
     package, reference = random_comparison
-    assert tuple(TERM_NAMES) == SPEC_NAMES
+    assert term_names(BounceReward) == SPEC_NAMES
     assert tuple(REFERENCE_WEIGHTS) == SPEC_NAMES
     assert set(package) == set(reference) == set(SPEC_NAMES)
 
@@ -213,7 +219,7 @@ def test_names_equal_the_specification(random_comparison):
 def test_weights_equal_the_specification():
     config = EnvConfig().reward
     assert {name: getattr(config, name).weight for name in SPEC_NAMES} == REFERENCE_WEIGHTS
-    assert config == RewardConfig()
+    assert config == BounceReward()
 
 
 E = math.exp
@@ -333,7 +339,7 @@ PINNED_IDS = [f"{name}-{i}" for i, (name, _, _) in enumerate(PINNED)]
 @pytest.fixture(scope="module")
 def pinned_terms():
     """The package's terms for all hand-computed states, from one compilation."""
-    return evaluate(RewardConfig(), stack([inputs for _, inputs, _ in PINNED]))
+    return evaluate(BounceReward(), stack([inputs for _, inputs, _ in PINNED]))
 
 
 def test_every_term_has_hand_computed_values():
@@ -354,8 +360,8 @@ def test_reference_equals_hand_value(name, inputs, expected):
 
 def test_downward_velocity_takes_its_sign_from_the_weight():
     falling = state(vz=-1.0)
-    negated = RewardConfig(downward_velocity={"weight": -1.0})
-    rewarded = evaluate(RewardConfig(), falling)["downward_velocity"]
+    negated = BounceReward(downward_velocity={"weight": -1.0})
+    rewarded = evaluate(BounceReward(), falling)["downward_velocity"]
     penalised = evaluate(negated, falling)["downward_velocity"]
     assert rewarded > 0
     assert penalised == -rewarded
@@ -382,13 +388,13 @@ TWO_STATES = stack(
 @pytest.fixture(scope="module")
 def default_terms():
     """The default configuration's terms of `TWO_STATES`."""
-    return evaluate(RewardConfig(), TWO_STATES)
+    return evaluate(BounceReward(), TWO_STATES)
 
 
 @pytest.mark.parametrize("name", SPEC_NAMES)
 def test_weight_scales_only_its_term(name, default_terms):
     assert np.any(default_terms[name] != 0)
-    scaled = RewardConfig(**{name: {"weight": -3.0 * REFERENCE_WEIGHTS[name]}})
+    scaled = BounceReward(**{name: {"weight": -3.0 * REFERENCE_WEIGHTS[name]}})
     terms = evaluate(scaled, TWO_STATES)
     for other in SPEC_NAMES:
         factor = -3.0 if other == name else 1.0
@@ -398,32 +404,32 @@ def test_weight_scales_only_its_term(name, default_terms):
 # Gradients
 
 
-def reward(config: RewardConfig, inputs: RewardInputs):
-    return sum(weighted_terms(config, inputs).values())
+def reward(config: BounceReward, inputs: dict[str, jax.Array]):
+    return sum(terms_of(config, inputs).values())
 
 
 VARIED = ("ball_position", "ball_velocity", "paddle_position", "action", "joint_velocity")
 
 
-def directional_derivatives(inputs: RewardInputs, direction: RewardInputs):
+def directional_derivatives(inputs: dict[str, jax.Array], direction: dict[str, jax.Array]):
     """Derivatives [N] of the reward along a direction, by JAX and by central differences of the
     fourth order."""
     step = 3e-6
-    evaluate = jax.jit(jax.vmap(partial(reward, RewardConfig())))
+    evaluate = jax.jit(jax.vmap(partial(reward, BounceReward())))
 
     def reward_after(steps: float):
-        moved = {n: getattr(inputs, n) + steps * step * getattr(direction, n) for n in VARIED}
-        return evaluate(inputs._replace(**moved))
+        moved = {n: inputs[n] + steps * step * direction[n] for n in VARIED}
+        return evaluate(inputs | moved)
 
     by_difference = (
         8.0 * (reward_after(1.0) - reward_after(-1.0)) - (reward_after(2.0) - reward_after(-2.0))
     ) / (12.0 * step)
 
     def along(inputs, direction):
-        gradient = jax.grad(lambda varied: reward(RewardConfig(), inputs._replace(**varied)))(
-            {name: getattr(inputs, name) for name in VARIED}
+        gradient = jax.grad(lambda varied: reward(BounceReward(), inputs | varied))(
+            {name: inputs[name] for name in VARIED}
         )
-        return sum(jax.numpy.vdot(gradient[name], getattr(direction, name)) for name in VARIED)
+        return sum(jax.numpy.vdot(gradient[name], direction[name]) for name in VARIED)
 
     return jax.jit(jax.vmap(along))(inputs, direction), by_difference
 
@@ -436,8 +442,8 @@ def test_gradient_equals_finite_differences():
     states = states | {"n_bounces": states["n_bounces"].astype(np.float64)}
     direction = {name: rng.normal(size=states[name].shape) for name in VARIED}
     with jax.enable_x64(True):
-        inputs = RewardInputs(**{name: jax.numpy.asarray(x) for name, x in states.items()})
-        actual, expected = directional_derivatives(inputs, inputs._replace(**direction))
+        inputs = {name: jax.numpy.asarray(x) for name, x in states.items()}
+        actual, expected = directional_derivatives(inputs, inputs | direction)
         actual, expected = np.asarray(actual), np.asarray(expected)
     assert np.isfinite(actual).all()
     error = np.abs(actual - expected) / (1.0 + np.abs(expected))
@@ -458,7 +464,7 @@ def test_gradient_equals_finite_differences():
 )
 def test_gradient_is_finite_everywhere(at):
     with jax.enable_x64(True):
-        inputs = RewardInputs(**{name: jax.numpy.asarray(x[0], float) for name, x in at.items()})
-        gradient = jax.grad(lambda inputs: reward(RewardConfig(), inputs))(inputs)
-    for name, value in gradient._asdict().items():
+        inputs = {name: jax.numpy.asarray(x[0], float) for name, x in at.items()}
+        gradient = jax.grad(lambda inputs: reward(BounceReward(), inputs))(inputs)
+    for name, value in gradient.items():
         assert np.isfinite(value).all(), name

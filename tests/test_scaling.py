@@ -253,7 +253,7 @@ MESSAGES = """
 import functools, jax, re, sys
 from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, rows
-from bounce_mjx.task import vector
+from bounce_mjx.env import vector
 from bounce_mjx.training import devices
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.task import vector
+from bounce_mjx.env import vector
 
 NUM_ENVS = 4
 STEPS = 70
@@ -169,7 +169,7 @@ def test_end_starts_a_new_episode(limited):
         assert np.all(results.final_observation[t, :, 21] < -1)
         np.testing.assert_array_equal(results.observation[t, :, 19:25], 0)
         np.testing.assert_allclose(results.observation[t, :, 8], 0.45, atol=0.0101)
-        np.testing.assert_array_equal(after.env.pipeline_state.task.last_action, 0)
+        np.testing.assert_array_equal(after.env.pipeline_state.last_action, 0)
         np.testing.assert_array_equal(after.env.pipeline_state.task.n_bounces, 0)
         np.testing.assert_array_equal(results.episode_length[t], 25)
 

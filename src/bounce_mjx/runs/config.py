@@ -125,7 +125,8 @@ def train_config(task: type[Task], base: type[ConfigT] = TrainConfig) -> type[Co
 
 def runs_folder(task: type[Task]) -> Path:
     """Default folder of a task's runs."""
-    return Path("runs") / (task.folder or task.__name__.lower())
+    # A task that extends another one has a folder of its own.
+    return Path("runs") / (vars(task).get("folder") or task.__name__.lower())
 
 
 def load_run_config(run: Path, task: str | None = None) -> TrainConfig:

@@ -17,6 +17,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import rollout_metrics
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task import Curve
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.trainer import Metrics, Snapshot
 
@@ -41,6 +42,7 @@ class TorchTrainer:
                 "leave it out, or train with bounce-mjx train"
             )
         self.library = library
+        self._curves = env.task.curves
         self.mesh: Mesh = make_mesh(1, config.ppo)
         first = make_vector_env(config.ppo, env, config.seed)
         self.learners: list[Learner] = []
@@ -74,7 +76,7 @@ class TorchTrainer:
             parts.append([learner.learn(1) for learner in self.learners])
             if stopping():
                 break
-        blocks = [summarize(_joined(metrics), curves) for metrics in zip(*parts, strict=True)]
+        blocks = [summarize(_joined(metrics), self._curves) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
