@@ -90,7 +90,7 @@ def evaluation_figure(env: Env, recording: Recording) -> Figure:
             rows,
             2,
             width_ratios=(1.5, 1.0),
-            left=0.05,
+            left=0.06,
             right=0.985,
             top=1.0 - 0.34 / height,
             bottom=0.45 / height,

@@ -69,9 +69,9 @@ def robustness_table(report: RobustnessReport) -> Table:
         for name in letters
     ]
     table = Table(
-        title=f"{summary(report)} (* misses its bound)",
+        title=summary(report),
         title_justify="left",
-        caption=escape("\n".join(described)),
+        caption=escape("\n".join([*described, "*  misses its bound"])),
         caption_justify="left",
         box=box.SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
@@ -249,7 +249,8 @@ def _draw_legend(figure: Figure, height: float, letters: dict[str, str], framed:
     figure.colorbar(scale, cax=bar, orientation="horizontal", ticks=(0, 50, 75, 90, 100))
     bar.set_title("episodes until the time limit, %", fontsize=8)
     bar.tick_params(labelsize=8, length=0)
-    missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
+    first = next(iter(letters.values()))
+    missed = literal("   ".join(f"{letter} {name}" for name, letter in letters.items()))
     handles = [
         Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
         Line2D(

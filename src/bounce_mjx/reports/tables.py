@@ -123,7 +123,8 @@ def verdict(result: Result) -> str:
 def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
     details, own = report.details, _details(report)
-    texts = [f"{d.title} {short_text(d.value)} {d.unit}".rstrip() for d in own]
+    units = ["" if d.value is None else f" {d.unit}".rstrip() for d in own]
+    texts = [f"{d.title} {short_text(d.value)}{u}" for d, u in zip(own, units, strict=True)]
     means = [text for text, detail in zip(texts, own, strict=True) if detail.is_mean]
     others = [text for text in texts if text not in means]
     means += [f"return {details['mean_return']:.0f}", f"length {details['mean_length_s']:.2f} s"]
