@@ -41,10 +41,7 @@ ConfigT = TypeVar("ConfigT", bound=StrictModel)
 
 
 class TrainConfig(StrictModel):
-    """A training run: the task, the trainer, the length and the evaluations.
-
-    The settings of the environment are those of the task: `train_config` makes the class for one.
-    """
+    """A training run: the task, the trainer, the length and the evaluations."""
 
     task: str = DEFAULT
     """Name of the task, or FILE.py:CLASS for one of your own."""
