@@ -150,7 +150,7 @@ class _CommandControls:
         Args:
           value: the value that is set; None if it is drawn.
         """
-        start = 0.5 * (command.low + command.high) if value is None else value
+        start = round(0.5 * (command.low + command.high), 6) if value is None else value
         ends = (command.low, command.high, start, *(command.span or ()))
         self._limits = float(min(ends)), float(max(ends))
         self._step = command.step
