@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import train_config
+from bounce_mjx.tasks.registry import DEFAULT, find_task
 
 _HEAD = """# Config reference
 
-Every setting of a training run. A YAML file (`--config FILE`, see [training](training.md)) holds
+Every setting of a training run of the task bounce; [another task](write-a-task.md) has other
+keys in `env`. A YAML file (`--config FILE`, see [training](training.md)) holds
 the keys as nested groups. Each key is also a flag of `train_jax.py`, and the flag wins over the
 file. Unknown keys and values out of range are refused.
 
@@ -37,6 +39,8 @@ These rules concern several keys:
 - `ppo.critic_metrics` names metrics of the environment.
 """
 
+_CONFIG = train_config(find_task(DEFAULT))
+
 # In the description of a key, the unit follows a comma, at the end or before an addition.
 _UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces)(?=[.;]| \()")
 
@@ -48,7 +52,7 @@ def main() -> None:
 
 def reference() -> str:
     """The whole page, Markdown."""
-    return _HEAD + "".join(_section(model, prefix) for model, prefix in _groups(TrainConfig, ""))
+    return _HEAD + "".join(_section(model, prefix) for model, prefix in _groups(_CONFIG, ""))
 
 
 def flag(key: str) -> str:

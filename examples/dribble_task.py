@@ -1,7 +1,4 @@
-"""Dribbling as a task of one's own (docs/write-a-task.md): many low bounces.
-
-bounce-mjx train --task examples/dribble_task.py:Dribble
-"""
+"""Dribbling as a task of one's own (docs/write-a-task.md): many low bounces."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -11,6 +8,20 @@ import jax.numpy as jnp
 
 from bounce_mjx import task
 
+REST = 0.0225
+"""Height of the ball's centre over the paddle's while they touch, m."""
+
+
+class Inputs(NamedTuple):
+    """What the reward terms depend on."""
+
+    reach: jax.Array
+    """Height over the paddle that the ball's energy allows [], m."""
+    target: jax.Array
+    """Wished height [], m."""
+    distance: jax.Array
+    """Horizontal distance of the ball from its start [], m."""
+
 
 class ApexReward(task.RewardTerm):
     """Apex: the ball's energy is that of a bounce to the wished height."""
@@ -18,9 +29,9 @@ class ApexReward(task.RewardTerm):
     weight: float = 4.0
     """Weight of the term."""
     scale: float = 0.02
-    """Width of the Gaussian of the height that the ball can reach, m."""
+    """Width of the Gaussian, m."""
 
-    def value(self, inputs: "Inputs") -> jax.Array:
+    def value(self, inputs: Inputs) -> jax.Array:
         return task.gaussian(inputs.reach - inputs.target, self.scale)
 
 
@@ -30,9 +41,9 @@ class CentreReward(task.RewardTerm):
     weight: float = 2.0
     """Weight of the term."""
     scale: float = 0.05
-    """Width of the Gaussian of the horizontal distance, m."""
+    """Width of the Gaussian, m."""
 
-    def value(self, inputs: "Inputs") -> jax.Array:
+    def value(self, inputs: Inputs) -> jax.Array:
         return task.gaussian(inputs.distance, self.scale)
 
 
@@ -51,7 +62,7 @@ class Observation(task.ObservationConfig):
 
 
 class Config(task.WorldConfig):
-    """The world, with a ball that starts low, and the task of dribbling."""
+    """The world, with a ball that starts low, and the settings of dribbling."""
 
     ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.15)
     """Ball position at a reset, before noise, m."""
@@ -67,52 +78,31 @@ class Config(task.WorldConfig):
         return {"apex": task.Command(*self.apex_range, "m", least=0.01, span=(0.05, 0.1))}
 
 
-class State(NamedTuple):
-    """What is kept of an episode."""
-
-    rising: jax.Array
-    """Whether the ball rose after the last step [], bool."""
-
-
-class Inputs(NamedTuple):
-    """What the reward terms depend on."""
-
-    reach: jax.Array
-    """Height over the paddle that the ball's energy allows [], m."""
-    target: jax.Array
-    """Wished height [], m."""
-    distance: jax.Array
-    """Horizontal distance of the ball from its start [], m."""
-
-
 class Dribble(task.Task):
     """Many low bounces: apexes 5 to 10 cm over the paddle, more than three a second, for 20 s."""
 
     Config = Config
     curves = (task.Curve("task/apex_error", "apex_error", "apexes", "|apex − wish|, cm", 100.0),)
-    rest = 0.0225
-    """Height of the ball's centre over the paddle's while they touch, m."""
 
-    def reset(self, start: task.Start) -> State:
-        return State(jnp.zeros((), bool))
+    def reset(self, start: task.Start) -> jax.Array:
+        # The task's state: whether the ball rose after the last step.
+        return jnp.zeros((), bool)
 
-    def step(self, state: State, step: task.Step) -> task.TaskStep:
-        ball, velocity = step.truth.ball_position, step.truth.ball_velocity
-        height = ball[2] - step.truth.paddle_position[2] - self.rest
-        rising = velocity[2] > 0.0
-        apexes = state.rising & ~rising
+    def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
+        ball, speed = step.truth.ball_position, step.truth.ball_velocity[2]
+        height = ball[2] - step.truth.paddle_position[2] - REST
         distance = task.horizontal_distance(ball, self.config.ball_init_pos)
-        reach = height + jnp.square(velocity[2]) / (2.0 * 9.81)
-        inputs = Inputs(reach, step.command["apex"], distance)
-        error = jnp.abs(height - step.command["apex"])
+        wish = step.command["apex"]
+        inputs = Inputs(height + jnp.square(speed) / (2.0 * 9.81), wish, distance)
+        apex = rose & (speed <= 0.0)
         return task.TaskStep(
-            state=State(rising),
+            state=speed > 0.0,
             reward=task.weighted_terms(self.config.reward, inputs),
             ended=(height < -0.03) | (height > 0.5) | (distance > 0.2),
             metrics={
-                "apexes": apexes,
-                "apex_error": jnp.where(apexes, error, 0.0),
-                "low_apexes": apexes & (height > 0.05) & (height < 0.1),
+                "apexes": apex,
+                "apex_error": jnp.where(apex, jnp.abs(height - wish), 0.0),
+                "low_apexes": apex & (height > 0.05) & (height < 0.1),
             },
         )
 
@@ -122,16 +112,9 @@ class Dribble(task.Task):
         return task.Tally({**counted, "seconds": settled * self.config.control_dt})
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        sums = episodes.sums
+        apexes, low, seconds = (episodes.sums[n] for n in ("apexes", "low_apexes", "seconds"))
         return (
-            task.share_of_events(
-                "height", "apexes 5 to 10 cm high", sums["low_apexes"], sums["apexes"], 0.95
-            ),
-            task.mean_of_events(
-                "rate", "apexes a second", sums["apexes"], sums["seconds"], (3.0, math.inf)
-            ),
+            task.share_of_events("height", "apexes 5 to 10 cm high", low, apexes, 0.95),
+            task.mean_of_events("rate", "apexes a second", apexes, seconds, (3.0, math.inf)),
             task.share_of_episodes("stable", "episodes that last 20 s", episodes.lasted, 0.99),
         )
-
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
-        return {"apex": f"{100.0 * command['apex']:.1f} cm"}

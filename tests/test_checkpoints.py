@@ -19,7 +19,6 @@ import pytest
 import tensorstore
 
 import bounce_mjx
-from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
@@ -30,7 +29,7 @@ from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.reading import load_policy, load_training_state
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce import BounceBall, BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

@@ -15,6 +15,8 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from bounce_mjx.task.observation import QUANTITIES, Kinematics
+from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.commands import export as export_command
@@ -33,8 +35,6 @@ from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.task.observation import QUANTITIES, Kinematics
-from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))

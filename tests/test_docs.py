@@ -1,6 +1,7 @@
 """The documentation: links resolve, commands and flags exist, and quotations are true."""
 
 import ast
+import dataclasses
 import functools
 import importlib
 import inspect
@@ -9,7 +10,6 @@ import re
 import runpy
 import shlex
 import sys
-import types
 from pathlib import Path
 
 import jax
@@ -31,10 +31,11 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task import rewards
-from bounce_mjx.world.randomization import TERMS
-from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
+from bounce_mjx.task import term_names, weighted_terms
+from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
+from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 REFERENCE = runpy.run_path(str(CHECKOUT / "docs/config_reference.py"))["reference"]()
@@ -297,9 +298,9 @@ def test_map_has_every_folder_of_the_package() -> None:
 def test_task_page_has_the_weights() -> None:
     page = content("task.md")
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| `", page, re.MULTILINE)
-    defaults = RewardConfig()
+    defaults = BounceReward()
     assert {name: float(weight) for name, weight in rows} == {
-        name: getattr(defaults, name).weight for name in TERM_NAMES
+        name: getattr(defaults, name).weight for name in term_names(BounceReward)
     }
 
 
@@ -376,23 +377,21 @@ def test_files_on_pages_are_configs(page: str) -> None:
         TrainConfig.model_validate(yaml.safe_load(file))
 
 
-def test_new_term_of_the_rewards_page_is_a_term(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's code, at its place in the module."""
+def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
+    """The page's code, as a file of the user's."""
     (example,) = examples("rewards.md", "python")
-    before, mark, after = Path(rewards.__file__).read_text().partition("class SharedRewardConfig(")
-    module = types.ModuleType("rewards_with_a_new_term")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec(compile(f"{before}{example}\n\n{mark}{after}", "rewards.md", "exec"), vars(module))
-
-    config = module.RewardConfig(sideways_velocity={"weight": 2.0})
-    inputs = {name: np.zeros(3) for name in module.RewardInputs._fields}
+    (tmp_path / "straight.py").write_text(example)
+    task = find_task(f"{tmp_path}/straight.py:Straight")
+    config = task.Config(reward={"sideways_velocity": {"weight": 2.0}}).reward
+    names = [field.name for field in dataclasses.fields(RewardInputs) if field.name != "home"]
+    inputs = {name: np.zeros(3) for name in names}
     inputs |= {"n_bounces": np.zeros(()), "target_height": np.zeros(())}
     inputs |= {"ball_velocity": np.array([3.0, 4.0, 1.0]), "bounced": np.array(False)}
     for height, expected in ((0.3, -2.0 * 25.0), (0.05, 0.0)):  # flying, and at the paddle
         inputs["ball_position"] = np.array([0.0, 0.0, height])
-        terms = module.weighted_terms(config, module.RewardInputs(**inputs))
+        terms = weighted_terms(config, RewardInputs(**inputs, home=config))
         assert float(terms["sideways_velocity"]) == pytest.approx(expected)
-    assert terms.keys() == {*TERM_NAMES, "sideways_velocity"}
+    assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
 
 
 @pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md", "jax.md"])

@@ -10,7 +10,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bounce_mjx import BounceBall
-from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.deploy.export import describe
 from bounce_mjx.deploy.histories import Histories
 from bounce_mjx.gpu.scalars import as_scalars
@@ -19,6 +18,7 @@ from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.world.ball_filter import BallFilter, Constants
 from bounce_mjx.world.estimator import Estimator, filter_constants
 from bounce_mjx.world.sensing import Picture
@@ -28,7 +28,7 @@ OBSERVATION = BounceConfig().layout
 BALLS, STEPS, DT = 8, 500, 0.01
 SEEN = {"ball_position": 1, "ball_velocity": 1}
 ENV = {
-    "observation": dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
+    "observation": dict.fromkeys(BounceConfig().observation.quantities(), 0)
     | SEEN
     | {"position": "filter", "velocity": "filter"},
     "randomization": {

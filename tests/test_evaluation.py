@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bounce_mjx.task.env import Memory
+from bounce_mjx.task.observation import OBSERVATION
+from bounce_mjx.task.state import State
 from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
@@ -27,9 +30,6 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task.env import Memory
-from bounce_mjx.task.observation import OBSERVATION
-from bounce_mjx.task.state import State
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856

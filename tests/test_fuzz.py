@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.config.command_line import _flags, parse
+from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
@@ -23,8 +23,8 @@ from bounce_mjx.runs.config import TrainConfig, load_config
 from bounce_mjx.training.command import config_of
 from tiny_runs import contents
 
-FLAGS = sorted(_flags(train_command.TrainCommand))
-EVAL_FLAGS = sorted(_flags(eval_command.EvalCommand))
+FLAGS = sorted(flags_of(train_command.TrainCommand))
+EVAL_FLAGS = sorted(flags_of(eval_command.EvalCommand))
 
 
 @pytest.fixture(scope="module")

@@ -230,7 +230,7 @@ def test_wrong_arguments_give_one_sentence(opengl, arguments, sentence):
 
 
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
-    single, vector = environments.BounceBallEnv(), make_vec()
+    single, vector = environments.TaskEnv(), make_vec()
     for env in (single, vector):
         with pytest.raises(gymnasium.error.ResetNeeded, match="before its reset"):
             env.step(env.action_space.sample())
@@ -374,7 +374,7 @@ def test_rendering_failure_gives_one_sentence(monkeypatch):
 
 
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
-    env = environments.BounceBallEnv()
+    env = environments.TaskEnv()
     monkeypatch.setattr(batch, "_jax_process", 1)
     with pytest.raises(UserError, match='context="forkserver"'):
         env.reset()

@@ -11,7 +11,6 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo.networks import make_ppo_networks
 from brax.training.distribution import NormalDistribution
 
-from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.networks import orthogonal
@@ -24,6 +23,7 @@ from bounce_mjx.learning.statistics import (
     normalize,
     update,
 )
+from bounce_mjx.tasks.bounce import BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.env import vector
+from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
@@ -13,8 +15,7 @@ from bounce_mjx.learning import policy, ppo
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import normalize
-from bounce_mjx.env import vector
-from bounce_mjx.env.state import State
+from bounce_mjx.task import Task
 
 OBSERVATION = EnvConfig().layout
 
@@ -191,6 +192,7 @@ class TwoStates:
     observation_size = 2
     action_size = 1
     backend = "none"
+    task = Task
 
     def __init__(self, first_reward: float, terminates: bool = False, hidden: bool = False):
         """Leaving the first state pays `first_reward`, leaving the second one pays 1 and

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from bounce_mjx.task.env import TaskState
+from bounce_mjx.task.observation import OBSERVATION, Kinematics
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
@@ -13,8 +15,6 @@ from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.task.env import TaskState
-from bounce_mjx.task.observation import OBSERVATION, Kinematics
 
 EPISODES, RECORDED = 6, 4
 

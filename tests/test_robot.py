@@ -16,7 +16,6 @@ from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.results import HOME_HEIGHT, _speed_result
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
@@ -25,6 +24,8 @@ from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, load_model
 from bounce_mjx.runs.config import load_config, read_preset
+from bounce_mjx.task import Episodes, Result
+from bounce_mjx.tasks.bounce import HOME_HEIGHT, Bounce
 from bounce_mjx.viewers.controllers import make_scripted_controller
 from random_worlds import random_parameters
 from test_parameters import assert_same_step, c_steps, uncompiled_steps
@@ -549,15 +550,24 @@ def test_an_adopted_config_gives_the_same_model_again(written) -> None:
     assert fingerprint(again[0]) == fingerprint(again[1])
 
 
+def speed_result(config: EnvConfig, low: float, high: float) -> Result:
+    """The result of a ball that rises at 1 m/s, with target heights from `low` to `high`."""
+    names = "settled_steps centred_steps settled_bounces accurate_bounces rising_steps rising_speed"
+    one = np.ones(1)
+    sums, commands = dict.fromkeys(names.split(), one), {"target_height": (low, high)}
+    results = Bounce(config).results(Episodes(sums, {"n_bounces": one}, one > 0, commands))
+    return next(result for result in results if result.name == "upward speed")
+
+
 def test_speed_is_judged_at_targets_above_the_arms_own_home(written) -> None:
     """As for the package's own arm, whose config judges it too; higher targets are not judged."""
     config = load_config(written["small"]).env
     low, high = config.target_height_range
     home = config.reward.paddle_home_height
     assert home != HOME_HEIGHT
-    assert _speed_result((1.0, 0.0), (low, high), home).passed
-    assert _speed_result((1.0, 0.0), (low, high + 0.1), home).passed is None
-    assert _speed_result((1.0, 0.0), (0.4, 0.6), HOME_HEIGHT).passed
+    assert speed_result(config, low, high).passed
+    assert speed_result(config, low, high + 0.1).passed is None
+    assert speed_result(EnvConfig(), 0.4, 0.6).passed
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:

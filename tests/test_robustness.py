@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
+from bounce_mjx.task.randomization import TERMS, RandomizationConfig
 from matplotlib.patches import Rectangle
 from rich.console import Console
 
@@ -28,7 +29,6 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.randomization import TERMS, RandomizationConfig
 
 RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
+from bounce_mjx.env import vector
 from bounce_mjx.gpu import elementwise, rows
 from bounce_mjx.gpu.rows import Rows
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
-from bounce_mjx.env import vector
 
 # Not a multiple of the block size.
 BATCH = 70

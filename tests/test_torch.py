@@ -34,11 +34,11 @@ from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
 from bounce_mjx.adapters.torch.skrl_ppo import SkrlEnv
 from bounce_mjx.adapters.torch.trainer import make_learner, summarize
+from bounce_mjx.env import vector
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
-from bounce_mjx.env import vector
 
 NUM_ENVS = 4
 # Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 import viser
 import zstandard
+from bounce_mjx.task.randomization import RandomizationConfig
 from rich.console import Console
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -39,7 +40,6 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.randomization import RandomizationConfig
 from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser

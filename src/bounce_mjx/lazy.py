@@ -8,10 +8,14 @@ printed, without the seconds that JAX takes to import. Such a module has
 import importlib
 import importlib.abc
 import importlib.machinery
+import importlib.util
 import sys
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
+
+
+Hook = Callable[[types.ModuleType], None]
 
 
 class _Lazy(types.ModuleType):
@@ -24,32 +28,45 @@ class _Lazy(types.ModuleType):
 def silence_mjx() -> None:
     """Lets a later import of MJX print nothing; otherwise it prints a line for each optional
     package that is missing. The output of other threads is left alone."""
-    if _SILENCED not in sys.modules:
-        sys.meta_path.insert(0, _SilentMJX())
+
+    def give_silent_print(module: types.ModuleType) -> None:
+        module.print = lambda *_, **__: None
+
+    around_import("mujoco.mjx.warp", before=give_silent_print)
 
 
-_SILENCED = "mujoco.mjx.warp"
+def around_import(name: str, before: Hook | None = None, after: Hook | None = None) -> None:
+    """Lets the first import of a module call functions with it, before and after its own code; does
+    nothing if it is already imported."""
+    if name not in sys.modules:
+        sys.meta_path.insert(0, _AroundImport(name, before, after))
 
 
-class _SilentMJX(importlib.abc.MetaPathFinder):
-    """Gives the module of MJX that prints a `print` of its own."""
+class _AroundImport(importlib.abc.MetaPathFinder):
+    """Finds nothing itself, and changes the loader of one module."""
+
+    def __init__(self, name: str, before: Hook | None, after: Hook | None):
+        self._name, self._before, self._after = name, before, after
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """The module's own spec, with a loader that first replaces `print`."""
-        if fullname != _SILENCED:
+        """The module's own spec."""
+        if fullname != self._name:
             return None
         sys.meta_path.remove(self)
-        spec = importlib.machinery.PathFinder.find_spec(fullname, path)
+        spec = importlib.util.find_spec(fullname)
         if spec is not None and spec.loader is not None:
             load = spec.loader.exec_module
 
-            def load_silently(module: types.ModuleType) -> None:
-                module.print = lambda *_, **__: None
+            def load_between(module: types.ModuleType) -> None:
+                if self._before is not None:
+                    self._before(module)
                 load(module)
+                if self._after is not None:
+                    self._after(module)
 
-            spec.loader.exec_module = load_silently
+            spec.loader.exec_module = load_between
         return spec
 
 
@@ -61,4 +78,4 @@ if TYPE_CHECKING:
 else:
     jax, jnp, mujoco, np = map(_Lazy, ("jax", "jax.numpy", "mujoco", "numpy"))
 
-__all__ = ["jax", "jnp", "mujoco", "np", "silence_mjx"]
+__all__ = ["around_import", "jax", "jnp", "mujoco", "np", "silence_mjx"]

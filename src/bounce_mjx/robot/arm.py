@@ -28,7 +28,7 @@ MIN_JOINTS = 3
 _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 _HIDDEN_GROUP = 3
-_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "target_height")
+_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball")
 _RESERVED += ("paddle_home",)
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _SILENCE = threading.Lock()

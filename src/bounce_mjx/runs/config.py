@@ -41,10 +41,7 @@ ConfigT = TypeVar("ConfigT", bound=StrictModel)
 
 
 class TrainConfig(StrictModel):
-    """A training run: the task, the trainer, the length and the evaluations.
-
-    The settings of the environment are those of the task: `train_config` makes the class for one.
-    """
+    """A training run: the task, the trainer, the length and the evaluations."""
 
     task: str = DEFAULT
     """Name of the task, or FILE.py:CLASS for one of your own."""
@@ -125,7 +122,8 @@ def train_config(task: type[Task], base: type[ConfigT] = TrainConfig) -> type[Co
 
 def runs_folder(task: type[Task]) -> Path:
     """Default folder of a task's runs."""
-    return Path("runs") / (task.folder or task.__name__.lower())
+    # A task that extends another one has a folder of its own.
+    return Path("runs") / (vars(task).get("folder") or task.__name__.lower())
 
 
 def load_run_config(run: Path, task: str | None = None) -> TrainConfig:

@@ -9,8 +9,7 @@ from bounce_mjx.runs.config import TrainConfig, load_config
 def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
     """Keyword arguments of brax's `ppo.train`, from a config or `configs/default.yaml`.
 
-    brax's trainer lacks the bounce count as an input of the value network and the decay of the
-    learning rate.
+    brax's trainer lacks `critic_metrics` and the decay of the learning rate.
     """
     config = config or load_config(resource_path("configs/default.yaml"))
     ppo = config.ppo

@@ -76,9 +76,7 @@ class TorchTrainer:
             parts.append([learner.learn(1) for learner in self.learners])
             if stopping():
                 break
-        blocks = [
-            summarize(_joined(metrics), self._curves) for metrics in zip(*parts, strict=True)
-        ]
+        blocks = [summarize(_joined(metrics), self._curves) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
