@@ -36,9 +36,9 @@ RESULT = r"rests +episodes"
 # A ball that hits something in the physics of the world; a default or an example in a sentence for
 # users; and the keys of older files.
 ALLOWED = {
-    "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py", "commands/train_torch.py",
-    "commands/run_options.py", "physics/convergence.py", "physics/mjx_engine.py", "robot/pose.py",
-    "task/results.py", "task/shown.py", "world/ball_filter.py", "world/observation.py",
+    "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py",
+    "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
+    "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py", "world/ball_filter.py", "world/observation.py",
 }  # fmt: skip
 
 
@@ -121,8 +121,8 @@ def test_a_task_without_events_goes_through_every_command(
     assert re.search(RESULT, said) and "report:" in said
     (folder,) = (tmp_path / "runs" / "rest").iterdir()
     assert "rests" in (folder / "report.html").read_text(encoding="utf-8")
-    said = command("train", *task, "--resume", str(folder), "--total-steps", "256", "--no-report")
-    assert "resum" in said
+    command("train", *task, "--resume", str(folder), "--total-steps", "256", "--no-report")
+    assert '"trained_steps": 256' in (folder / "results.json").read_text(encoding="utf-8")
     assert re.search(RESULT, command("eval", *task, "--episodes", "4"))
     assert re.search(RESULT, command("eval", *task, "--episodes", "4", "--physics", "mujoco"))
     suite = tmp_path / "suite.yaml"
@@ -289,4 +289,4 @@ def test_a_robot_serves_another_task() -> None:
     env = Env(config)
     truth = env.kinematics(jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state)
     above = np.asarray(truth.ball_position - truth.paddle_position)
-    np.testing.assert_allclose(above, [0.0, 0.0, 0.1], atol=0.08)
+    np.testing.assert_allclose(above, [0.0, 0.0, 0.2], atol=0.08)
