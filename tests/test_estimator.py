@@ -292,9 +292,10 @@ def test_the_estimator_fits_into_a_gpu_kernel() -> None:
     config = BounceConfig(**ENV)
     estimator = Estimator(config, load_model(None, 0.001), None)
     ball, plane = jnp.zeros(3), jnp.zeros(4)
-    start = estimator.start(ball, plane)
     picture = Picture(ball, ball, jnp.zeros(()), jnp.zeros(()))
-    args, tree = jax.tree.flatten((start, {"ball_latency": jnp.zeros(())}, picture, picture, plane))
+    world = {"ball_latency": jnp.zeros(())}
+    start = estimator.start(picture, world, plane)
+    args, tree = jax.tree.flatten((start, world, picture, picture, plane))
 
     def flat(*args):
         return jax.tree.leaves(estimator.next(*tree.unflatten(args)))
