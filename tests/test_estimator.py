@@ -53,7 +53,7 @@ class Watched(NamedTuple):
 
 @pytest.fixture(scope="module")
 def env() -> BounceBall:
-    return BounceBall(TrainConfig(env=ENV).env)
+    return BounceBall(BounceConfig(**ENV))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_filtered_velocity_is_several_times_better_than_differences(env, watched
 
 def test_numpy_equals_the_environment(env, watched) -> None:
     """A robot's histories, from the same measurements."""
-    metadata = policy_metadata(TrainConfig(env=ENV), 0)
+    metadata = policy_metadata(TrainConfig(env=BounceConfig(**ENV)), 0)
 
     def measured(ball: int, t: int) -> dict[str, np.ndarray]:
         return {
@@ -141,7 +141,7 @@ def test_numpy_equals_the_environment(env, watched) -> None:
 
 def test_metadata_has_the_constants_of_the_filter() -> None:
     settings = {"restitution": 0.8, "latency": 0.015, "air_drag": 0.1}
-    metadata = policy_metadata(TrainConfig(env=ENV | {"estimator": settings}), 0)
+    metadata = policy_metadata(TrainConfig(env=BounceConfig(**(ENV | {"estimator": settings}))), 0)
     assert (metadata.position, metadata.velocity) == ("filter", "filter")
     assert settings.items() <= metadata.estimator._asdict().items()
     # Half the paddle's thickness and the ball's radius.
@@ -152,7 +152,9 @@ def test_metadata_has_the_constants_of_the_filter() -> None:
 
 def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
     """Every position differs, so that each is a new picture."""
-    metadata = policy_metadata(TrainConfig(env=ENV | {"estimator": {"latency": 0.02}}), 0)
+    metadata = policy_metadata(
+        TrainConfig(env=BounceConfig(**(ENV | {"estimator": {"latency": 0.02}}))), 0
+    )
     angles = np.array(metadata.default_joint_angles)
 
     def estimates(stamp: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -174,7 +176,7 @@ def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
 def test_measurements_of_missed_steps_are_no_pictures() -> None:
     """A late call fills the missed control steps with interpolated measurements; to the filter, the
     last picture is still the newest."""
-    metadata = policy_metadata(TrainConfig(env=ENV), 0)
+    metadata = policy_metadata(TrainConfig(env=BounceConfig(**ENV)), 0)
     angles = np.array(metadata.default_joint_angles)
 
     def measured(height: float, age: float) -> dict[str, np.ndarray]:
@@ -196,7 +198,7 @@ def test_a_stated_latency_replaces_the_true_one(mj_model) -> None:
     picture = Picture(*map(jnp.array, (0.0, 0.0, 0.017, 0.0)))
     world = {"ball_latency": jnp.array(0.013)}
     for stated, expected in ((None, 0.017), (0.02, 0.024)):
-        config = TrainConfig(env=ENV | {"estimator": {"latency": stated}}).env
+        config = BounceConfig(**(ENV | {"estimator": {"latency": stated}}))
         age = Estimator(config, mj_model, None).age(picture, world)
         assert age == pytest.approx(expected)
 
@@ -205,7 +207,7 @@ def test_a_stated_latency_replaces_the_true_one(mj_model) -> None:
 
 
 def constants(**changes) -> Constants:
-    return filter_constants(TrainConfig(env=ENV).env, load_model(None, 0.001))._replace(**changes)
+    return filter_constants(BounceConfig(**ENV), load_model(None, 0.001))._replace(**changes)
 
 
 def repeat(count, function, start):
@@ -287,12 +289,13 @@ def test_a_ball_beside_the_paddle_is_not_pushed() -> None:
 
 def test_the_estimator_fits_into_a_gpu_kernel() -> None:
     """With an operation that kernels lack, the whole step would be compiled by XLA."""
-    config = TrainConfig(env=ENV).env
+    config = BounceConfig(**ENV)
     estimator = Estimator(config, load_model(None, 0.001), None)
     ball, plane = jnp.zeros(3), jnp.zeros(4)
-    start = estimator.start(ball, plane)
     picture = Picture(ball, ball, jnp.zeros(()), jnp.zeros(()))
-    args, tree = jax.tree.flatten((start, {"ball_latency": jnp.zeros(())}, picture, picture, plane))
+    world = {"ball_latency": jnp.zeros(())}
+    start = estimator.start(picture, world, plane)
+    args, tree = jax.tree.flatten((start, world, picture, picture, plane))
 
     def flat(*args):
         return jax.tree.leaves(estimator.next(*tree.unflatten(args)))

@@ -144,8 +144,8 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
         ),
-        servo_stiffness=_plain(m.actuator_gainprm[servos, 0] * gear**2),
-        servo_damping=_plain(-m.actuator_biasprm[servos, 2] * gear**2),
+        servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
+        servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
         torque_limits=tuple(
             float(high * g) if is_limited else None
             for high, g, is_limited in zip(
@@ -170,10 +170,6 @@ def _inputs(env: WorldConfig) -> tuple[Input, ...]:
         Input(_INPUT_NAMES.get(part.name, part.name), histories[part.name], part.size, part.unit)
         for part in env.observation.parts(env.num_joints)
     )
-
-
-def _plain(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
 
 
 def _hinges(
@@ -202,16 +198,16 @@ def _hinges(
             links.append(
                 Hinge(
                     joint=addresses.arm_joints.index(joint),
-                    position=_plain(position + _rotated(anchor, quaternion)),
-                    quaternion=_plain(quaternion),
-                    axis=_plain(m.jnt_axis[joint]),
+                    position=tuple((position + _rotated(anchor, quaternion)).tolist()),
+                    quaternion=tuple(quaternion.tolist()),
+                    axis=tuple(m.jnt_axis[joint].tolist()),
                     reference=float(m.qpos0[m.jnt_qposadr[joint]]),
                 )
             )
             position, quaternion = -anchor, np.array([1.0, 0.0, 0.0, 0.0])
     centre = position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion)
     normal = _rotated(paddle_normal(m, default_joint_angles), quaternion)
-    return tuple(links), _plain(centre), _plain(normal)
+    return tuple(links), tuple(centre.tolist()), tuple(normal.tolist())
 
 
 def _rotated(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

@@ -78,27 +78,22 @@ def onnx_graph(
     Raises:
       UserError: the function uses an operation without a counterpart, or onnx is not installed.
     """
-    with needed("onnx", EXTRA):
-        from onnx import helper
-    closed, outputs = jax.make_jaxpr(function, return_shape=True)(inputs)
     graph = _Graph(owner)
+    closed, outputs = jax.make_jaxpr(function, return_shape=True)(inputs)
     # JAX sorts the names of a dict.
     results = graph.run(closed.jaxpr, closed.consts, sorted(inputs))
     for name, result in zip(sorted(outputs), results, strict=True):
         graph.node("Identity", result, output=name)
     used = {name for node in graph.nodes for name in node.input}
-
-    def tensor(name: str, row: jax.ShapeDtypeStruct) -> Any:
-        dtype = helper.np_dtype_to_tensor_dtype(np.dtype(row.dtype))
-        return helper.make_tensor_value_info(name, dtype, ["N", *row.shape])
-
-    return helper.make_graph(
-        graph.nodes,
-        "policy",
-        [tensor(name, row) for name, row in inputs.items() if name in used],
-        [tensor(name, row) for name, row in outputs.items()],
-        list(graph.constants.values()),
-    )
+    tensors = [
+        [
+            graph.helper.make_tensor_value_info(name, graph.code(row.dtype), ["N", *row.shape])
+            for name, row in group.items()
+        ]
+        for group in ({name: inputs[name] for name in inputs if name in used}, outputs)
+    ]
+    constants = list(graph.constants.values())
+    return graph.helper.make_graph(graph.nodes, "policy", *tensors, constants)
 
 
 def _equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
@@ -124,8 +119,8 @@ def _axes(equation: JaxprEqn) -> list[int]:
 class _Graph:
     def __init__(self, owner: str):
         with needed("onnx", EXTRA):
-            import onnx
-        self._onnx, self._owner = onnx, owner
+            from onnx import helper, numpy_helper
+        self.helper, self._from_array, self._owner = helper, numpy_helper.from_array, owner
         self.nodes: list[Any] = []
         self.constants: dict[tuple, Any] = {}
 
@@ -211,20 +206,24 @@ class _Graph:
         """Name of a node's output."""
         output = output or f"{kind}_{len(self.nodes)}"
         names = [value if isinstance(value, str) else self._constant(value) for value in inputs]
-        make_node = self._onnx.helper.make_node
-        self.nodes.append(make_node(kind, names, [output], name=output, **attributes))
+        made = self.helper.make_node(kind, names, [output], name=output, **attributes)
+        self.nodes.append(made)
         return output
 
     def _constant(self, value: np.ndarray) -> str:
         key = value.dtype, value.shape, value.tobytes()
         if key not in self.constants:
             name = f"constant_{len(self.constants)}"
-            self.constants[key] = self._onnx.numpy_helper.from_array(np.array(value), name)
+            self.constants[key] = self._from_array(np.array(value), name)
         return self.constants[key].name
 
     def cast(self, x: Value, dtype: Any) -> str:
         """An array as another type."""
-        return self.node("Cast", x, to=self._onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+        return self.node("Cast", x, to=self.code(dtype))
+
+    def code(self, dtype: Any) -> int:
+        """ONNX's number of a type."""
+        return self.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
     def reduced(self, kind: str, equation: JaxprEqn, x: Value) -> str:
         """Least (Min) or greatest (Max) entries."""

@@ -22,7 +22,7 @@ _TYPES = {_FLOAT: np.float32, "tensor(int32)": np.int32, "tensor(bool)": np.bool
 _LARGEST_MEMORY = 1_000_000
 
 
-class Network:
+class OnnxNetwork:
     """A network and its memory: what the output `next/<name>` gives is the input `<name>` of the
     next step."""
 

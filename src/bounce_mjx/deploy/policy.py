@@ -7,7 +7,7 @@ import numpy as np
 
 from bounce_mjx.deploy.histories import Histories, Measurements
 from bounce_mjx.deploy.metadata import UNITS, Metadata, measurement_sizes
-from bounce_mjx.deploy.network import Network
+from bounce_mjx.deploy.network import OnnxNetwork
 from bounce_mjx.errors import MissingPackage, UserError
 
 _MAX_PAUSE = 1.0
@@ -33,7 +33,7 @@ class DeployedPolicy:
           UserError: the file is not a policy from `bounce-mjx export`, or onnxruntime is missing.
         """
         try:
-            self._network = Network(model)
+            self._network = OnnxNetwork(model)
             self.metadata: Metadata = self._network.metadata
             self.units = UNITS | {
                 name: c.unit or "no unit" for name, c in self.metadata.commands.items()
