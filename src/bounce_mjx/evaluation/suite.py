@@ -207,6 +207,7 @@ def _condition(
         config = trained.randomization
         n = trained.num_joints
         ranges = {name: _shaped(name, n, *getattr(config, name)) for name in config.terms}
+        ranges |= {name: _shaped(name, n, c.low, c.high) for name, c in trained.commands.items()}
     else:
         ranges = {
             term: _bounds(term, trained.num_joints, entry, value, source)
