@@ -25,7 +25,6 @@ import numpy as np
 import pytest
 import viser
 import zstandard
-from bounce_mjx.task.randomization import RandomizationConfig
 from rich.console import Console
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -40,7 +39,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.task.rewards import TERM_NAMES, RewardConfig
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
 from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
 from bounce_mjx.viewers.controllers import (
@@ -50,28 +50,39 @@ from bounce_mjx.viewers.controllers import (
     make_zero_controller,
 )
 from bounce_mjx.viewers.controls import direction
-from bounce_mjx.viewers.display import (
-    HOME_EDGES,
-    HOME_SITE,
-    TARGET_SITE,
-    Display,
-    _primitive,
-    body_scenes,
-)
+from bounce_mjx.viewers.display import Display, _primitive, body_scenes
 from bounce_mjx.viewers.offscreen import choose_backend
+from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.scene import Scene, camera_pose
 from bounce_mjx.viewers.scene import _grid as scene_grid
-from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    SideBySide,
+    Simulation,
+    frame_at,
+    of_environment,
+    resample,
+)
 from bounce_mjx.viewers.watch import TrainingPage, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
+from bounce_mjx.world.randomization import RandomizationConfig
 from tiny_runs import TINY
 
 GRAVITY = 9.81
 HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
 SECONDS = 3.0
 PATIENCE = 60.0
+HOME_EDGES = tuple(f"paddle_home_edge{i}" for i in range(4))
+
+
+def at_height(target: float) -> dict[str, float]:
+    return {"target_height": target}
+
+
+def target_of(frame: EnvFrame) -> np.ndarray:
+    return frame.command["target_height"]
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +103,7 @@ def scripted(env: BounceBall) -> Simulation:
 
 
 @pytest.fixture(scope="module")
-def recording(scripted: Simulation) -> Frame:
+def recording(scripted: Simulation) -> EnvFrame:
     """A recording that is one step longer than an episode."""
     return scripted.record(SECONDS + scripted.env.dt)
 
@@ -100,18 +111,20 @@ def recording(scripted: Simulation) -> Frame:
 # The simulation
 
 
-def test_frames_describe_one_state(env: BounceBall, recording: Frame) -> None:
+def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None:
     """MuJoCo's kinematics find the ball and the paddle where the frame has them."""
     display = Display(env)
     for step in (0, 57, 123):
         for i in range(2):
-            display.pose(recording.qpos[step, i], recording.target_height[step, i])
+            display.pose(
+                recording.qpos[step, i], of_environment(frame_at(recording, step).command, i)
+            )
             geom = display.data.geom
             np.testing.assert_allclose(geom("ball").xpos, recording.ball[step, i], atol=1e-6)
             np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
 
 
-def test_ball_falls_freely(recording: Frame, env: BounceBall) -> None:
+def test_ball_falls_freely(recording: EnvFrame, env: BounceBall) -> None:
     """High above the paddle the ball only falls: z'' = -g."""
     z = recording.ball[:-2, 0, 2]
     high = z[1:-1] > 0.2
@@ -120,7 +133,7 @@ def test_ball_falls_freely(recording: Frame, env: BounceBall) -> None:
     np.testing.assert_allclose(acceleration[high], -GRAVITY, atol=0.02)
 
 
-def test_time_runs_until_the_episode_ends(recording: Frame, env: BounceBall) -> None:
+def test_time_runs_until_the_episode_ends(recording: EnvFrame, env: BounceBall) -> None:
     steps = round(SECONDS / env.dt)
     np.testing.assert_allclose(recording.time[: steps + 1, 0], np.arange(steps + 1) * env.dt)
     np.testing.assert_array_equal(np.flatnonzero(recording.over[:, 0]), [steps])
@@ -128,14 +141,14 @@ def test_time_runs_until_the_episode_ends(recording: Frame, env: BounceBall) -> 
     start = np.asarray(env.config.ball_init_pos)
     distance = np.abs(recording.ball[steps + 1] - start)
     assert np.all(distance < env.config.ball_position_noise + 0.001)
-    assert np.all(recording.n_bounces[steps + 1] == 0)
+    assert np.all(recording.metrics["n_bounces"][steps + 1] == 0)
 
 
-def test_environments_differ(recording: Frame) -> None:
+def test_environments_differ(recording: EnvFrame) -> None:
     assert np.all(recording.qpos[0, 0, :6] != recording.qpos[0, 1, :6])
 
 
-def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording: Frame) -> None:
+def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording: EnvFrame) -> None:
     held = Simulation(env, make_zero_controller(env), 2, seed=0).record(SECONDS)
     moved = np.abs(held.qpos[20, :, :6] - held.qpos[0, :, :6])
     assert np.all(moved < 0.01)
@@ -158,29 +171,30 @@ def test_random_actions_are_uniform(env: BounceBall) -> None:
 
 def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
     scripted.reset()
-    drawn = scripted.frame.target_height
-    scripted.target_height = 0.77
+    drawn = target_of(scripted.frame)
+    scripted.command = at_height(0.77)
     assert np.all(drawn != np.float32(0.77))
-    np.testing.assert_allclose(scripted.step().target_height, 0.77)
+    np.testing.assert_allclose(target_of(scripted.step()), 0.77)
     scripted.reset()
-    np.testing.assert_allclose(scripted.step().target_height, 0.77)
-    scripted.target_height = None
+    np.testing.assert_allclose(target_of(scripted.step()), 0.77)
+    scripted.command = {}
     scripted.reset()
     low, high = scripted.env.config.target_height_range
-    assert np.all((scripted.step().target_height >= low) & (scripted.frame.target_height <= high))
+    target = target_of(scripted.step())
+    assert np.all((target >= low) & (target <= high))
 
 
 def test_a_new_target_is_seen_before_the_next_step(scripted: Simulation) -> None:
     """While the page is paused, and after a reset."""
     scripted.reset()
-    scripted.target_height = 0.77
-    np.testing.assert_allclose(scripted.frame.target_height, 0.77)
-    np.testing.assert_allclose(scripted.reset().target_height, 0.77)
-    scripted.target_height = None
+    scripted.command = at_height(0.77)
+    np.testing.assert_allclose(target_of(scripted.frame), 0.77)
+    np.testing.assert_allclose(target_of(scripted.reset()), 0.77)
+    scripted.command = {}
 
 
 def test_only_an_episode_that_was_not_timed_out_is_lost(
-    env: BounceBall, scripted: Simulation, recording: Frame
+    env: BounceBall, scripted: Simulation, recording: EnvFrame
 ) -> None:
     assert recording.over.any() and not recording.lost.any()
     scripted.reset()
@@ -192,13 +206,13 @@ def test_only_an_episode_that_was_not_timed_out_is_lost(
 
 def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
     both = SideBySide([scripted, scripted])
-    both.target_height = 0.7
+    both.command = at_height(0.7)
     both.reset()
     frame = both.step()
-    assert both.num_envs == len(frame.ball) == len(both.frame.n_bounces) == 4
-    np.testing.assert_allclose(both.frame.target_height, 0.7)
+    assert both.num_envs == len(frame.ball) == len(both.frame.metrics["n_bounces"]) == 4
+    np.testing.assert_allclose(target_of(both.frame), 0.7)
     assert both.record(0.05).qpos.shape[:2] == (6, 4)
-    both.target_height = None
+    both.command = {}
 
 
 @pytest.fixture(scope="module")
@@ -255,13 +269,14 @@ def test_a_push_adds_its_velocity_to_the_ball_once(scripted: Simulation) -> None
 # Resampling
 
 
-def ramp(over: tuple[int, ...] = ()) -> Frame:
+def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
     """Eleven frames of one environment, 0.01 s apart; every value is the frame's time in steps."""
     value = np.arange(11.0)[:, None]
     wide = np.repeat(value[..., None], 3, axis=-1)
     ended = np.zeros((11, 1), bool)
     ended[list(over)] = True
-    return Frame(value * 0.01, wide, wide, wide, value, value, wide, ended, ended)
+    command, metrics = {"height": value}, {"count": value}
+    return EnvFrame(value * 0.01, wide, wide, wide, command, metrics, ended, ended)
 
 
 def test_resampling_interpolates_positions() -> None:
@@ -271,8 +286,9 @@ def test_resampling_interpolates_positions() -> None:
     np.testing.assert_allclose(frames.time[:, 0], times)
     for positions in (frames.qpos, frames.ball, frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
-    # Counts and rewards come from the last step.
-    np.testing.assert_array_equal(frames.n_bounces[:, 0], np.floor(100 * times + 1e-9))
+    # Commands and metrics come from the last step.
+    for values in (frames.command["height"], frames.metrics["count"]):
+        np.testing.assert_array_equal(values[:, 0], np.floor(100 * times + 1e-9))
 
 
 def test_resampling_does_not_blend_two_episodes() -> None:
@@ -311,21 +327,21 @@ def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
 
 def test_markers_are_at_the_positions_of_the_task(env: BounceBall) -> None:
     display = Display(env)
-    display.pose(env.mj_model.qpos0, 0.61)
+    display.pose(env.mj_model.qpos0, at_height(0.61))
     reward = env.config.reward
     np.testing.assert_allclose(
-        display.data.site(TARGET_SITE).xpos, [reward.target_x, reward.target_y, 0.61]
+        display.data.site("target_height").xpos, [reward.target_x, reward.target_y, 0.61]
     )
-    assert display.data.site(HOME_SITE).xpos[2] == pytest.approx(
+    assert display.data.site("paddle_home").xpos[2] == pytest.approx(
         reward.paddle_home_height, abs=1e-3
     )
 
 
 def test_the_home_is_an_outline_that_leaves_the_paddle_free(env: BounceBall) -> None:
     model, data = (display := Display(env)).model, display.data
-    display.pose(env.mj_model.qpos0, 0.5)
-    assert model.site(HOME_SITE).rgba[3] == 0.0
-    home, half = data.site(HOME_SITE).xpos, model.site(HOME_SITE).size
+    display.pose(env.mj_model.qpos0, at_height(0.5))
+    assert model.site("paddle_home").rgba[3] == 0.0
+    home, half = data.site("paddle_home").xpos, model.site("paddle_home").size
     for name in HOME_EDGES:
         gap = np.abs(data.site(name).xpos - home) - model.site(name).size
         assert np.max(gap[:2] - half[:2]) == pytest.approx(0.0, abs=1e-9)
@@ -338,17 +354,17 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     env = BounceBall(EnvConfig(mjcf=bare))
     assert env.mj_model.nsite == 0
     display = Display(env)
-    display.pose(env.mj_model.qpos0, 0.5)
-    assert display.data.site(TARGET_SITE).xpos[2] == 0.5
-    assert display.data.site(HOME_SITE).xpos[2] == env.config.reward.paddle_home_height
+    display.pose(env.mj_model.qpos0, at_height(0.5))
+    assert display.data.site("target_height").xpos[2] == 0.5
+    assert display.data.site("paddle_home").xpos[2] == env.config.reward.paddle_home_height
 
 
 # The camera of the page
 
 
-def projected(points: np.ndarray, reward, aspect: float, on_phone: bool, offsets) -> np.ndarray:
+def projected(points: np.ndarray, focus, aspect: float, on_phone: bool, offsets) -> np.ndarray:
     """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
-    position, gaze = camera_pose(offsets, reward, aspect, on_phone)
+    position, gaze = camera_pose(offsets, focus, aspect, on_phone)
     forward = (gaze - position) / np.linalg.norm(gaze - position)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -373,31 +389,32 @@ HOMES = {
 def test_the_camera_sees_every_robot(number: int, home, aspect, on_phone, lowest) -> None:
     """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
     x, y, z = home
-    reward = RewardConfig(target_x=x, target_y=y, paddle_home_height=z)
     paddle = np.array([x, y, 0.0]) * (1.0 + 0.05 / np.hypot(x, y)) + (0.0, 0.0, z)
     parts = np.array([(-0.1, 0.0, 0.0), paddle, (x, y, z + 0.8)])
     offsets = scene_grid(number)
     points = (offsets[:, None] + parts).reshape(-1, 3)
-    across, up = projected(points, reward, aspect, on_phone, offsets).T
+    across, up = projected(points, np.array(home), aspect, on_phone, offsets).T
     assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
 
 
 @pytest.mark.parametrize("number", [1, 2, 16])
 def test_labels_are_above_the_highest_target_and_in_the_picture(
-    env: BounceBall, recording: Frame, number: int
+    env: BounceBall, recording: EnvFrame, number: int
 ) -> None:
-    frame = Frame(*(np.resize(values[0], (number, *values.shape[2:])) for values in recording))
+    frame = jax.tree.map(
+        lambda values: np.resize(values[0], (number, *values.shape[2:])), recording
+    )
     names = ["A", "B"] if number == 2 else None
     with open_server("127.0.0.1", 0) as server:
         scene = Scene(server, env, number, names)
-        scene.update([frame._replace(target_height=np.full(number, 0.8))])
+        scene.update([frame._replace(command=at_height(np.full(number, 0.8)))])
         labels = np.array([label.position for label in scene._labels])
-        targets = scene._markers[TARGET_SITE].batched_positions
+        targets = scene._markers["target_height"].batched_positions
         texts = [label.text for label in scene._labels]
     np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
     for aspect, on_phone, lowest in PICTURES:
         offsets = scene_grid(number)
-        across, up = projected(labels, env.config.reward, aspect, on_phone, offsets).T
+        across, up = projected(labels, np.array(env.task.focus()), aspect, on_phone, offsets).T
         # Room for the text of a label.
         assert np.all(np.abs(across) < 0.9) and np.all((lowest < up) & (up < 0.93))
     assert (
@@ -526,6 +543,7 @@ def watch(
 def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """A client of a simulation's page."""
     failures, printed, ended = [], io.StringIO(), threading.Event()
+    address = Address("127.0.0.1", free_port("127.0.0.1", 8400))
 
     def step(simulation) -> None:
         if ended.is_set():
@@ -536,9 +554,8 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     def serve() -> None:
         try:
             run_browser(
-                simulation, num_shown=1, speed=1.0, seconds=None, title="exp[lr] <b>",
-                host="127.0.0.1", port=free_port("127.0.0.1", 8400), console=Console(file=printed),
-                stop=StopRequest(),
+                simulation, PageStart("exp[lr] <b>"), address, seconds=None,
+                console=Console(file=printed), stop=StopRequest(),
             )  # fmt: skip
         except BaseException as error:
             failures.append(error)
@@ -563,14 +580,14 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     for owner, method, record in (
         (Scene, "show", lambda _, number: did["shown"].append(number)),
         (Pace, "due", lambda _, speed: did["speed"].append(speed)),
-        (Simulation, "step", lambda simulation: did["target"].append(simulation.target_height)),
+        (Simulation, "step", lambda one: did["target"].append(one.command.get("target_height"))),
         (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
     ):
         watch(monkeypatch, owner, method, record)
-    scripted.target_height = None
+    scripted.command = {}
     with served(scripted, monkeypatch) as client:
         yield client, did
-    scripted.target_height = None
+    scripted.command = {}
 
 
 def wait_until(holds: Callable[[], bool]) -> None:
@@ -778,7 +795,7 @@ def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
 ) -> None:
     client, did = page
     up = np.array([0.0, 0.0, 1.0])
-    position, gaze = camera_pose(np.zeros((1, 3)), scripted.env.config.reward)
+    position, gaze = camera_pose(np.zeros((1, 3)), np.array(scripted.env.task.focus()))
     for forward in (gaze - position, np.array([-1.0, 0.0, 0.0])):
         pushes = len(did["push"])
         client.set(client.control("towards"), "left")
@@ -805,7 +822,7 @@ def test_the_last_seconds_are_saved_as_they_were_seen(
     client, did = page
     saved = []
 
-    def replay(env: BounceBall, recording: Frame, names) -> str:
+    def replay(env: BounceBall, recording: EnvFrame, names) -> str:
         saved.append(recording)
         return "<html>"
 
@@ -961,7 +978,7 @@ def played() -> Simulation:
     return Simulation(env, controller, 2, seed=0, ranges=drawn_ranges(config))
 
 
-def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...]) -> Frame:
+def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...]) -> EnvFrame:
     """An episode whose world changes after its first second, which is nominal."""
     simulation.world = {}
     simulation.reset()
@@ -1084,7 +1101,7 @@ def test_a_client_that_does_not_answer_does_not_delay_the_end(capfd) -> None:
 
 def test_reward_bars_show_every_term() -> None:
     """The bars show all terms, however many there are."""
-    terms = dict.fromkeys(TERM_NAMES, 0.0) | {"position": 2.0, "alignment": -1.25}
+    terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
     terms["sixteenth_term"] = 0.5
     text = reward_bars(terms)
     for name in terms:
@@ -1251,16 +1268,18 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
     shown = []
     monkeypatch.setattr(show, "Simulation", Named)
     monkeypatch.setattr(
-        browser, "run_browser", lambda simulation, **given: shown.append((simulation, given))
+        browser,
+        "run_browser",
+        lambda simulation, start, *_, **given: shown.append((simulation, start)),
     )
     both_play = "pretrained robust --viewer browser --num-envs 4".split()
     play.main(both_play)
     play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
-    (both, given), (drawn, _) = shown
+    (both, start), (drawn, _) = shown
     assert [one.world for one in both._simulations] == [{}, {}]
     assert [one.world for one in drawn._simulations] == [None, None]
-    assert given["names"] == ["A", "A", "B", "B"] and given["num_shown"] == both.num_envs == 4
-    assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", given["title"])
+    assert start.names == ["A", "A", "B", "B"] and start.num_shown == both.num_envs == 4
+    assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", start.title)
     for simulation, name in zip(both._simulations, ("pretrained", "robust"), strict=True):
         observation = load_run_config(pretrained_checkpoint(name).run).env.observation
         assert simulation.env.config.observation == observation
@@ -1272,10 +1291,10 @@ def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
     assert "shows one policy" in sentence and "--viewer browser" in sentence
 
 
-def test_the_windows_own_toggles_of_the_used_keys_are_undone() -> None:
+def test_the_windows_own_toggles_of_the_used_keys_are_undone(env: BounceBall) -> None:
     keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
     keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
-    used = {letter for words in native._HELP for letter in words if letter.isupper()}
+    used = {letter for words in native._help(env) for letter in words if letter.isupper()}
     assert keys == used == set(native._KEYS)
 
 

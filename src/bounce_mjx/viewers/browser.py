@@ -1,26 +1,30 @@
 """The live page: viser serves the scene, the controls and the plots to any browser."""
 
 import collections
+import colorsys
 import html
+import itertools
 import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+import jax
 import numpy as np
 import viser
 import viser.uplot
 from rich.console import Console
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import StopRequest
-from bounce_mjx.task.rewards import TERM_NAMES
-from bounce_mjx.viewers.controls import Controls
+from bounce_mjx.viewers.controls import Controls, words
+from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import open_server, replay
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation
+from bounce_mjx.viewers.simulation import EnvFrame, SideBySide, Simulation, of_environment, stacked
 
 # Pictures and plots per second.
 _PICTURE_RATE = 50.0
@@ -29,57 +33,40 @@ _PLOT_SECONDS = 4.0
 _SAVED_SECONDS = 10.0
 AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
 """Style of the axes of a plot."""
-_LEGEND = """<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
-<b style="color:#2b8a3e">green disc</b> target height<br>
-<b style="color:#1c6ad6">blue frame</b> home of the paddle<br>
-<b style="color:#e8590c">orange line</b> path of the ball, 0.6 s<br>
-<b>space</b> pause, <b>R</b> reset, <b>T G</b> target height, <b>M N</b> speed,
-<b>I K J L</b> push the ball, <b>Ctrl-K</b> all keys
-</div>"""
+_LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
+_REWARD = "reward/"
+_SHAPES = {"cylinder": "disc", "frame": "frame", "box": "box"}
+# Every 30 degrees of the colour wheel.
+_HUES = "red orange yellow green green green cyan blue blue purple pink pink".split()
 
 
 def run_browser(
     simulation: Simulation | SideBySide,
+    start: PageStart,
+    address: Address,
     *,
-    num_shown: int,
-    speed: float,
     seconds: float | None,
-    host: str,
-    port: int,
-    title: str,
     console: Console,
     stop: StopRequest,
-    names: Sequence[str] | None = None,
-    allowed: Collection[str] = (),
 ) -> None:
     """Serves the page until the simulated `seconds` are over (None: without an end).
 
     Args:
-      num_shown: environments shown at first; the page's slider goes up to all of the simulation.
-      port: a free port of this machine.
-      names: see `Scene`.
-      allowed: see `start_server`.
+      address: has a free port of this machine.
 
     Raises:
       Interrupted: a stop was requested.
     """
-    with open_server(host, port, allowed) as server:
-        page = LivePage(
-            server, simulation, num_shown=num_shown, speed=speed, title=title, names=names
-        )
+    with open_server(*address) as server:
+        page = LivePage(server, simulation, start)
         # A host name may look like rich's markup.
         console.print(
-            f"viewer: {address(host, server.get_port())}  (Ctrl-C ends it)",
+            f"viewer: {address.url}  (Ctrl-C ends it)",
             markup=False,
             highlight=False,
             soft_wrap=True,
         )
         page.run(seconds, stop.check)
-
-
-def address(host: str, port: int) -> str:
-    """Address of the page."""
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _window_title(title: str) -> str:
@@ -95,11 +82,7 @@ class LivePage:
         self,
         server: viser.ViserServer,
         simulation: Simulation | SideBySide,
-        *,
-        num_shown: int,
-        speed: float,
-        title: str,
-        names: Sequence[str] | None = None,
+        start: PageStart,
         side: viser.PanelHandle | None = None,
     ):
         """
@@ -108,7 +91,7 @@ class LivePage:
         """
         self._server = server
         self._simulation = simulation
-        self._names = names
+        self._names = start.names
         gui = server.gui
         gui.configure_theme(
             show_logo=False, show_share_button=False, control_width="medium",
@@ -117,14 +100,14 @@ class LivePage:
         gui.set_panel_label("bounce_mjx")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(280)
-        gui.add_html(_window_title(f"bounce_mjx: {title}"))
-        self._controls = Controls(server, simulation, title=title, speed=speed, num_shown=num_shown)
+        gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
+        self._controls = Controls(server, simulation, start)
         self._settings = self._controls.read()
-        self._scene = Scene(server, simulation.env, num_shown, names)
-        self._history: collections.deque[Frame] = collections.deque(
+        self._scene = Scene(server, simulation.env, start.num_shown, start.names)
+        self._history: collections.deque[EnvFrame] = collections.deque(
             maxlen=round(_PLOT_SECONDS / simulation.env.dt)
         )
-        self._seen: collections.deque[Frame] = collections.deque(
+        self._seen: collections.deque[EnvFrame] = collections.deque(
             maxlen=round(_SAVED_SECONDS / simulation.env.dt)
         )
         side = side or gui.add_panel()
@@ -169,8 +152,8 @@ class LivePage:
         """Applies the controls' settings and requests; returns whether anything changed."""
         before, now = self._settings, self._controls.read()
         self._settings = now
-        if now.target_height != before.target_height:
-            self._simulation.target_height = now.target_height
+        if now.command != before.command:
+            self._simulation.command = now.command
         if now.world != before.world:
             self._simulation.world = now.world
         if now.num_shown != before.num_shown:
@@ -188,49 +171,92 @@ class LivePage:
             ).start()
         return now != before or reset or push is not None
 
-    def _save(self, client: viser.ClientHandle, frames: list[Frame]) -> None:
+    def _save(self, client: viser.ClientHandle, frames: list[EnvFrame]) -> None:
         """Sends a page that replays the last seconds."""
         if not frames:
             return
         shown = self._settings.num_shown
-        recording = Frame(*(np.stack(values)[:, :shown] for values in zip(*frames, strict=True)))
+        recording = jax.tree.map(lambda values: values[:, :shown], stacked(frames))
         text = replay(self._simulation.env, recording, names=self._names)
-        client.send_file_download("bounce.html", text.encode(), save_immediately=True)
+        client.send_file_download("replay.html", text.encode(), save_immediately=True)
 
     def _add_plots(self, side: viser.PanelHandle) -> None:
-        gui = self._server.gui
+        gui, frame = self._server.gui, self._simulation.frame
         first = "robot 1" if self._names is None else self._names[0]
+        levels = [
+            {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
+            for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
+        ]
+        lines = [
+            {"label": "s"},
+            {"label": "ball", "stroke": "#e8590c", "width": 2},
+            *levels,
+            {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
+        ]
         with side.add_tab(first, viser.Icon.CHART_LINE):
             gui.add_markdown("height, m, over the last seconds")
             self._heights = gui.add_uplot(
-                (np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)),
-                (
-                    {"label": "s"},
-                    {"label": "ball", "stroke": "#e8590c", "width": 2},
-                    {"label": "target", "stroke": "#2b8a3e", "width": 2, "dash": [6, 4]},
-                    {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
-                ),
+                (np.zeros(1),) * len(lines),
+                tuple(lines),
                 axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
                 scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
                 legend={"live": False},
                 height=190,
             )
             gui.add_markdown("reward, by term")
-            self._terms = gui.add_html(reward_bars(dict.fromkeys(TERM_NAMES, 0.0)))
-            gui.add_html(_LEGEND)
+            self._terms = gui.add_html(reward_bars(dict.fromkeys(_reward_terms(frame), 0.0)))
+            gui.add_html(_legend(self._simulation.env, frame))
+
+    def _levels(self, frame: EnvFrame) -> dict[str, float]:
+        """The task's heights of the first environment."""
+        return self._simulation.env.task.levels(of_environment(frame.command, 0))
 
     def _update_plots(self) -> None:
         if not self._history:
             return
         heights = np.array(
-            [(f.ball[0, 2], f.target_height[0], f.paddle[0, 2]) for f in self._history]
+            [(f.ball[0, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in self._history]
         )
         dt = self._simulation.env.dt
         times = np.arange(1 - len(heights), 1) * dt
         self._heights.data = (times, *heights.T)
         recent = list(self._history)[-round(1.0 / _PLOT_RATE / dt) :]
-        terms = np.mean([frame.reward_terms[0] for frame in recent], axis=0)
-        self._terms.content = reward_bars(dict(zip(TERM_NAMES, terms, strict=True)))
+        terms = jax.tree.map(lambda *values: np.mean(values), *map(_reward_terms, recent))
+        self._terms.content = reward_bars(terms)
+
+
+def _reward_terms(frame: EnvFrame) -> dict[str, float]:
+    """The weighted reward terms of the first environment."""
+    return {
+        name.removeprefix(_REWARD): value[0]
+        for name, value in frame.metrics.items()
+        if name.startswith(_REWARD)
+    }
+
+
+def _legend(env: Env, frame: EnvFrame) -> str:
+    """HTML that explains the task's markers, the line and the keys."""
+    rows = [
+        (f"{_colour_name(rgba)} {_SHAPES[shape]}", 0.65 * 255.0 * np.array(rgba[:3]), words(name))
+        for name, _, _, rgba, shape in env.task.markers(of_environment(frame.command, 0))
+    ]
+    rows.append(("orange line", (232.0, 89.0, 12.0), "path of the ball, 0.6 s"))
+    lines = [
+        f'<b style="color:rgb({",".join(f"{c:.0f}" for c in colour)})">{what}</b> '
+        f"{html.escape(meaning)}<br>"
+        for what, colour, meaning in rows
+    ]
+    moved = [f"<b>T G</b> {html.escape(words(name))}, " for name in list(env.config.commands)[:1]]
+    return f"""<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
+{"".join(lines)}
+<b>space</b> pause, <b>R</b> reset, {"".join(moved)}<b>M N</b> speed,
+<b>I K J L</b> push the ball, <b>Ctrl-K</b> all keys
+</div>"""
+
+
+def _colour_name(rgba: Sequence[float]) -> str:
+    hue, saturation, _ = colorsys.rgb_to_hsv(*rgba[:3])
+    return _HUES[round(len(_HUES) * hue) % len(_HUES)] if saturation > 0.2 else "grey"
 
 
 def reward_bars(terms: Mapping[str, float]) -> str:
@@ -244,7 +270,7 @@ def reward_bars(terms: Mapping[str, float]) -> str:
         lines.append(
             f'<div style="display:flex;align-items:center;height:15px">'
             f'<span style="width:48%;white-space:nowrap;overflow:hidden;text-overflow:ellipsis">'
-            f"{html.escape(name.replace('_', ' '))}</span>"
+            f"{html.escape(words(name))}</span>"
             f'<span style="width:16%;text-align:right;padding-right:6px">{_rounded(value)}</span>'
             f'<span style="width:36%;height:9px;position:relative;background:#eef0f3">'
             f'<span style="position:absolute;height:9px;left:{left:.1f}%;'

@@ -10,9 +10,10 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import StopRequest
-from bounce_mjx.viewers.controls import direction
+from bounce_mjx.viewers.controls import direction, words
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.pace import Pace
@@ -22,13 +23,6 @@ _PICTURE_RATE = 60.0
 _TRAIL_SECONDS = 0.5
 _PUSH = 0.2
 _KEYS = "RTGMNIKJL"
-_HELP = {
-    "space": "pause",
-    "R": "reset",
-    "T / G": "command up / down",
-    "M / N": "speed",
-    "I K J L": "push the ball",
-}
 # Flags that MuJoCo's window toggles with the same keys.
 _OPTION_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjVISSTRING) if key and key in _KEYS]
 _SCENE_FLAGS = [i for i, (*_, key) in enumerate(mujoco.mjRNDSTRING) if key and key in _KEYS]
@@ -72,6 +66,18 @@ def run_native(
       Interrupted: a stop was requested.
     """
     _Window(simulation, speed).run(seconds, stop)
+
+
+def _help(env: Env) -> dict[str, str]:
+    """What each key does."""
+    moved = [("T / G", words(name)) for name in list(env.config.commands)[:1]]
+    return {
+        "space": "pause",
+        "R": "reset",
+        **dict(moved),
+        "M / N": "speed",
+        "I K J L": "push the ball",
+    }
 
 
 class _Window:
@@ -146,7 +152,7 @@ class _Window:
         simulation = self._simulation
         for name, command in list(simulation.env.config.commands.items())[:1]:
             value = float(simulation.frame.command[name][0]) + direction * command.step
-            value = float(np.clip(value, max(command.least, command.step), command.greatest))
+            value = float(np.clip(value, command.least, command.greatest))
             simulation.command = simulation.command | {name: value}
 
     def _texts(self) -> list[tuple]:
@@ -161,6 +167,6 @@ class _Window:
             (font, position, "\n".join(lines), "\n".join(lines.values()))
             for position, lines in (
                 (corner.mjGRID_TOPLEFT, state),
-                (corner.mjGRID_BOTTOMLEFT, _HELP),
+                (corner.mjGRID_BOTTOMLEFT, _help(self._simulation.env)),
             )
         ]

@@ -1,7 +1,8 @@
-"""The viewing options that `view` and `play` share."""
+"""What `view` and `play` let a user choose, and how a page starts."""
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -44,3 +45,29 @@ class ViewerOptions(StrictModel):
     """Other names under which a browser may open the page, such as a proxy's."""
     port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of the page's server, or the next free port."""
+
+
+class PageStart(NamedTuple):
+    """What a page shows at first."""
+
+    title: str
+    names: Sequence[str] | None = None
+    """A name of each environment for its label; by default their numbers."""
+    num_shown: int = 1
+    """Number of environments in the scene; the page's slider goes up to all of the simulation."""
+    speed: float = 1.0
+    """Speed as a factor of real time."""
+
+
+class Address(NamedTuple):
+    """Where a page is served."""
+
+    host: str
+    port: int
+    allowed: Collection[str] = ()
+    """Other names under which a browser may open the page."""
+
+    @property
+    def url(self) -> str:
+        """Address of the page for a browser."""
+        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"

@@ -11,7 +11,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.guard import start_server
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import Frame, SideBySide, Simulation, resample
+from bounce_mjx.viewers.simulation import EnvFrame, SideBySide, Simulation, frame_at, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
@@ -23,7 +23,7 @@ _STOP_SECONDS = 1.0
 def write_page(
     path: Path,
     simulation: Simulation | SideBySide,
-    recording: Frame,
+    recording: EnvFrame,
     fps: int | None,
     names: Sequence[str] | None = None,
 ) -> None:
@@ -41,7 +41,7 @@ def write_page(
 
 
 def replay(
-    env: Env, recording: Frame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
+    env: Env, recording: EnvFrame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
 ) -> str:
     """A page (HTML) that replays a recording [T, N, ...]."""
     frames = resample(recording, env.dt, fps)
@@ -49,7 +49,7 @@ def replay(
         scene = Scene(server, env, frames.time.shape[1], names)
         recorder = server.get_scene_serializer()
         for i in range(len(frames.time)):
-            scene.update([Frame(*(values[i] for values in frames))])
+            scene.update([frame_at(frames, i)])
             recorder.insert_sleep(1.0 / fps)
         return recorder.as_html().replace(_VISER_TITLE, "<title>bounce_mjx</title>", 1)
 

@@ -11,7 +11,7 @@ import viser
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.display import Display, body_scenes, site_mesh
-from bounce_mjx.viewers.simulation import Frame, frame_readings, of_environment
+from bounce_mjx.viewers.simulation import EnvFrame, frame_readings, of_environment
 
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
@@ -134,7 +134,7 @@ class Scene:
         initial.position, initial.look_at = tuple(position), tuple(self._gaze)
         initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
 
-    def update(self, frames: Sequence[Frame]) -> None:
+    def update(self, frames: Sequence[EnvFrame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
         display, model, number = self._display, self._display.model, self._num_envs
         frame = frames[-1]
@@ -169,7 +169,7 @@ class Scene:
                 if not np.array_equal(label.position, position):
                     label.position = position
 
-    def follow(self, frame: Frame) -> None:
+    def follow(self, frame: EnvFrame) -> None:
         """Moves the camera of every page smoothly with the first ball."""
         gaze = self._gaze + _FOLLOWING * (frame.ball[0] + self._offsets[0] - self._gaze)
         for client in self._server.get_clients().values():
@@ -180,7 +180,7 @@ class Scene:
                     client.camera.position, client.camera.look_at = gaze + view, gaze
         self._gaze = gaze
 
-    def _label(self, frame: Frame, index: int) -> str:
+    def _label(self, frame: EnvFrame, index: int) -> str:
         """An environment's name if there are several, and the task's readings or the loss of its
         ball."""
         name = "" if self._num_envs == 1 else f"{index + 1}:  "
@@ -194,7 +194,7 @@ class Scene:
             return name + next(iter(readings.values()), "")
         return name + "   ".join(f"{word} {value}" for word, value in readings.items())
 
-    def _trails(self, frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    def _trails(self, frames: Sequence[EnvFrame]) -> tuple[np.ndarray, np.ndarray]:
         """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
         age; a reset cuts the paths."""
         for frame in frames:

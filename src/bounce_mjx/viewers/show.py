@@ -14,7 +14,7 @@ from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import check_display, has_display, run_native
-from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
+from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
 from bounce_mjx.world.config import WorldConfig
@@ -40,23 +40,47 @@ def show(
     """Shows or records environments under their controllers; Ctrl-C closes a viewer.
 
     Args:
-      shown: one, or several with the same robot side by side, on the page or in its recording. The
-        labels of several are A, B, ...
+      shown: one, or several with the same task and robot side by side, on the page or in its
+        recording. The labels of several are A, B, ...
+      commands: values of the task's commands; the others are drawn.
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
         of several.
     """
-    recorded = options.video is not None or options.html is not None
-    if recorded and options.viewer != "auto":
+    if len({one.config.task for one in shown}) > 1:
+        raise UserError("the policies have different tasks; show one at a time")
+    viewer = _viewer(options, several=len(shown) > 1)
+    present = {"recording": _recording, "native": _window, "browser": _page}[viewer](
+        options, console
+    )
+    with console.status("compiling"):
+        simulation = _simulate(shown, options, commands, has_sliders=viewer == "browser")
+    present(simulation, _page_start(shown, options))
+
+
+Present = Callable[[Simulation | SideBySide, PageStart], None]
+"""Shows a simulation."""
+
+
+def _viewer(options: ViewerOptions, several: bool) -> str:
+    """browser, native or recording."""
+    is_recorded = options.video is not None or options.html is not None
+    if is_recorded and options.viewer != "auto":
         raise UserError(
             f"--viewer {options.viewer} and --video or --html exclude each other; give only one"
         )
-    viewer, several = options.viewer, len(shown) > 1
-    if several and (viewer == "native" or options.video is not None):
+    if several and (options.viewer == "native" or options.video is not None):
         raise UserError("a window or a video shows one policy; show several with --viewer browser")
-    if viewer == "auto":
-        viewer = "native" if not several and has_display() else "browser"
+    if is_recorded:
+        return "recording"
+    if options.viewer == "auto":
+        return "native" if not several and has_display() else "browser"
+    return options.viewer
+
+
+def _recording(options: ViewerOptions, console: Console) -> Present:
+    """Writes the files; checks them at once."""
     film = None
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
@@ -67,69 +91,91 @@ def show(
         from bounce_mjx.viewers.page import SUFFIXES, write_page
 
         check_writable(options.html, "--html", SUFFIXES)
-    if not recorded and viewer == "native":
-        check_display()
-    if not recorded and viewer == "browser":
-        from bounce_mjx.viewers.browser import free_port, run_browser
 
-        port = free_port(options.host, options.port)
-
-    on_page = not recorded and viewer == "browser"
-    title, names = shown[0].title, None
-    # Policies side by side are compared in one world.
-    is_drawn = all(one.config.randomization.terms for one in shown)
-    if several:
-        each = max(1, options.num_envs // len(shown))
-        letters = string.ascii_uppercase[: len(shown)]
-        names = [letter for letter in letters for _ in range(each)]
-        titles = zip(letters, shown, strict=True)
-        title = ", ".join(f"{letter}: {one.title}" for letter, one in titles)
-
-    def simulate(one: Shown) -> Simulation:
-        config, num_envs = one.config, each if several else options.num_envs
-        env, ranges = Env(config), None
-        if on_page:
-            env, ranges = Env(with_sliders(config)), drawn_ranges(config)
-            # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
-            if env.engine.name == "fused" and not several:
-                num_envs = MAX_ENVS
-        simulation = Simulation(env, one.make_controller(env), num_envs, options.seed, ranges)
-        simulation.command = commands
-        simulation.world = None if is_drawn else {}
-        return simulation
-
-    with console.status("compiling"):
-        simulations = [simulate(one) for one in shown]
-    if len({fingerprint(one.env.mj_model) for one in simulations}) > 1:
-        raise UserError("the policies have different robots or time steps; show one at a time")
-    simulation = SideBySide(simulations) if several else simulations[0]
-
-    if recorded:
+    def present(simulation: Simulation | SideBySide, start: PageStart) -> None:
         with console.status("recording"):
             recording = simulation.record(options.seconds or _RECORDED_SECONDS)
             if film is not None:
                 film.write(simulation, recording)
             if options.html is not None:
-                write_page(options.html, simulation, recording, options.fps, names)
+                write_page(options.html, simulation, recording, options.fps, start.names)
         for path in (options.video, options.html):
             if path is not None:
                 # rich would read brackets in a path as markup.
                 console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
-        return
-    with contextlib.suppress(Interrupted), StopRequest() as stop:
-        if viewer == "native":
-            run_native(simulation, speed=options.speed, seconds=options.seconds, stop=stop)
-        else:
+
+    return present
+
+
+def _window(options: ViewerOptions, console: Console) -> Present:
+    """Opens MuJoCo's window; checks the display at once."""
+    check_display()
+
+    def present(simulation: Simulation, start: PageStart) -> None:
+        with contextlib.suppress(Interrupted), StopRequest() as stop:
+            run_native(simulation, speed=start.speed, seconds=options.seconds, stop=stop)
+
+    return present
+
+
+def _page(options: ViewerOptions, console: Console) -> Present:
+    """Serves the page; looks for a port at once."""
+    from bounce_mjx.viewers.browser import free_port, run_browser
+
+    port = free_port(options.host, options.port)
+    address = Address(options.host, port, options.allow_host)
+
+    def present(simulation: Simulation | SideBySide, start: PageStart) -> None:
+        with contextlib.suppress(Interrupted), StopRequest() as stop:
             run_browser(
-                simulation,
-                num_shown=simulation.num_envs if several else options.num_envs,
-                speed=options.speed,
-                seconds=options.seconds,
-                host=options.host,
-                port=port,
-                title=title,
-                console=console,
-                names=names,
-                allowed=options.allow_host,
-                stop=stop,
+                simulation, start, address, seconds=options.seconds, console=console, stop=stop
             )
+
+    return present
+
+
+def _robots_each(shown: Sequence[Shown], options: ViewerOptions) -> int:
+    """Number of robots of each controller."""
+    return max(1, options.num_envs // len(shown))
+
+
+def _simulate(
+    shown: Sequence[Shown],
+    options: ViewerOptions,
+    commands: dict[str, float],
+    has_sliders: bool,
+) -> Simulation | SideBySide:
+    """Compiles the simulation.
+
+    Args:
+      has_sliders: whether sliders change the world and the number of robots.
+    """
+    envs = [Env(with_sliders(one.config) if has_sliders else one.config) for one in shown]
+    if len({fingerprint(env.mj_model) for env in envs}) > 1:
+        raise UserError("the policies have different robots or time steps; show one at a time")
+    num_envs = _robots_each(shown, options)
+    # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
+    if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
+        num_envs = MAX_ENVS
+    # Policies side by side are compared in one world.
+    is_drawn = all(one.config.randomization.terms for one in shown)
+    simulations = []
+    for one, env in zip(shown, envs, strict=True):
+        ranges = drawn_ranges(one.config) if has_sliders else None
+        controller = one.make_controller(env)
+        simulation = Simulation(env, controller, num_envs, options.seed, ranges)
+        simulation.command = commands
+        simulation.world = None if is_drawn else {}
+        simulations.append(simulation)
+    return SideBySide(simulations) if len(simulations) > 1 else simulations[0]
+
+
+def _page_start(shown: Sequence[Shown], options: ViewerOptions) -> PageStart:
+    """The titles, and how many robots are shown."""
+    each = _robots_each(shown, options)
+    if len(shown) == 1:
+        return PageStart(shown[0].title, None, each, options.speed)
+    letters = string.ascii_uppercase[: len(shown)]
+    titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
+    names = [letter for letter in letters for _ in range(each)]
+    return PageStart(", ".join(titles), names, len(names), options.speed)

@@ -16,7 +16,7 @@ from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters
 
 
-class Frame(NamedTuple):
+class EnvFrame(NamedTuple):
     """N environments after a control step; a recording has a leading axis of T frames."""
 
     time: np.ndarray
@@ -39,16 +39,37 @@ class Frame(NamedTuple):
     fast."""
 
 
+class _Changes(NamedTuple):
+    """What a user changes before a step."""
+
+    command: dict[str, np.float32]
+    """Commands; nan keeps one."""
+    push: np.ndarray
+    """Velocity that is added to the ball's [3], m/s."""
+    world: World
+    """Terms of the world; nan keeps an entry."""
+
+
 def of_environment(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
     """Commands or metrics [N] of one environment, each a number."""
     return {name: float(value[index]) for name, value in values.items()}
 
 
-def frame_readings(env: Env, frame: Frame, index: int = 0) -> dict[str, str]:
+def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
     """The task's readings of one environment of a frame."""
     return env.task.readings(
         of_environment(frame.command, index), of_environment(frame.metrics, index)
     )
+
+
+def stacked(frames: Sequence[EnvFrame]) -> EnvFrame:
+    """T frames as a recording."""
+    return jax.tree.map(lambda *values: np.stack(values), *frames)
+
+
+def frame_at(recording: EnvFrame, i: int) -> EnvFrame:
+    """One frame of a recording."""
+    return jax.tree.map(lambda values: values[i], recording)
 
 
 class Simulation:
@@ -106,14 +127,14 @@ class Simulation:
         self._command = dict(command)
         self.frame = self._with_command(self.frame)
 
-    def _with_command(self, frame: Frame) -> Frame:
+    def _with_command(self, frame: EnvFrame) -> EnvFrame:
         """A frame that already shows the commands that the next step sets."""
         given = {
             name: np.full_like(frame.command[name], value) for name, value in self._command.items()
         }
         return frame._replace(command=frame.command | given)
 
-    def reset(self) -> Frame:
+    def reset(self) -> EnvFrame:
         """Starts a new episode in every environment; returns the first frame."""
         self.frame = self._reset(np.ones(self.num_envs, bool))
         return self.frame
@@ -122,7 +143,7 @@ class Simulation:
         """Adds a velocity (m/s) to every ball at the start of the next step."""
         self._push = self._push + np.asarray(velocity, np.float32)
 
-    def step(self) -> Frame:
+    def step(self) -> EnvFrame:
         """Advances one control step."""
         inputs = self._inputs()
         # Before the program runs, so that a push of another thread meanwhile acts on the next step.
@@ -133,11 +154,11 @@ class Simulation:
             self._reset(self.frame.over)
         return self.frame
 
-    def record(self, seconds: float) -> Frame:
+    def record(self, seconds: float) -> EnvFrame:
         """The current frame and the frames of the following `seconds`, stacked."""
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
-        return jax.tree.map(lambda *values: np.stack(values), *frames)
+        return stacked(frames)
 
     def _set_command(self) -> dict[str, np.float32]:
         """Every command; nan where the drawn one stays."""
@@ -157,10 +178,10 @@ class Simulation:
 
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
-        changes = self._set_command(), self._push, self._world()
-        return self.policy, self._key, self._states, self._steps, *changes
+        changes = _Changes(self._set_command(), self._push, self._world())
+        return self.policy, self._key, self._states, self._steps, changes
 
-    def _reset(self, over: np.ndarray) -> Frame:
+    def _reset(self, over: np.ndarray) -> EnvFrame:
         """Starts a new episode in some environments [N]; the frame of all."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
@@ -177,9 +198,9 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, command, push, world):
+    def _advance(self, policy, key, states, steps, changes):
         key, action_key = jax.random.split(key)
-        states = _influence(self.env, states, command, push, world)
+        states = _changed(self.env, states, changes)
         actions = self._controller(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
@@ -196,7 +217,7 @@ class SideBySide:
         self.num_envs = sum(simulation.num_envs for simulation in simulations)
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> EnvFrame:
         """The current frame of all environments."""
         return _joined([simulation.frame for simulation in self._simulations])
 
@@ -220,7 +241,7 @@ class SideBySide:
         for simulation in self._simulations:
             simulation.world = world
 
-    def reset(self) -> Frame:
+    def reset(self) -> EnvFrame:
         """See `Simulation.reset`."""
         for simulation in self._simulations:
             simulation.reset()
@@ -231,22 +252,22 @@ class SideBySide:
         for simulation in self._simulations:
             simulation.push(velocity)
 
-    def step(self) -> Frame:
+    def step(self) -> EnvFrame:
         """See `Simulation.step`."""
         return _joined([simulation.step() for simulation in self._simulations])
 
-    def record(self, seconds: float) -> Frame:
+    def record(self, seconds: float) -> EnvFrame:
         """See `Simulation.record`."""
         recordings = [simulation.record(seconds) for simulation in self._simulations]
         return _joined(recordings, axis=1)
 
 
-def _joined(frames: Sequence[Frame], axis: int = 0) -> Frame:
+def _joined(frames: Sequence[EnvFrame], axis: int = 0) -> EnvFrame:
     """Frames of several simulations as one; the environments are along the axis."""
     return jax.tree.map(lambda *values: np.concatenate(values, axis), *frames)
 
 
-def resample(recording: Frame, dt: float, fps: float) -> Frame:
+def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     """A recording [T, N, ...] at another rate.
 
     Positions are interpolated in time, but not across a reset; other values come from the last
@@ -277,11 +298,9 @@ def resample(recording: Frame, dt: float, fps: float) -> Frame:
     )
 
 
-def _influence(
-    env: Env, states: State, command: dict[str, jax.Array], push: jax.Array, world: World
-) -> State:
-    """States [..., N] with other commands, each [] (nan keeps it), a ball pushed by a velocity [3]
-    (m/s), and another world (nan keeps a term)."""
+def _changed(env: Env, states: State, changes: _Changes) -> State:
+    """States [..., N] with the changes of a user."""
+    command, push, world = changes
     before = states.pipeline_state
     velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
     changed = before._replace(
@@ -306,11 +325,11 @@ def _influence(
     return states.replace(pipeline_state=changed, obs=observation)
 
 
-def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> Frame:
+def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFrame:
     """The frame of states (batch last) `steps` control steps after their resets."""
     now = states.pipeline_state
     kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(now)
-    return Frame(
+    return EnvFrame(
         time=steps * env.dt,
         qpos=now.physics.qpos.T,
         ball=kinematics.ball_position.T,

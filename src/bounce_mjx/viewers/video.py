@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imageio_ffmpeg
-import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -16,8 +15,9 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.offscreen import Renderer, choose_backend
 from bounce_mjx.viewers.simulation import (
-    Frame,
+    EnvFrame,
     Simulation,
+    frame_at,
     frame_readings,
     of_environment,
     resample,
@@ -66,7 +66,7 @@ class VideoWriter:
             )
         self._backend = choose_backend()
 
-    def write(self, simulation: Simulation, recording: Frame) -> None:
+    def write(self, simulation: Simulation, recording: EnvFrame) -> None:
         """Writes a recording of the simulation's first environment.
 
         Raises:
@@ -103,12 +103,12 @@ class VideoWriter:
         ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
         return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
-    def _pictures(self, env: Env, frames: Frame) -> Iterator[np.ndarray]:
+    def _pictures(self, env: Env, frames: EnvFrame) -> Iterator[np.ndarray]:
         """One picture [height, width, 3] for each frame."""
         length = round(_TRAIL_SECONDS * self.fps)
         with Renderer(env, *self._size, self._backend) as renderer:
             for i in range(len(frames.time)):
-                frame = jax.tree.map(lambda values, i=i: values[i], frames)
+                frame = frame_at(frames, i)
                 start = max(0, i - length)
                 resets = np.flatnonzero(np.diff(frames.time[start : i + 1, 0]) < 0.0)
                 start += resets[-1] + 1 if resets.size else 0

@@ -1,4 +1,4 @@
-"""The page of a running training: its newest policy, its curves and the five results."""
+"""The page of a running training: its newest policy, its curves and its results."""
 
 import collections
 import contextlib
@@ -20,16 +20,15 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.viewers.browser import AXIS, LivePage, address, free_port
+from bounce_mjx.task.shown import Curve
+from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
 from bounce_mjx.viewers.controllers import make_exchangeable_controller
+from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.simulation import Simulation
 
 _ROBOTS = 4
-_CURVES = {
-    "episode/return": "return of an episode",
-    "episode/bounces": "bounces in a row at its end",
-}
+_RETURN = Curve("episode/return", "", title="return of an episode")
 _MAX_POINTS = 2000
 
 
@@ -53,8 +52,8 @@ class TrainingPage:
         Raises:
           UserError: the page cannot be served there.
         """
-        self._config, self._host, self._port = config, host, free_port(host, port)
-        self._console, self._allowed = console, allowed
+        self._config, self._console = config, console
+        self._address = Address(host, free_port(host, port), allowed)
         self._news: queue.SimpleQueue = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -76,7 +75,7 @@ class TrainingPage:
         """Waits until Ctrl-C ends the page."""
         self._news.put(lambda _, panel: panel.end())
         if self._thread.is_alive():
-            self._say(f"the page stays at {address(self._host, self._port)} until Ctrl-C")
+            self._say(f"the page stays at {self._address.url} until Ctrl-C")
         with StopRequest(signal.SIGINT) as stop:
             while self._thread.is_alive() and not stop.requested:
                 self._thread.join(0.2)
@@ -85,13 +84,11 @@ class TrainingPage:
         try:
             with _on_cpu():
                 simulation = self._simulate()
-                with open_server(self._host, self._port, self._allowed) as server:
+                with open_server(*self._address) as server:
                     side = server.gui.add_panel()
-                    panel = _Panel(server.gui, side, self._config.total_steps)
-                    page = LivePage(
-                        server, simulation, num_shown=1, speed=1.0, title="training", side=side
-                    )
-                    self._say(f"watch: {address(self._host, self._port)}")
+                    panel = _Panel(server.gui, side, self._config)
+                    page = LivePage(server, simulation, PageStart("training"), side)
+                    self._say(f"watch: {self._address.url}")
                     page.run(None, lambda: self._tell(simulation, panel))
         # The training goes on without its page.
         except Exception as error:
@@ -121,10 +118,12 @@ class TrainingPage:
 
 
 class _Panel:
-    """The tab of the training: its progress, the five results and the curves."""
+    """The tab of the training: its progress, its results and the task's curves."""
 
-    def __init__(self, gui: viser.GuiApi, side: viser.PanelHandle, total_steps: int):
-        self._total_steps = total_steps
+    def __init__(self, gui: viser.GuiApi, side: viser.PanelHandle, config: TrainConfig):
+        self._total_steps = config.total_steps
+        titled = [curve for curve in config.env.task.curves if curve.title]
+        self._curves = (_RETURN, *titled)
         self._points: collections.deque[tuple[float, ...]] = collections.deque(maxlen=_MAX_POINTS)
         self._met_at: dict[str, int] = {}
         self._changed = False
@@ -132,12 +131,13 @@ class _Panel:
             self._progress = gui.add_html(_text("compiling"))
             self._results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
             self._plots = []
-            for title in _CURVES.values():
-                gui.add_markdown(title)
+            for curve in self._curves:
+                line = {"label": curve.title, "stroke": "#e8590c", "width": 2}
+                gui.add_markdown(curve.title)
                 self._plots.append(
                     gui.add_uplot(
                         (np.zeros(1), np.zeros(1)),
-                        ({"label": "M steps"}, {"label": title, "stroke": "#e8590c", "width": 2}),
+                        ({"label": "M steps"}, line),
                         axes=({**AXIS, "size": 30}, {**AXIS, "size": 50}),
                         scales={"x": {"time": False}},
                         legend={"show": False},
@@ -147,7 +147,8 @@ class _Panel:
 
     def add_block(self, steps: int, means: dict[str, float]) -> None:
         """Adds a point to the curves."""
-        self._points.append((steps / 1e6, *(means.get(name, np.nan) for name in _CURVES)))
+        values = (curve.scale * means.get(curve.tag, np.nan) for curve in self._curves)
+        self._points.append((steps / 1e6, *values))
         rate = means["speed/steps_per_second"]
         done = f"{steps:,} of {self._total_steps:,} steps"
         self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
@@ -174,7 +175,7 @@ class _Panel:
 
 
 def results_list(report: Report, steps: int, met_at: dict[str, int]) -> str:
-    """The five results as HTML, each with the step from which it has been met without a break.
+    """The results as HTML, each with the step from which it has been met without a break.
 
     Args:
       steps: environment steps at the evaluation.

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from bounce_mjx.evaluation.suite import neutral_range
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
@@ -47,7 +46,7 @@ SLIDERS = (
 
 
 def with_sliders(config: WorldConfig) -> WorldConfig:
-    """Task with the sliders' terms active, in ranges that contain both the sliders' and the task's.
+    """The config with the sliders' terms active, in ranges that contain the sliders' and its own.
 
     The nominal restitution holds only for the project's own model; other models get no slider for
     it.
@@ -64,12 +63,12 @@ def with_sliders(config: WorldConfig) -> WorldConfig:
 
 def drawn_ranges(config: WorldConfig) -> Ranges:
     """Ranges with which a reset of `with_sliders(config)` draws the worlds of `config`."""
-    ranges = config.randomization.ranges()
-    for name in with_sliders(config).randomization.terms:
-        if name not in ranges:
-            low, high = neutral_range(name, config)
-            ranges[name] = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
-    return ranges
+    nominal = {
+        name: jnp.full(TERMS[name].shape(config.num_joints), TERMS[name].nominal, jnp.float32)
+        for name in with_sliders(config).randomization.terms
+        if name not in config.randomization.terms
+    }
+    return config.randomization.ranges() | {name: (end, end) for name, end in nominal.items()}
 
 
 def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
