@@ -36,7 +36,7 @@ from bounce_mjx.reports.figures import (
     rewards_figure,
 )
 from bounce_mjx.reports.tables import results_markdown
-from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
@@ -373,7 +373,7 @@ def check_report(run: Path) -> str:
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     assert len(re.findall(r">128</td>|>256</td>", page)) == 2
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
-    assert TrainConfig.model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
+    assert train_config(Bounce).model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
     return page
 
 
@@ -441,7 +441,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     (config,) = log.Tensors("config/text_summary")
     text = config.tensor_proto.string_val[0].decode()
     plain = yaml.safe_load(re.fullmatch(r"```yaml\n(.*)```", text, re.DOTALL)[1])
-    assert TrainConfig.model_validate(plain) == load_config(trained / "config.yaml")
+    assert train_config(Bounce).model_validate(plain) == load_config(trained / "config.yaml")
 
     tables = log.Tensors("results/text_summary")
     assert [event.step for event in tables] == [128, 256]

@@ -149,14 +149,14 @@ def measure_conditions(
             for i, condition in enumerate(batch):
                 own = slice(i * options.episodes, (i + 1) * options.episodes)
                 of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
-                outcome = _outcome(env, condition, of_condition, engine)
+                outcome = _outcome_in(env, condition, of_condition, engine)
                 outcomes[indices[start + i]] = outcome
             done += len(batch)
             progress(done)
     return outcomes
 
 
-def _outcome(
+def _outcome_in(
     env: Env, condition: Condition, statistics: Statistics, engine: str
 ) -> ConditionOutcome:
     report = judge(env, statistics, condition.commands)
