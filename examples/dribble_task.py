@@ -64,7 +64,7 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, with a ball that starts low, and the settings of dribbling."""
 
-    ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.15)
+    ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.25)
     """Ball position at a reset, before noise, m."""
     apex_range: tuple[float, float] = (0.065, 0.085)
     """Range of the wished height of the apexes over the paddle, m."""
@@ -98,7 +98,7 @@ class Dribble(task.Task):
         return task.TaskStep(
             state=speed > 0.0,
             reward=task.weighted_terms(self.config.reward, inputs),
-            ended=(height < -0.03) | (height > 0.5) | (distance > 0.2),
+            ended=(height < -0.03) | (height > 0.5) | (distance > 0.3),
             metrics={
                 "apexes": apex,
                 "apex_error": jnp.where(apex, jnp.abs(height - wish), 0.0),

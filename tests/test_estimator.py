@@ -157,7 +157,9 @@ def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
 
     def estimates(stamp: dict[str, np.ndarray]) -> list[np.ndarray]:
         fall = [{"ball_position": np.array([0.59, 0.0, 0.5 - 5e-4 * t * t])} for t in range(30)]
-        histories = Histories(metadata, metadata.observation, fall[0] | {"joint_angles": angles} | stamp)
+        histories = Histories(
+            metadata, metadata.observation, fall[0] | {"joint_angles": angles} | stamp
+        )
         seen = []
         for measured in fall[1:]:
             histories.add(measured | {"joint_angles": angles} | stamp, np.zeros(6))

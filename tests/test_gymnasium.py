@@ -185,8 +185,14 @@ def test_target_option_holds_in_an_observation_with_a_history():
     "options, sentence",
     [
         ({"target_hight": 0.5}, "unexpected option 'target_hight'; known options are: target_h"),
-        ({"target_height": -1.0}, "target_height is -1.0, but must be a height"),
-        ({"target_height": "high"}, "target_height is 'high', but must be a height"),
+        (
+            {"target_height": -1.0},
+            "target_height is -1.0, but must be a finite number >=",
+        ),
+        (
+            {"target_height": "high"},
+            "target_height is 'high', but must be a finite number",
+        ),
         ({"reset_mask": np.ones(2, bool)}, r"shape \(2,\), but must be .* \(3,\) with at least"),
         ({"reset_mask": np.zeros(3, bool)}, "at least one True"),
     ],

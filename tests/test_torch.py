@@ -39,6 +39,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
+from bounce_mjx.tasks.bounce import Bounce
 
 NUM_ENVS = 4
 # Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.
@@ -536,7 +537,7 @@ def test_policy_acts_like_the_network(learners, library):
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_learner_reports_the_same_metrics_as_the_jax_trainer(learners, library):
     _, metrics = learners[library]
-    reported = summarize(metrics)
+    reported = summarize(metrics, Bounce.curves)
     assert {"reward/height", "episode/return", "task/ball_xy_error"} < reported.keys()
     assert {"loss/policy", "loss/value", "policy/learning_rate"} < reported.keys()
     assert all(values.shape == (2,) for values in reported.values())
@@ -574,5 +575,5 @@ def test_training_makes_episodes_longer(library):
         num_envs=256, rollout_length=24, num_minibatches=4, num_epochs=4, hidden_layers=(64, 64)
     )
     learner = make_learner(library, config, task, 0)
-    lengths = summarize(learner.learn(35))["episode/length"]
+    lengths = summarize(learner.learn(35), task.task.curves)["episode/length"]
     assert lengths[-5:].mean() > 1.3 * lengths[:5].mean()

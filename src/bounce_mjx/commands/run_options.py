@@ -1,7 +1,6 @@
 """Shared by the commands that show or measure a run: whose run it is, and the task's commands."""
 
 import difflib
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -88,19 +87,7 @@ class CommandFlags:
                 advice = f"; did you mean {near[0]}?" if near else ""
                 raise UserError(f"unknown argument {flag}{advice} (see {self._prog} --help)")
             name, command = commands[flag]
-            try:
-                value = float(text)
-            except ValueError:
-                value = math.nan
-            if not (command.least <= value <= command.greatest and math.isfinite(value)):
-                limits = [f">= {command.least:g}"] * math.isfinite(command.least)
-                limits += [f"<= {command.greatest:g}"] * math.isfinite(command.greatest)
-                wanted = " and ".join(["a finite number", *limits])
-                raise UserError(
-                    f"{flag} is {text!r}, but must be {wanted} ({command.unit or 'no unit'}) "
-                    f"(see {self._prog} --help)"
-                )
-            values[name] = value
+            values[name] = command.checked(text, flag)
         return values
 
 

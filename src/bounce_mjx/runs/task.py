@@ -67,12 +67,14 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
             )
         return task
     _check_copy(name, run)
-    if given is not None and (task := find_task(given)) is not known_task(name):
-        print(
-            f"warning: {given} differs from the task that {run} was trained with; the one of the "
-            f"training is {name}",
-            file=sys.stderr,
-        )
+    if given is not None:
+        task = find_task(given)
+        if not is_same_task(name, given):
+            print(
+                f"warning: {given} differs from the task that {run} was trained with; the one of "
+                f"the training is {name}",
+                file=sys.stderr,
+            )
         admit(name, task)
     task = known_task(name)
     if task is None:

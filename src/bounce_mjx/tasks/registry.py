@@ -28,6 +28,9 @@ GROUP = "bounce_mjx.tasks"
 
 _MAX_BYTES = 2**20
 
+# The tasks of the files that the user has named, by their content.
+_named: dict[tuple[str, str], type[Task]] = {}
+
 _OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce"}
 
 
@@ -38,7 +41,9 @@ def find_task(name: str) -> type[Task]:
       UserError: there is none, or it cannot be imported.
     """
     if is_file(name):
-        return _from_file(name)
+        task = _from_file(name)
+        admit(name, task)
+        return task
     known = _registered()
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
@@ -98,16 +103,17 @@ def read_source(name: str) -> bytes:
 def known_task(name: str) -> type[Task] | None:
     """The task of FILE.py:CLASS if code with the same content has been named in this process;
     nothing of the file is run."""
-    module = sys.modules.get(_module_name(read_source(name)))
-    return None if module is None else _class_in(module, name)
+    return _named.get(_content(name))
 
 
 def admit(name: str, task: type[Task]) -> None:
-    """Lets a task stand for FILE.py:CLASS, whose code is another one."""
-    attribute = name.rpartition(":")[2]
-    module = types.ModuleType(_module_name(read_source(name)))
-    setattr(module, attribute, task)
-    sys.modules[module.__name__] = module
+    """Lets a task stand for FILE.py:CLASS, whose code may be another one."""
+    _named[_content(name)] = task
+
+
+def _content(name: str) -> tuple[str, str]:
+    """What identifies the code of FILE.py:CLASS."""
+    return hashlib.sha256(read_source(name)).hexdigest(), name.rpartition(":")[2]
 
 
 def _registered() -> dict[str, str]:
@@ -116,19 +122,15 @@ def _registered() -> dict[str, str]:
     return {entry.name: entry.value for entry in entries} | _OWN
 
 
-def _module_name(source: bytes) -> str:
-    return f"bounce_mjx_task_{hashlib.sha256(source).hexdigest()[:16]}"
-
-
 def _from_file(name: str) -> type[Task]:
-    path, source = source_file(name), read_source(name)
-    module_name = _module_name(source)
+    path, (digest, _) = source_file(name), _content(name)
+    module_name = f"bounce_mjx_task_{digest[:16]}"
     if module_name not in sys.modules:
         spec = importlib.util.spec_from_file_location(module_name, path)
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module
         try:
-            exec(compile(source, str(path), "exec"), vars(module))
+            exec(compile(read_source(name), str(path), "exec"), vars(module))
         except Exception as error:
             del sys.modules[module_name]
             frames = [

@@ -8,6 +8,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -34,6 +35,27 @@ class Command(NamedTuple):
     """Range that a viewer offers; by default, and at least, the range from which it is drawn."""
     step: float = 0.05
     """Change by a key of a viewer."""
+
+    def checked(self, value: Any, label: str) -> float:
+        """A user's value as a number.
+
+        Args:
+          label: what has the value, for the error.
+
+        Raises:
+          UserError: it is not a number within the limits.
+        """
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if math.isfinite(number) and self.least <= number <= self.greatest:
+            return number
+        limits = [f">= {self.least:g}"] * math.isfinite(self.least)
+        limits += [f"<= {self.greatest:g}"] * math.isfinite(self.greatest)
+        wanted = " ".join(["a finite number", " and ".join(limits)]).rstrip()
+        unit = f" ({self.unit})" if self.unit else ""
+        raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
 
 
 class WorldConfig(StrictModel):

@@ -344,23 +344,11 @@ def checked_commands(options: dict[str, Any], commands: dict[str, Command]) -> d
     Raises:
       UserError: one is not a number within its limits.
     """
-    checked = {}
-    for name in commands.keys() & options.keys():
-        command, value = commands[name], options[name]
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            number = np.nan
-        if value is None:
-            continue
-        if not (command.least <= number <= command.greatest and np.isfinite(number)):
-            unit = f" {command.unit}" if command.unit else ""
-            raise UserError(
-                f"the option {name} is {value!r}, but must be a number from {command.least:g} to "
-                f"{command.greatest:g}{unit}"
-            )
-        checked[name] = number
-    return checked
+    return {
+        name: command.checked(options[name], f"the option {name}")
+        for name, command in commands.items()
+        if options.get(name) is not None
+    }
 
 
 def _whole(name: str, value: Any, at_least: int) -> int:

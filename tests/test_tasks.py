@@ -1,0 +1,292 @@
+"""The seam between the world and the task: bouncing is one file among others."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from bounce_mjx.config.files import dump_config
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs.config import CONFIG_FILE, load_config, load_run_config, read_preset
+from bounce_mjx.runs.folders import create_run
+from bounce_mjx.tasks import registry
+from bounce_mjx.tasks.registry import find_task, task_name
+from tiny_runs import TINY
+
+CHECKOUT = Path(__file__).parent.parent
+PACKAGE = CHECKOUT / "src" / "bounce_mjx"
+REST = f"{CHECKOUT / 'tests' / 'rest_task.py'}:Rest"
+DRIBBLE = f"{CHECKOUT / 'examples' / 'dribble_task.py'}:Dribble"
+
+# Words that stay outside of tasks/: public names, ids of other libraries, files of the package.
+PUBLIC = re.compile(
+    r"bounce_mjx|BOUNCE_MJX|bounce-mjx|BounceBall|bounce_ball|BounceConfig|tasks\.bounce\b|tasks/bounce\b"
+)
+# A row of the results of `REST`.
+RESULT = r"rests +episodes"
+
+# A ball that hits something in the physics of the world; a default or an example in a sentence for
+# users; and the keys of older files.
+ALLOWED = {
+    "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py",
+    "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
+    "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py", "world/ball_filter.py", "world/observation.py",
+}  # fmt: skip
+
+
+def test_only_the_tasks_folder_speaks_of_bouncing() -> None:
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        name = path.relative_to(PACKAGE).as_posix()
+        text = PUBLIC.sub("", path.read_text(encoding="utf-8"))
+        words = re.findall(r"(?i)\w*(?:bounc|apex|target_?.?height)\w*", text)
+        if words and not name.startswith("tasks/") and name not in ALLOWED:
+            found[name] = sorted(set(words))
+    assert not found
+
+
+def test_nothing_imports_a_task() -> None:
+    """Modules find a task by its name, except for the public names of the package."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            module = node.module if isinstance(node, ast.ImportFrom) else None
+            if re.search(r"tasks\.(?!registry)", str(module)):
+                found.add(path.relative_to(PACKAGE).as_posix())
+    assert found == {"__init__.py", "tasks/bounce.py"}
+
+
+@pytest.fixture(scope="module")
+def without_bouncing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package without its tasks."""
+    root = tmp_path_factory.mktemp("package")
+    shutil.copytree(PACKAGE, root / "src" / "bounce_mjx")
+    for folder in ("mjcf", "configs"):
+        shutil.copytree(CHECKOUT / folder, root / folder)
+    for path in (root / "src/bounce_mjx/tasks").glob("bounce*.py"):
+        path.unlink()
+    return root / "src"
+
+
+def run(source: Path, folder: Path, *args: str, code: int = 0) -> str:
+    """The output of a command of the package in `source`, which must exit with `code`."""
+    done = subprocess.run(
+        [sys.executable, "-m", "bounce_mjx", *args],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(source)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_all_modules_import_without_bouncing(without_bouncing: Path, tmp_path: Path) -> None:
+    script = """
+import importlib, pkgutil, bounce_mjx
+for module in pkgutil.walk_packages(bounce_mjx.__path__, "bounce_mjx."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+print(bounce_mjx.__file__)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(without_bouncing)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.strip() == str(without_bouncing / "bounce_mjx/__init__.py"), done.stderr
+
+
+@pytest.mark.slow
+def test_a_task_without_events_goes_through_every_command(
+    without_bouncing: Path, tmp_path: Path
+) -> None:
+    """In the package without bouncing. The task has no command, event, curve, marker or plot."""
+
+    def command(*args: str, code: int = 0) -> str:
+        return run(without_bouncing, tmp_path, *args, code=code)
+
+    task = ("--task", REST)
+    said = command("train", *task, *TINY, "--total-steps", "128")
+    assert re.search(RESULT, said) and "report:" in said
+    (folder,) = (tmp_path / "runs" / "rest").iterdir()
+    assert "rests" in (folder / "report.html").read_text(encoding="utf-8")
+    command("train", *task, "--resume", str(folder), "--total-steps", "256", "--no-report")
+    assert '"trained_steps": 256' in (folder / "results.json").read_text(encoding="utf-8")
+    assert re.search(RESULT, command("eval", *task, "--episodes", "4"))
+    assert re.search(RESULT, command("eval", *task, "--episodes", "4", "--physics", "mujoco"))
+    suite = tmp_path / "suite.yaml"
+    suite.write_text(
+        "perturbations:\n"
+        "- {name: ball, unit: factor, strengths: [0.9], terms: {ball_mass: strength}}\n"
+    )
+    flags = ("--suite", str(suite), "--episodes", "4")
+    assert "rests" in command("robustness", *task, *flags)
+    command("play", *task, "--html", "play.html", "--seconds", "0.1")
+    command("view", *task, "--html", "view.html", "--seconds", "0.1", "--actions", "zero")
+    assert "script" in command("view", *task, "--html", "x.html", "--actions", "scripted", code=2)
+    command("report", *task)
+    command("plot", *task, "--formats", "svg")
+    command("export", *task, "--onnx", "rest.onnx", "--jax", "rest.jax")
+    script = """
+import numpy as np
+from bounce_mjx import load_policy
+policy = load_policy("rest.onnx")
+sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
+print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(without_bouncing)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == "(6,)\n", done.stderr
+    assert "there is no task 'bounce'" in command("train", code=2)
+
+
+# A task in a file
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A copy of the example that no other test has named."""
+    path = tmp_path / "mine.py"
+    text = Path(DRIBBLE.rpartition(":")[0]).read_text(encoding="utf-8")
+    path.write_text(f"{text}\n# {tmp_path}\n", encoding="utf-8")
+    return path
+
+
+def in_another_process(*lines: str) -> str:
+    """What the lines print in a process in which no task was named."""
+    head = ("from pathlib import Path", "from bounce_mjx.runs.config import load_run_config")
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join([*head, *lines])], capture_output=True, text=True
+    )
+    return done.stdout + done.stderr
+
+
+def test_a_run_keeps_its_task_which_runs_only_if_the_user_names_it(
+    mine: Path, tmp_path: Path
+) -> None:
+    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    run_folder = create_run(config)
+    copy = run_folder / "task" / "mine.py"
+    assert copy.read_bytes() == mine.read_bytes()
+    assert "task: task/mine.py:Dribble\n" in (run_folder / CONFIG_FILE).read_text()
+    # Here the file was named by its content.
+    assert load_run_config(run_folder).env == config.env
+
+    marker = tmp_path / "ran"
+    source = copy.read_text() + f"open({str(marker)!r}, 'w')\n"
+    mine.write_text(source)
+    other = create_run(
+        read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    )
+    marker.unlink()
+    said = in_another_process(f"load_run_config(Path({str(other)!r}))")
+    assert "is code; name it to run it: --task FILE.py:Dribble" in said
+    assert not marker.exists()
+    said = in_another_process(
+        f"config = load_run_config(Path({str(other)!r}), {f'{mine}:Dribble'!r})",
+        "print(type(config.env).__name__, config.env.apex_range)",
+    )
+    assert said == "Config (0.065, 0.085)\n" and marker.exists()
+
+
+def test_another_file_than_the_runs_is_told(
+    mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from bounce_mjx.training.command import TrainingCommand, read_command
+
+    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    run_folder = create_run(config)
+    changed = tmp_path / "changed.py"
+    changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
+    flags = ["--resume", str(run_folder), "--task", f"{changed}:Dribble"]
+    with pytest.raises(UserError, match=r"--resume cannot change the task, and .*changed\.py"):
+        read_command(TrainingCommand, flags, prog="train", description="")
+    assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
+    assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
+    flags[-1] = f"{mine}:Dribble"
+    assert read_command(TrainingCommand, flags, prog="train", description="").env == config.env
+
+
+def test_an_edited_copy_of_a_task_is_refused(mine: Path, tmp_path: Path) -> None:
+    name = f"{mine}:Dribble"
+    config = read_preset(None, task=name).model_copy(update={"log_dir": tmp_path})
+    run_folder = create_run(config)
+    with (run_folder / "task" / "mine.py").open("a") as file:
+        file.write("# edited\n")
+    with pytest.raises(UserError, match=r"is not the task that .* was trained with"):
+        load_run_config(run_folder, name)
+
+
+def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("task: mine.py:Dribble\nenv: {apex_range: [0.06, 0.07]}\n")
+    with pytest.raises(UserError, match=r"which is code; name it yourself to run it: --task "):
+        load_config(path)
+    assert load_config(path, task=f"{mine}:Dribble").env.apex_range == (0.06, 0.07)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bonce", "there is no task 'bonce' .*; did you mean bounce?"),
+        ("missing.py:Task", r"the task's file .*missing\.py cannot be read .*; give FILE.py:CLASS"),
+        (DRIBBLE.replace("Dribble", "Dribbl"), "has no task 'Dribbl' .*Dribble"),
+        (DRIBBLE.replace("Dribble", "Config"), "has no task 'Config'"),
+    ],
+)
+def test_a_wrong_task_is_one_sentence(name: str, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        find_task(name)
+
+
+def test_a_mistake_in_a_tasks_file_names_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.py"
+    path.write_text("import bounce_mjx.task\n\nx = 1 / 0\n")
+    with pytest.raises(
+        UserError, match=r"wrong\.py cannot be imported \(ZeroDivisionError in line 3"
+    ):
+        find_task(f"{path}:Task")
+
+
+def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its entry point gives the task a name, which its runs keep."""
+    package = tmp_path / "my_tasks"
+    package.mkdir()
+    shutil.copy(DRIBBLE.rpartition(":")[0], package / "__init__.py")
+    info = tmp_path / "my_tasks-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_tasks\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nlow = my_tasks:Dribble\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    task = find_task("low")
+    assert task.__name__ == "Dribble" and task_name(task) == "low"
+    config = read_preset(None, task="low")
+    assert "task: low\n" in dump_config(config) and config.log_dir == Path("runs/dribble")
+
+
+def test_a_robot_serves_another_task() -> None:
+    """Its arm and its start pose are kept; the heights are those of the task above its paddle."""
+    preset, robot = CHECKOUT / "configs/cpu.yaml", CHECKOUT / "configs/robots/ur5e.yaml"
+    config, bounce = load_config(preset, robot, DRIBBLE).env, load_config(preset, robot).env
+    assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
+    assert config.default_joint_angles == bounce.default_joint_angles
+    env = Env(config)
+    truth = env.kinematics(jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state)
+    above = np.asarray(truth.ball_position - truth.paddle_position)
+    np.testing.assert_allclose(above, [0.0, 0.0, 0.2], atol=0.08)
