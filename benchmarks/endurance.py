@@ -65,7 +65,7 @@ def measure(command: Command) -> list[dict]:
     @jax.jit
     def start(key):
         states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, command.num_envs))
-        return states, empty_statistics(command.num_envs), jnp.int32(0)
+        return states, empty_statistics(env, states), jnp.int32(0)
 
     def advance(_, carry):
         states, statistics, step = carry

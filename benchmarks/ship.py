@@ -16,7 +16,7 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import DEFAULT_SEED
+from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
@@ -77,7 +77,11 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
         )
     policy = load_policy(checkpoint, trained_with)
     report, physics, _ = run_interruptible(
-        evaluate_policy, policy, trained_with.env, trained_with.ppo, nominal=True
+        evaluate_policy,
+        policy,
+        trained_with.env,
+        trained_with.ppo,
+        EvaluationOptions(nominal=True),
     )
     console.print(results_table(report, f"{checkpoint.folder}, {physics}"))
     console.print(details_line(report), highlight=False)

@@ -668,14 +668,17 @@ def test_one_value_replaces_a_drawn_command(monkeypatch):
 
 
 def test_a_nominal_evaluation_draws_no_worlds(monkeypatch):
-    config = EnvConfig(randomization={"air_drag": (0.1, 0.2)})
+    """Its commands are the task's, if the training had wider ranges: the speed is judged."""
+    config = EnvConfig(target_height_range=(0.3, 0.8), randomization={"air_drag": (0.1, 0.2)})
     options = EvaluationOptions(episodes=2)
     nominal = options._replace(nominal=True)
     fixed = nominal._replace(commands={"target_height": 0.5})
-    seen, _ = seen_worlds(monkeypatch, config, options, nominal, fixed)
+    seen, reports = seen_worlds(monkeypatch, config, options, nominal, fixed)
     assert 0.1 <= seen[0][0]["air_drag"] <= 0.2
     assert seen[1][0] == seen[2][0] == {}
+    assert 0.4 <= seen[1][1]["target_height"] <= 0.6
     assert seen[2][1] == {"target_height": 0.5}
+    assert [report.results[SPEED].passed for report in reports] == [None, False, False]
 
 
 def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):

@@ -27,24 +27,28 @@ from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.recording import Recording
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.curves import Group, group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
-    CURVES,
     curves_figure,
     evaluation_figure,
     image,
     rewards_figure,
 )
 from bounce_mjx.reports.tables import results_markdown
-from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
+from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training import report as training_report
 from bounce_mjx.training.log import Logs, WandbLog, open_log
 
+TERMS = term_names(BounceReward)
+CURVES = (
+    Curve("episode/return", "", title="return of an episode"),
+    *(curve for curve in Bounce.curves if curve.title),
+)
 TINY = (
     "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
     "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
@@ -78,7 +82,7 @@ def runs(tmp_path: Path) -> list[Path]:
     rng = np.random.default_rng(0)
     folders = []
     for seed, num_envs, points in ((0, 4096, 5), (1, 4096, 4), (2, 4096, 5), (0, 2048, 5)):
-        names = [name for name, *_ in CURVES] + [f"reward/{name}" for name in TERM_NAMES]
+        names = [curve.tag for curve in CURVES] + [f"reward/{name}" for name in TERMS]
         scalars = {
             name: {1000 * (i + 1): float(rng.random()) for i in range(points)} for name in names
         }
@@ -209,18 +213,19 @@ def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
 def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
     """One run is one line; the apex error is in centimetres."""
     figure = curves_figure(group_runs(runs[3:]))
-    for axes, (name, _, factor) in zip(figure.axes, CURVES, strict=True):
-        values = logged(runs[3], name)
+    for axes, curve in zip(figure.axes, CURVES, strict=True):
+        values = logged(runs[3], curve.tag)
         line = next(line for line in axes.lines if len(line.get_xdata()))
-        np.testing.assert_allclose(line.get_ydata(), factor * np.array([*values.values()]))
-    assert "cm" in CURVES[2][1] and CURVES[2][2] == 100.0
+        np.testing.assert_allclose(line.get_ydata(), curve.scale * np.array([*values.values()]))
+        assert axes.get_title() == curve.title
+    assert "cm" in CURVES[2].title and CURVES[2].scale == 100.0
 
 
 def test_there_is_a_panel_for_every_reward_term(runs: list[Path]) -> None:
     figure = rewards_figure(group_runs(runs))
     titles = [axes.get_title().replace(" ", "_") for axes in figure.axes]
-    assert titles == list(TERM_NAMES)
-    for axes, name in zip(figure.axes, TERM_NAMES, strict=True):
+    assert titles == list(TERMS)
+    for axes, name in zip(figure.axes, TERMS, strict=True):
         drawn = [line.get_ydata() for line in axes.lines if len(line.get_xdata()) == 5]
         expected = [*logged(runs[3], f"reward/{name}").values()]
         assert any(np.allclose(y, expected) for y in drawn)
@@ -238,9 +243,11 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
         joint_angles=np.zeros((400, 6, 2), np.float32),
         ball=ball,
         paddle=np.zeros((400, 3, 2), np.float32),
-        target_height=np.full((400, 2), 0.5, np.float32),
-        bounced=bounced,
-        apex=np.full((400, 2), 0.53, np.float32),
+        command={"target_height": np.full((400, 2), 0.5, np.float32)},
+        task={
+            "bounced": bounced.astype(np.float32),
+            "apex": np.full((400, 2), 0.53, np.float32),
+        },
         running=running,
     )
     heights, errors, hits = evaluation_figure(env, recording).axes
@@ -248,6 +255,8 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
     line = next(line for line in heights.lines if line.get_label() == "ball")
     np.testing.assert_allclose(line.get_xdata(), 0.01 * np.arange(1, 401))
     np.testing.assert_allclose(line.get_ydata(), ball[:, 2, 0])
+    level = next(line for line in heights.lines if line.get_label() == "target 0.50 m")
+    np.testing.assert_allclose(level.get_ydata(), 0.5)
     # Three bounces after 2 s and before the end of the episode, all with the apex 3 cm too high.
     counts = [bar for bar in errors.patches if bar.get_height()]
     (bar,) = counts
@@ -257,6 +266,44 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
     assert sorted((outline.get_width(), outline.get_height())) == pytest.approx([10.0, 13.0])
     points = next(line for line in hits.lines if line.get_marker() == ".")
     assert len(points.get_xdata()) == 3
+
+
+def test_what_another_task_shows_is_drawn(runs: list[Path], monkeypatch) -> None:
+    """Its curves, its levels, which follow its commands, and any number of its plots."""
+    curves = (Curve("loss/value", "", title="loss, $", scale=2.0), Curve("loss/other", ""))
+    (group,) = group_runs(runs[3:])
+    logged_curve = group.runs[0].curves["episode/return"]
+    run = group.runs[0]._replace(curves=group.runs[0].curves | {"loss/value": logged_curve})
+    figure = curves_figure([Group("a", [run], curves)])
+    assert [axes.get_title() for axes in figure.axes] == ["return of an episode", r"loss, \$"]
+    (line,) = (line for line in figure.axes[1].lines if len(line.get_xdata()))
+    np.testing.assert_allclose(line.get_ydata(), 2.0 * logged_curve.values)
+
+    env, steps = BounceBall(EnvConfig(episode_seconds=0.04)), np.eye(4, 2, dtype=bool)
+    monkeypatch.setattr(Bounce, "levels", lambda self, command: {"rim": command["low"] + 0.1})
+    shown = [
+        Histogram("error, N", "turns", np.array([-3.0, 0.5]), 2.0),
+        Histogram("nothing, m", "holes", np.zeros(0), 1.0),
+        Hits("landings, cm", steps),
+    ]
+    monkeypatch.setattr(Bounce, "plots", lambda self, recording: shown)
+    recording = Recording(
+        *(np.zeros((4, size, 2), np.float32) for size in (6, 3, 3)),
+        command={"low": np.array([[0.1, 9.0], [0.1, 9.0], [0.3, 9.0], [0.3, 9.0]])},
+        task={},
+        running=np.array([[True, True]] * 3 + [[False, True]]),
+    )
+    heights, *plots = evaluation_figure(env, recording).axes
+    (level,) = (line for line in heights.lines if line.get_label() == "rim")
+    np.testing.assert_allclose(level.get_ydata(), [0.2, 0.2, 0.4])
+    assert [axes.get_title() for axes in plots] == [
+        "error, N (2 turns)", "nothing, m (0 holes)", "landings, cm (2)",
+    ]  # fmt: skip
+    bounds = [line.get_xdata()[0] for line in plots[0].lines if line.get_linestyle() == "--"]
+    assert bounds == [-2.0, 2.0]
+    assert [text.get_text() for text in plots[1].texts] == ["no holes"]
+    shown.clear()
+    assert len(evaluation_figure(env, recording).axes) == 1
 
 
 def test_images_have_the_format_of_their_suffix(runs: list[Path]) -> None:
@@ -326,7 +373,7 @@ def check_report(run: Path) -> str:
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     assert len(re.findall(r">128</td>|>256</td>", page)) == 2
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
-    assert TrainConfig.model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
+    assert train_config(Bounce).model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
     return page
 
 
@@ -341,7 +388,7 @@ def test_training_leaves_a_report(trained: Path) -> None:
     height = load_results(trained).best.results[2]
     assert (height.value, height.passed) == (None, False)
     assert ">-</td>" in re.search(r"<td[^>]*>height</td>.*", page)[0]
-    assert "|apex error| -, " in page
+    assert "apex error -, " in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
@@ -394,7 +441,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     (config,) = log.Tensors("config/text_summary")
     text = config.tensor_proto.string_val[0].decode()
     plain = yaml.safe_load(re.fullmatch(r"```yaml\n(.*)```", text, re.DOTALL)[1])
-    assert TrainConfig.model_validate(plain) == load_config(trained / "config.yaml")
+    assert train_config(Bounce).model_validate(plain) == load_config(trained / "config.yaml")
 
     tables = log.Tensors("results/text_summary")
     assert [event.step for event in tables] == [128, 256]

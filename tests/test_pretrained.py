@@ -13,7 +13,8 @@ from rich.console import Console
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import folders
@@ -38,7 +39,7 @@ def measured() -> Report:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
     return evaluate_policy(
-        load_policy(checkpoint, config), config.env, config.ppo, episodes=EPISODES
+        load_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(EPISODES)
     ).report
 
 
@@ -126,7 +127,7 @@ def measure(monkeypatch, ship, measured: Report):
     """A function (report) that makes `ship` measure this report."""
 
     def replace(report: Report) -> None:
-        evaluation = Evaluation(report, "fused", ())
+        evaluation = PolicyEvaluation(report, "fused", ())
         monkeypatch.setattr(ship, "evaluate_policy", lambda *_, **__: evaluation)
 
     replace(measured)

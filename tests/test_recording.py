@@ -5,18 +5,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from bounce_mjx.task.env import TaskState
-from bounce_mjx.task.observation import OBSERVATION, Kinematics
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.env.env import EnvState
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
-from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
-from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
+from bounce_mjx.task import Histogram, Hits, Kinematics, Recording
+from bounce_mjx.tasks.bounce import Bounce
 
 EPISODES, RECORDED = 6, 4
+LAYOUT = EnvConfig().layout
 
 
 @pytest.fixture(scope="module")
@@ -69,26 +70,34 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
         "joint_angles": recording.joint_angles,
         "ball_position": recording.ball,
         "paddle_position": recording.paddle,
-        "target_height": recording.target_height[:, None],
+        "target_height": recording.command["target_height"][:, None],
     }
     for name, recorded in parts.items():
-        expected = stepped.obs[:, OBSERVATION[name]]
+        expected = stepped.obs[:, LAYOUT[name]]
         up_to_end = np.broadcast_to(running[:, None], expected.shape)
         np.testing.assert_allclose(
             recorded[up_to_end], expected[up_to_end], rtol=1e-3, atol=1e-3, err_msg=name
         )
     bounces = (stepped.metrics["bounced"] > 0) & running
     assert bounces.sum() >= RECORDED
-    np.testing.assert_array_equal(settled_bounces(recording, 0), bounces)
+    np.testing.assert_array_equal((recording.task["bounced"] > 0) & recording.running, bounces)
     np.testing.assert_allclose(statistics.steps[:RECORDED], running.sum(axis=0))
 
 
-def test_apex_errors_equal_the_environment(evaluated, stepped) -> None:
+def drawn(recording: Recording, **settings) -> tuple[Histogram, Hits]:
+    """What the task draws; every bounce has settled but one of the first step."""
+    config = EnvConfig(episode_seconds=4.0, **settings)
+    return Bounce(config).plots(recording)
+
+
+def test_apex_errors_equal_the_environment(evaluated, stepped, monkeypatch) -> None:
+    monkeypatch.setattr("bounce_mjx.tasks.bounce.SETTLING_SECONDS", 0.0)
     _, recording = evaluated
-    bounces = settled_bounces(recording, 0)
-    errors = apex_errors(recording, bounces)
-    np.testing.assert_allclose(np.abs(errors), stepped.metrics["apex_error"][bounces], atol=1e-3)
-    assert (errors < 0.0).any()  # a ball that only drops never reaches most targets
+    errors, hits = drawn(recording)
+    expected = 100.0 * stepped.metrics["apex_error"][hits.steps]
+    assert len(expected) >= RECORDED
+    np.testing.assert_allclose(np.abs(errors.values), expected, atol=0.1)
+    assert (errors.values < 0.0).any()  # a ball that only drops never reaches most targets
 
 
 def made_up(steps: int, episodes: int) -> Recording:
@@ -97,29 +106,37 @@ def made_up(steps: int, episodes: int) -> Recording:
         joint_angles=np.zeros((steps, 6, episodes), np.float32),
         ball=np.zeros((steps, 3, episodes), np.float32),
         paddle=np.zeros((steps, 3, episodes), np.float32),
-        target_height=np.zeros((steps, episodes), np.float32),
-        bounced=np.zeros((steps, episodes), bool),
-        apex=np.zeros((steps, episodes), np.float32),
+        command={"target_height": np.zeros((steps, episodes), np.float32)},
+        task={
+            "bounced": np.zeros((steps, episodes), np.float32),
+            "apex": np.zeros((steps, episodes), np.float32),
+        },
         running=np.ones((steps, episodes), bool),
     )
 
 
-def test_settled_bounces_are_late_and_before_the_end() -> None:
+def test_drawn_bounces_are_settled_and_before_the_end(monkeypatch) -> None:
+    """Control steps of 1 s, of which the first two end within 2 s."""
     recording = made_up(6, 2)
-    recording.bounced[[0, 2, 4], :] = True
+    recording.task["bounced"][[0, 2, 4], :] = 1.0
     recording.running[3:, 1] = False
-    late = settled_bounces(recording, 2)
-    assert np.argwhere(late).tolist() == [[2, 0], [2, 1], [4, 0]]
-    assert not settled_bounces(recording, 0)[0].any()  # before it there was no flight
-    assert recording.bounced[0].all()
+    _, hits = drawn(recording, control_dt=1.0)
+    assert np.argwhere(hits.steps).tolist() == [[2, 0], [2, 1], [4, 0]]
+    monkeypatch.setattr("bounce_mjx.tasks.bounce.SETTLING_SECONDS", 0.0)
+    _, hits = drawn(recording, control_dt=1.0)
+    assert not hits.steps[0].any()  # before it there was no flight
+    assert (recording.task["bounced"][0] == 1.0).all()
 
 
 def test_apex_errors_have_a_sign() -> None:
-    recording = made_up(4, 1)
-    recording.target_height[:] = 0.5
-    recording.apex[:, 0] = (0.3, 0.62, 0.1, 0.45)
-    bounces = np.array([[False], [True], [True], [False]])
-    np.testing.assert_allclose(apex_errors(recording, bounces), [-0.2, 0.12], atol=1e-6)
+    """In cm, from the highest position before the bounce."""
+    recording = made_up(6, 1)
+    recording.command["target_height"][:] = 0.5
+    recording.task["apex"][:, 0] = (0.0, 0.0, 0.3, 0.62, 0.1, 0.45)
+    recording.task["bounced"][3:5] = 1.0
+    errors, _ = drawn(recording, control_dt=1.0)
+    np.testing.assert_allclose(errors.values, [-20.0, 12.0], atol=1e-4)
+    assert errors.bound == 10.0
 
 
 def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
@@ -138,7 +155,7 @@ def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
         recording.ball[step, :, episode] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
     bounces = rng.random((5, 3)) < 0.5
     assert 0 < bounces.sum() < bounces.size
-    np.testing.assert_allclose(hit_points(env, recording, bounces), points[bounces], atol=1e-6)
+    np.testing.assert_allclose(paddle_points(env, recording, bounces), points[bounces], atol=1e-6)
 
 
 def test_the_number_of_recorded_episodes_is_limited(env: BounceBall, networks) -> None:
@@ -156,8 +173,8 @@ def test_the_number_of_recorded_episodes_is_limited(env: BounceBall, networks) -
 class NoisyBall(BounceBall):
     """An environment whose sensors return only noise."""
 
-    def observe(self, kinematics: Kinematics, task: TaskState) -> jax.Array:
-        return jnp.sin(1e4 * super().observe(kinematics, task))
+    def observe(self, state: EnvState, truth: Kinematics | None = None) -> jax.Array:
+        return jnp.sin(1e4 * super().observe(state, truth))
 
 
 def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
@@ -170,11 +187,8 @@ def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, p
         make_recording_evaluator(ball, networks, EPISODES, RECORDED)(blind, jax.random.PRNGKey(2))
         for ball in (env, NoisyBall(env.config))
     )
-    assert statistics.rising_steps.sum() > 0 and recording.bounced.any()
-    for name in Statistics._fields:
-        np.testing.assert_allclose(
-            getattr(noisy, name), getattr(statistics, name), rtol=1e-3, err_msg=name
-        )
+    assert statistics.tally.sums["rising_steps"].sum() > 0 and recording.task["bounced"].any()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), noisy, statistics)
     running = recording.running
     np.testing.assert_array_equal(noisy_recording.running, running)
     for name in ("ball", "paddle", "joint_angles"):

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 import yaml
-from bounce_mjx.task.randomization import TERMS, RandomizationConfig
 from matplotlib.patches import Rectangle
 from rich.console import Console
 
@@ -17,8 +16,13 @@ from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
-from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport, measure_conditions
-from bounce_mjx.evaluation.statistics import empty_statistics
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.robustness import (
+    ConditionOutcome,
+    RobustnessReport,
+    measure_conditions,
+)
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
@@ -29,7 +33,11 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.task import Tally
+from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
+DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
 RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
 
@@ -48,7 +56,8 @@ def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = No
 def test_the_shipped_suite_has_every_term() -> None:
     conditions = load_suite(resource_path("configs/robustness.yaml"), EnvConfig())
     assert len(conditions) >= 100
-    assert {term for condition in conditions for term in condition.ranges} == TERMS.keys()
+    ranged = {term for condition in conditions for term in condition.ranges}
+    assert ranged == {*TERMS, "target_height"}
 
     def values(term: str) -> set[float]:
         """Values of all conditions that perturb only this term."""
@@ -80,8 +89,8 @@ def test_strengths_have_a_unit_and_values_a_shape(tmp_path: Path) -> None:
     np.testing.assert_allclose(start.ranges["air_drag"], [0.1, 0.1])
     assert (start.strength, real.strength) == (5.0, None)
     np.testing.assert_allclose(real.ranges["servo_gain"], np.full((2, 6), 0.9))
-    assert real.target_heights == (0.3, 0.8)
-    assert tilt.target_heights == EnvConfig().target_height_range
+    assert real.commands == {"target_height": (0.3, 0.8)}
+    assert tilt.commands == {"target_height": EnvConfig().target_height_range}
 
 
 def test_settings_change_the_task_and_drop_the_training_world(tmp_path: Path) -> None:
@@ -122,6 +131,7 @@ def test_a_list_and_a_group_are_settings_too(tmp_path: Path) -> None:
 
 def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     trained = EnvConfig(
+        target_height_range=(0.3, 0.8),
         randomization={"action_latency": (0.0, 0.02), "gravity_tilt": (-0.02, 0.02)},
     )
     late, tilt, both, everything = (
@@ -133,7 +143,9 @@ def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     conditions = suite(tmp_path, late, tilt, both, everything, trained=trained)
     assert [c.trained for c in conditions] == [True, True, False, True, False, False, True]
     np.testing.assert_allclose(conditions[-1].ranges["gravity_tilt"], [[-0.02] * 2, [0.02] * 2])
-    assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt"}
+    assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt", "target_height"}
+    assert conditions[-1].commands == {"target_height": (0.3, 0.8)}
+    assert conditions[0].commands == {"target_height": (0.4, 0.6)}
     # Without randomisation, a training contains only conditions that leave the world unchanged.
     conditions = suite(tmp_path, late, tilt, both, everything)
     assert [c.trained for c in conditions] == [True, *[False] * 5]
@@ -145,6 +157,16 @@ MISTAKES = {
         [LATE | {"terms": {"action_latencies": "strength"}}],
         "unknown term action_latencies; did you mean action_latency?",
     ),
+    "former term": (
+        [LATE | {"terms": {"target_interval": "strength"}}],
+        "unknown term target_interval; did you mean command_interval?",
+    ),
+    "limit of a command": (
+        [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
+        "'late' at 0.01: target_height (0.0, 0.01) leaves 0.001 to inf; narrow the range",
+    ),
+    "unknown task": ([LATE | {"task": "bunce"}], "there is no task 'bunce'"),
+    "a file as a task": ([LATE | {"task": "task.py:Task"}], "the task task.py:Task is a file"),
     "unknown key": ([LATE | {"strength": 1}], "unknown key"),
     "no strengths": ([LATE | {"strengths": []}], "it has no strengths"),
     "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "strengths are alike"),
@@ -236,12 +258,15 @@ def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
 def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
     policy, ppo, env = shipped
     conditions = three_conditions(tmp_path, env)
-    fused = measure_conditions(policy, ppo, conditions, episodes=4, physics="fused")
-    c = measure_conditions(policy, ppo, conditions, episodes=4, physics="mujoco")
+    fused, c = (
+        measure_conditions(policy, ppo, conditions, EvaluationOptions(4, physics=engine))
+        for engine in ("fused", "mujoco")
+    )
     assert [o.physics for o in (*fused, *c)] == ["fused"] * 3 + ["mujoco"] * 3
     for ours, reference in zip(fused, c, strict=True):
         assert ours.failed == reference.failed
         assert ours.values["stable"] == reference.values["stable"]
+        assert ours.values["stable"] == 100.0 * ours.lasted == 100.0 * reference.lasted
         assert ours.mean_length_s == pytest.approx(reference.mean_length_s, abs=0.03)
         assert ours.values["upward speed"] == pytest.approx(
             reference.values["upward speed"], abs=0.02
@@ -265,7 +290,8 @@ def test_a_policy_that_ignores_the_ball_fails(shipped, tmp_path: Path) -> None:
     blind = policy._replace(params=jax.tree_util.tree_map_with_path(blinded, policy.params))
     kernel = blind.params["params"]["MLP_0"]["hidden_0"]["kernel"]
     assert np.all(kernel[of_ball] == 0.0) and np.any(kernel != 0.0)
-    outcomes = measure_conditions(blind, ppo, conditions, episodes=4, physics="fused")
+    options = EvaluationOptions(4, physics="fused")
+    outcomes = measure_conditions(blind, ppo, conditions, options)
     assert all("stable" in outcome.failed for outcome in outcomes)
 
 
@@ -285,16 +311,26 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         terms = env.config.randomization.terms
 
         def evaluate(policy, key, ranges):
-            calls.append((terms, count))
-            statistics = empty_statistics(count)
+            given_commands = sorted((ranges or {}).keys() - set(terms))
+            calls.append((*terms, *given_commands, count))
             given = {name: np.repeat(low, 4) for name, (low, _) in (ranges or {}).items()}
             late = given.get("action_latency", np.zeros(count))
             rate = given.get("camera_rate", np.zeros(count))
             # 100 steps are one second; the mean length and the speed identify the condition.
-            return statistics._replace(
+            nothing = (
+                "settled_steps", "centred_steps", "settled_bounces", "accurate_bounces",
+                "apex_error",
+            )  # fmt: skip
+            speed = given.get("target_height", np.full(count, 0.5)) + late
+            sums = dict.fromkeys(nothing, np.zeros(count)) | {
+                "rising_steps": np.ones(count),
+                "rising_speed": speed,
+            }
+            return Statistics(
+                running=np.ones(count, bool),
                 steps=100.0 + 1000.0 * late + rate,
-                rising_steps=np.ones(count),
-                rising_speed=given.get("target_height", np.full(count, 0.5)) + late,
+                episode_return=np.zeros(count),
+                tally=Tally(sums, {"n_bounces": np.zeros(count)}),
             )
 
         return evaluate
@@ -303,7 +339,8 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     monkeypatch.setattr(robustness, "make_mujoco_evaluator", make_evaluator)
     monkeypatch.setattr(robustness, "_CPU_BATCH", 14)
     done = []
-    outcomes = measure_conditions(None, PPOConfig(), conditions, episodes=4, progress=done.append)
+    options = EvaluationOptions(4)
+    outcomes = measure_conditions(None, PPOConfig(), conditions, options, done.append)
     assert [(o.perturbation, o.strength) for o in outcomes] == [
         *[("late", s) for s in (0, 5, 10, 15, 20)],
         ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02), ("dry", 5),
@@ -315,11 +352,10 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     speeds = [0.4, 0.405, 0.41, 0.415, 0.42, 0.5, 0.5, 0.8, 0.5, 0.5]
     np.testing.assert_allclose([o.values["upward speed"] for o in outcomes], speeds, rtol=1e-6)
     assert done == sorted(done) and done[-1] == 10
-    plain = ("action_latency", "target_height")
-    assert calls == [(plain, 12)] * 2 + [
-        (("camera_rate",), 8),
-        ((), 4),
-        (("joint_frictionloss",), 4),
+    assert calls == [("action_latency", "target_height", 12)] * 2 + [
+        ("camera_rate", 8),
+        (4,),
+        ("joint_frictionloss", 4),
     ]
 
 
@@ -332,19 +368,22 @@ def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
                 bounds, np.full((2, *term.shape(env.num_joints)), term.nominal)
             )
     np.testing.assert_array_equal(neutral_range("target_height", env), [0.3, 0.5])
+    # Wider ranges of a training are perturbations: the suite is the same for all such policies.
+    wide = EnvConfig(target_height_range=(0.3, 0.8))
+    np.testing.assert_array_equal(neutral_range("target_height", wide), [0.4, 0.6])
     assert neutral_range("camera_rate", env) is None
 
 
 # Table and figure
 
 
-def outcome(name: str, strength: float | None = None, **changes) -> Outcome:
+def outcome(name: str, strength: float | None = None, **changes) -> ConditionOutcome:
     values = dict(zip(RESULTS, (100.0, 99.0, 98.0, 1.4, 100.0), strict=True))
     given = dict(
         perturbation=name, group="g", unit="ms", strength=strength, trained=False, physics="fused",
-        values=values, failed=[], mean_length_s=20.0,
+        values=values, failed=[], lasted=1.0, mean_length_s=20.0,
     )  # fmt: skip
-    return Outcome(**(given | changes))
+    return ConditionOutcome(**(given | changes))
 
 
 @pytest.fixture
@@ -353,11 +392,12 @@ def report() -> RobustnessReport:
     failed = ["consecutive bounces", "height", "stable"]
     return RobustnessReport(
         checkpoint="c", steps=1, suite="s", episodes=4, seed=0,
+        measured={name: f"what {name} means, %" for name in RESULTS},
         outcomes=[
             outcome("nominal", group="nominal", trained=True),
             outcome("late", 0.0, trained=True),
             outcome("late", 5.0, trained=True),
-            outcome("late", 10.0, values=bad, failed=failed),
+            outcome("late", 10.0, values=bad, failed=failed, lasted=0.25),
             outcome("other", 1.0, group="h", physics="mujoco"),
         ],
     )  # fmt: skip
@@ -369,9 +409,13 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     lines = stream.getvalue().splitlines()
     assert "4 of 5 conditions meet all judged results" in lines[0]
     (row,) = [line.split() for line in lines if "10 ms" in line]
-    assert row == ["10", "ms", "25.0*", "50.0*", "-", "-*", "1.80", "FAIL"]
+    assert row == ["10", "ms", "50.0*", "-", "-*", "1.80", "25.0*", "FAIL"]
     (row,) = [line.split() for line in lines if "1 ms" in line]
-    assert row == ["other", "1", "ms", "100.0", "100.0", "99.0", "98.0", "1.40", "pass"]
+    assert row == ["other", "1", "ms", "100.0", "99.0", "98.0", "1.40", "100.0", "pass"]
+    (header,) = [line.split() for line in lines if "strength" in line]
+    assert header == ["condition", "strength", "C", "P", "H", "U", "S"]
+    described = [line.strip() for line in lines]
+    assert "U  upward speed: what upward speed means, %" in described
 
 
 def test_shipped_suite_fits_80_columns() -> None:
@@ -389,7 +433,7 @@ def test_shipped_suite_fits_80_columns() -> None:
     Console(file=stream, width=80).print(robustness_table(report))
     rows = [line for line in stream.getvalue().splitlines() if line.endswith("FAIL ")]
     assert len(rows) == len(outcomes)
-    assert len(stream.getvalue().splitlines()) <= len(rows) + 7, "a name is broken into two lines"
+    assert len(stream.getvalue().splitlines()) <= len(rows) + 12, "a name is broken into two lines"
 
 
 def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None:
@@ -406,7 +450,7 @@ def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None
     words = [text.get_text() for ax in axes for text in ax.texts]
     below = figure.texts[1].get_text()
     assert below.endswith("on the fused engine; other on MuJoCo's C engine")
-    assert words.count("\u2713") == 4 and "BHS" in words
+    assert words.count("\u2713") == 4 and "CHS" in words
     assert {"late, ms", "other, ms", "g", "h"} <= set(words)
 
 
@@ -448,13 +492,15 @@ CRAFTED_OUTCOMES = {
     "no outcomes": None,
     "unknown engine": {"physics": "other"},
     "no results": {"values": {}},
+    "other results": {"values": {"stable": 1.0}},
 }
 
 
 @pytest.mark.parametrize("change", CRAFTED_OUTCOMES.values(), ids=CRAFTED_OUTCOMES)
 def test_a_crafted_report_is_refused(report: RobustnessReport, tmp_path: Path, change) -> None:
     plain = report.model_dump()
-    plain["outcomes"] = [] if change is None else [plain["outcomes"][0] | change]
+    first = plain["outcomes"][0]
+    plain["outcomes"] = [] if change is None else [first | change, first]
     (tmp_path / "robustness.json").write_text(json.dumps(plain))
     with pytest.raises(UserError, match="robustness.json cannot be read"):
         load_robustness(tmp_path)
@@ -464,7 +510,8 @@ def test_names_are_not_read_as_formulas(report: RobustnessReport) -> None:
     name = r"$\frac$, \$5"
     changes = {"perturbation": name, "group": name, "unit": name}
     outcomes = [outcome.model_copy(update=changes) for outcome in report.outcomes]
-    outcomes[0].values["stable"] = None
+    values = {rf"{name} $\frac$": value for name, value in outcomes[0].values.items()}
+    outcomes = [outcome.model_copy(update={"values": values}) for outcome in outcomes]
     image(robustness_figure(report.model_copy(update={"outcomes": outcomes})), "svg")
 
 
@@ -507,3 +554,74 @@ def test_trained_share_is_not_of_the_suite() -> None:
     conditions = load_suite(resource_path("configs/robustness.yaml"), trained)
     config = robustness._spanning_config(conditions[:3], "config")
     assert config.randomization.share == 1.0
+
+
+# Another task
+
+
+def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> None:
+    """The shipped suite runs for a task without its commands, whose own command has its limits."""
+    dribble = find_task(DRIBBLE).Config()
+    shipped, of_bounce = (
+        load_suite(resource_path("configs/robustness.yaml"), config)
+        for config in (dribble, EnvConfig())
+    )
+    names = {c.perturbation.name for c in of_bounce} - {c.perturbation.name for c in shipped}
+    assert names == {"target height", "target changes every"}
+    assert len(of_bounce) - len(shipped) == 8
+    assert all(condition.commands == {"apex": (0.065, 0.085)} for condition in shipped)
+    low, high = suite(
+        tmp_path,
+        dict(name="apex", unit="cm", strengths=[7, 9], terms={"apex": "strength"}),
+        dict(name="only bounce", task="bounce", terms={"target_height": 0.5}),
+        trained=dribble,
+    )
+    assert [c.commands["apex"][0] for c in (low, high)] == pytest.approx([0.07, 0.09])
+    assert [c.trained for c in (low, high)] == [True, False]
+    with pytest.raises(UserError, match="unknown term target_height; known terms are .*apex"):
+        suite(tmp_path, dict(name="target", terms={"target_height": 0.5}), trained=dribble)
+    with pytest.raises(UserError, match="apex .0.001, 0.001. leaves 0.01 to inf"):
+        suite(tmp_path, dict(name="apex", terms={"apex": 0.001}), trained=dribble)
+
+
+def test_another_task_is_measured_in_perturbed_worlds(tmp_path: Path, monkeypatch) -> None:
+    """The table and the figure name its results; the figures of this fake evaluator are of its
+    commands."""
+    conditions = suite(
+        tmp_path,
+        dict(name="apex", unit="cm", strengths=[7, 9], terms={"apex": "strength"}),
+        trained=find_task(DRIBBLE).Config(),
+    )
+
+    def make_evaluator(env, networks, count):
+        def evaluate(policy, key, ranges):
+            wished = np.repeat(ranges["apex"][0], 2)
+            sums = {"apexes": 400.0 * wished, "low_apexes": np.full(count, 28.0)}
+            return Statistics(
+                running=np.array([True, True, True, False]),
+                steps=np.full(count, 100.0),
+                episode_return=np.zeros(count),
+                tally=Tally(sums | {"seconds": np.full(count, 10.0)}),
+            )
+
+        return evaluate
+
+    monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
+    outcomes = measure_conditions(None, PPOConfig(), conditions, EvaluationOptions(2))
+    # 28 apexes in 10 s, all of them low, and 36 of which 28 are low.
+    values = [[*outcome.values.values()] for outcome in outcomes]
+    np.testing.assert_allclose(values, [[100.0, 2.8, 100.0], [2800 / 36, 3.6, 50.0]], rtol=1e-5)
+    assert [outcome.failed for outcome in outcomes] == [["rate"], ["height", "stable"]]
+    assert [outcome.lasted for outcome in outcomes] == [1.0, 0.5]
+    report = RobustnessReport(
+        checkpoint="", steps=0, suite="", episodes=2, seed=0,
+        measured=outcomes[0].measured, outcomes=outcomes,
+    )  # fmt: skip
+    stream = io.StringIO()
+    Console(file=stream, width=80).print(robustness_table(report))
+    lines = [line.strip() for line in stream.getvalue().splitlines()]
+    assert {"R  rate: apexes a second", "H  height: apexes 5 to 10 cm high, %"} <= {*lines}
+    (row,) = [line.split() for line in lines if "9 cm" in line]
+    assert row == ["9", "cm", "77.8*", "3.60", "50.0*", "FAIL"]
+    words = [text.get_text() for ax in robustness_figure(report).axes for text in ax.texts]
+    assert {"R", "HS", "7", "9", "apex, cm"} <= {*words}

@@ -52,7 +52,7 @@ def make_mujoco_evaluator(
     def decide(policy, states):
         actions = act(networks, policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
-        return actions, states, _inputs(env, control)
+        return actions, states, _control_inputs(env, control)
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -71,7 +71,7 @@ def make_mujoco_evaluator(
                 actions, states, inputs = decide(policy, states)
                 inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
                 simulated[:, ball_velocity] += inputs.ball_push
-                simulated = _simulate(pool, models, data, simulated, inputs)
+                simulated = _next_states(pool, models, data, simulated, inputs)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
                 if step % 100 < 99:
@@ -96,14 +96,14 @@ class _Inputs(NamedTuple):
     """Deceleration [N] of the balls by the air divided by their squared speed, 1/m."""
 
 
-def _inputs(env: Env, control: Control) -> _Inputs:
+def _control_inputs(env: Env, control: Control) -> _Inputs:
     """Inputs from controls whose batch is last."""
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
     push = jnp.zeros((len(targets), 3)) if control.ball_push is None else control.ball_push.T
     return _Inputs(targets, push, control.air_drag)
 
 
-def _simulate(
+def _next_states(
     pool: rollout.Rollout,
     models: list[mujoco.MjModel],
     data: list[mujoco.MjData],

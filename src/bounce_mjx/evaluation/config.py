@@ -22,9 +22,10 @@ class EvaluationOptions(NamedTuple):
     """The seed of the resets."""
     physics: Physics = "config"
     nominal: bool = False
-    """Whether the worlds are the model's own; else they are drawn as in the training."""
+    """Whether the worlds are the model's own, with the task's default commands where the policy was
+    trained with them; else both are drawn as in the training."""
     commands: dict[str, float] = {}
-    """Commands by name with one value for all episodes; the others are drawn as in the training."""
+    """Commands by name with one value for all episodes; the others are drawn."""
 
 
 DEFAULT_OPTIONS = EvaluationOptions()

@@ -16,7 +16,7 @@ from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
 
-class _Episodes(NamedTuple):
+class _UnderWay(NamedTuple):
     """Episodes under way, batch last."""
 
     states: State
@@ -66,8 +66,8 @@ def run_episodes(
     return ended.statistics, ended.recording
 
 
-def _begin(env: Env, states: State, recorded: int) -> _Episodes:
-    return _Episodes(
+def _begin(env: Env, states: State, recorded: int) -> _UnderWay:
+    return _UnderWay(
         states=states,
         statistics=empty_statistics(env, states),
         recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
@@ -79,18 +79,18 @@ def _run_until(
     env: Env,
     networks: Networks,
     policy: Policy,
-    progress: _Episodes,
+    progress: _UnderWay,
     last_step: int | jax.Array,
-) -> _Episodes:
+) -> _UnderWay:
     """Goes on until all episodes have ended or `last_step` is reached."""
 
-    def unfinished(now: _Episodes) -> jax.Array:
+    def unfinished(now: _UnderWay) -> jax.Array:
         return jnp.any(now.statistics.running) & (now.step < last_step)
 
-    def advance(now: _Episodes) -> _Episodes:
+    def advance(now: _UnderWay) -> _UnderWay:
         actions = act(networks, policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        return _Episodes(
+        return _UnderWay(
             states=states,
             statistics=accumulate(env, now.statistics, states, now.step),
             recording=record(env, now.recording, states, now.statistics.running, now.step),
@@ -125,11 +125,11 @@ def make_reporting_evaluator(
     the time limit that is simulated."""
 
     @jax.jit
-    def start(key: jax.Array, ranges: Ranges | None) -> _Episodes:
+    def start(key: jax.Array, ranges: Ranges | None) -> _UnderWay:
         return _begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
 
     @jax.jit
-    def go_on(policy: Policy, now: _Episodes, last_step: jax.Array) -> _Episodes:
+    def go_on(policy: Policy, now: _UnderWay, last_step: jax.Array) -> _UnderWay:
         return _run_until(env, networks, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:

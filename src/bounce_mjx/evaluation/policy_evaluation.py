@@ -12,10 +12,11 @@ from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions
 from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
 from bounce_mjx.evaluation.results import Report, judge
+from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig, Ranges
+from bounce_mjx.world.randomization import RandomizationConfig
 
 
 class PolicyEvaluation(NamedTuple):
@@ -47,7 +48,8 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
-    env = Env(_config(env_config, options))
+    env = Env(_with_options(env_config, options))
+    commands = _commands(env_config, options)
     networks = make_networks(ppo_config, env.observation_size, env.action_size)
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
@@ -57,9 +59,11 @@ def evaluate_policy(
         make = make_mujoco_evaluator if on_c else make_reporting_evaluator
         make = functools.partial(make, progress=progress)
     evaluate = make(env, networks, options.episodes)
-    statistics = evaluate(policy, jax.random.PRNGKey(options.seed), _ranges(env, options))
+    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
+    key = jax.random.PRNGKey(options.seed)
+    statistics = evaluate(policy, key, ranges if commands else None)
     return PolicyEvaluation(
-        judge(env, statistics, {name: (v, v) for name, v in options.commands.items()}),
+        judge(env, statistics, commands),
         engine,
         # The warnings concern models on which MuJoCo's solver does not converge, unlike the fused
         # physics.
@@ -67,7 +71,7 @@ def evaluate_policy(
     )
 
 
-def _config(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:
+def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:
     """The config with the options' world and engine."""
     changes = {}
     if options.nominal:
@@ -81,9 +85,13 @@ def _config(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:
     return env.model_copy(update=changes)
 
 
-def _ranges(env: Env, options: EvaluationOptions) -> Ranges | None:
-    """The config's ranges with fixed commands, each end [1, ...]; None for the config's own."""
-    if not options.commands:
-        return None
-    fixed = {name: (value, value) for name, value in options.commands.items()}
-    return jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | fixed)
+def _commands(env: WorldConfig, options: EvaluationOptions) -> dict[str, tuple[float, float]]:
+    """Ranges of the commands that differ from the config's."""
+    ranges = {name: (value, value) for name, value in options.commands.items()}
+    if options.nominal:
+        ranges = neutral_commands(env) | ranges
+    return {
+        name: ends
+        for name, ends in ranges.items()
+        if ends != (env.commands[name].low, env.commands[name].high)
+    }

@@ -135,6 +135,7 @@ def measure_conditions(
         dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
         on_c = options.physics == "mujoco" or dry_in_mjx
         engine = "mujoco" if on_c else env.engine.name
+        names = _given_names(env, members)
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
         size = _batch_size(len(members), options.episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator
@@ -143,19 +144,19 @@ def measure_conditions(
             batch = members[start : start + size]
             # Padding the last call with a repeated condition avoids compiling another shape.
             padded = batch + [batch[-1]] * (size - len(batch))
-            ranges = _stacked_ranges(env, padded)
+            ranges = _stacked_ranges(names, padded)
             statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
             for i, condition in enumerate(batch):
                 own = slice(i * options.episodes, (i + 1) * options.episodes)
                 of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
-                outcome = _outcome(env, condition, of_condition, engine)
+                outcome = _outcome_in(env, condition, of_condition, engine)
                 outcomes[indices[start + i]] = outcome
             done += len(batch)
             progress(done)
     return outcomes
 
 
-def _outcome(
+def _outcome_in(
     env: Env, condition: Condition, statistics: Statistics, engine: str
 ) -> ConditionOutcome:
     report = judge(env, statistics, condition.commands)
@@ -191,17 +192,22 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
     return env.model_copy(update=changes)
 
 
-def _stacked_ranges(env: Env, conditions: Sequence[Condition]) -> Ranges | None:
-    """Ranges of C conditions, each end [C, ...]; None if no term is active and the commands have
-    the ranges of the config."""
+def _given_names(env: Env, conditions: Sequence[Condition]) -> list[str]:
+    """The terms and the commands whose ranges a program takes: a command only if a condition has
+    another range than the config."""
     own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
-    changed = [n for n in own if any(condition.commands[n] != own[n] for condition in conditions)]
+    changed = (n for n in own if any(condition.commands[n] != own[n] for condition in conditions))
+    return [*env.config.randomization.terms, *changed]
+
+
+def _stacked_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Ranges | None:
+    """Ranges of C conditions, each end [C, ...]; None without names."""
     return {
         name: tuple(
             jnp.asarray(np.stack(ends), jnp.float32)
             for ends in zip(*(condition.range(name) for condition in conditions), strict=True)
         )
-        for name in (*env.config.randomization.terms, *changed)
+        for name in names
     } or None
 
 

@@ -99,7 +99,10 @@ class Condition(NamedTuple):
     @property
     def commands(self) -> dict[str, tuple[float, float]]:
         """Range of each command."""
-        return {name: tuple(map(float, self.range(name))) for name in self.env.commands}
+        return {
+            name: tuple(map(float, self.ranges.get(name, ends)))
+            for name, ends in neutral_commands(self.env).items()
+        }
 
 
 def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
@@ -123,7 +126,7 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
         names.add(perturbation.name)
         if not _is_for(perturbation, trained, source):
             continue
-        _check(perturbation, (*TERMS, *trained.commands), source)
+        _check_keys(perturbation, (*TERMS, *trained.commands), source)
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
@@ -134,16 +137,9 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
 
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
     """Range of a term without effect on the world, None if the term has no such value; or that of
-    a command in an unperturbed world.
-
-    It is the task's default range of the command for all policies that were trained with it, so
-    that those with wider ranges are measured like the others; else the policy's own.
-    """
+    a command in a world without randomisation (`neutral_commands`)."""
     if name in env.commands:
-        low, high, *_ = env.commands[name]
-        default = type(env)().commands[name]
-        if low <= default.low and default.high <= high:
-            low, high = default.low, default.high
+        low, high = neutral_commands(env)[name]
     elif name == "push_interval":
         low = high = DEFAULT_PUSH_INTERVAL
     elif name == "command_interval":
@@ -151,6 +147,17 @@ def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
     else:
         low = high = TERMS[name].nominal
     return None if low is None else _shaped(name, env.num_joints, low, high)
+
+
+def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
+    """Range of each command in a world without randomisation: the task's default range for all
+    policies that were trained with it, so that those with wider ranges are measured like the
+    others; else the policy's own."""
+    ranges, defaults = dict(env.commands), type(env)().commands
+    for name, default in defaults.items():
+        if ranges[name].low <= default.low and default.high <= ranges[name].high:
+            ranges[name] = default
+    return {name: (command.low, command.high) for name, command in ranges.items()}
 
 
 def _is_for(perturbation: Perturbation, trained: WorldConfig, source: str) -> bool:
@@ -168,7 +175,7 @@ def _is_for(perturbation: Perturbation, trained: WorldConfig, source: str) -> bo
         raise UserError(f"{source}: {error}") from error
 
 
-def _check(p: Perturbation, known: Sequence[str], source: str) -> None:
+def _check_keys(p: Perturbation, known: Sequence[str], source: str) -> None:
     """Checks a perturbation's own keys.
 
     Args:
@@ -202,11 +209,12 @@ def _condition(
     scale = UNITS[perturbation.unit]
     value = None if strength is None else strength * scale
     plain = trained.model_copy(update={"randomization": RandomizationConfig()})
-    env = _with_settings(plain, perturbation.settings, value, source)
+    env = _with_changes(plain, perturbation.settings, value, source)
     if perturbation.trained_ranges:
         config = trained.randomization
         n = trained.num_joints
         ranges = {name: _shaped(name, n, *getattr(config, name)) for name in config.terms}
+        ranges |= {name: _shaped(name, n, c.low, c.high) for name, c in trained.commands.items()}
     else:
         ranges = {
             term: _bounds(term, trained.num_joints, entry, value, source)
@@ -219,7 +227,7 @@ def _condition(
     return Condition(perturbation, strength, env, ranges, contained)
 
 
-def _with_settings(
+def _with_changes(
     env: WorldConfig, settings: dict[str, Any], strength: float | None, source: str
 ) -> WorldConfig:
     """A config with changed settings."""

@@ -76,7 +76,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     }
     page = run / REPORT_FILE
     try:
-        write_atomically(page, _page(run, config, results, figures))
+        write_atomically(page, _html(run, config, results, figures))
     except OSError as error:
         raise UserError(
             f"{page} cannot be written ({error.strerror}); make the folder writable"
@@ -84,7 +84,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     return page, evaluation
 
 
-def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
+def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
     report = results.best
     pictures = "".join(
         f'<h2>{title}</h2>\n<img alt="{title}" src="{_embed(figure)}">\n'
@@ -94,7 +94,7 @@ def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [f"{e.steps:,}", *[figure_text(e.model_extra[name]) for name in names], _outcome(e)]
+        [f"{e.steps:,}", *[figure_text(e.model_extra[name]) for name in names], _standing(e)]
         for e in results.evaluations
     ]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
@@ -124,7 +124,7 @@ def _page(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 """
 
 
-def _outcome(evaluation: Evaluation) -> str:
+def _standing(evaluation: Evaluation) -> str:
     if evaluation.passed:
         return "pass"
     return "screening" if evaluation.screening else "-"

@@ -65,8 +65,8 @@ def robustness_table(report: RobustnessReport) -> Table:
     """Table of the results in each condition; an asterisk marks a missed bound."""
     letters = result_letters(report)
     described = [
-        f"{letters[name]}  {name}" + f": {report.measured[name]}" * (name in report.measured)
-        for name in letters
+        f"{letter}  {name}: {report.measured[name]}" if report.measured else f"{letter}  {name}"
+        for name, letter in letters.items()
     ]
     table = Table(
         title=summary(report),
@@ -252,14 +252,7 @@ def _draw_legend(figure: Figure, height: float, letters: dict[str, str], framed:
     missed = literal("   ".join(f"{letter} {name}" for name, letter in letters.items()))
     handles = [
         Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
-        Line2D(
-            [],
-            [],
-            marker=f"${next(iter(letters.values()))}$",
-            linestyle="",
-            color=_INK,
-            label=literal(f"missed: {missed}"),
-        ),
+        Line2D([], [], marker=f"${first}$", linestyle="", color=_INK, label=f"missed: {missed}"),
     ]
     if framed:
         handles.insert(
