@@ -1,5 +1,6 @@
-"""Exported policies: the ONNX graph against JAX, the NumPy histories against the environment."""
+"""Exported policies: the ONNX graph against JAX, a deployed policy against the environment."""
 
+import inspect
 import json
 import math
 import random
@@ -15,26 +16,28 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from bounce_mjx.task.observation import QUANTITIES, Kinematics
-from bounce_mjx.task.sensing import Sensing, remember, start_sensing
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy import loading
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.export import describe, export_jax, export_onnx
-from bounce_mjx.deploy.histories import Histories
-from bounce_mjx.deploy.metadata import from_entries
+from bounce_mjx.deploy.export import export_jax, export_onnx, policy_metadata
+from bounce_mjx.deploy.graph import onnx_graph
+from bounce_mjx.deploy.metadata import CommandRange, from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, act, make_networks
 from bounce_mjx.learning.statistics import Normalizer
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
 from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.world.observation import Kinematics
+from bounce_mjx.world.sensing import Sensing, remember
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
@@ -51,6 +54,7 @@ ALL = {
     "bounce_joint_angles": 3,
     "bounce_joint_velocities": 2,
 }
+QUANTITIES = EnvConfig().observation.quantities()
 # A ball bounces for seconds on a level paddle that hardly moves: with such stiff servos the arm
 # sinks only by micrometres.
 STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
@@ -75,11 +79,87 @@ ENVS = {
             "joint_angle_noise": (5e-5, 5e-5),
             "encoder_bias": (-0.003, 0.003),
             "joint_velocity_noise": (0.05, 0.05),
-            "target_height": (0.4, 0.6),
-            "target_interval": (0.3, 0.5),
+            "command_interval": (0.3, 0.5),
         },
         **LEVEL,
     },
+}
+
+
+# A task that counts visits below a commanded height, and remembers the ball's highest speed.
+VISITS = """
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bounce_mjx import task
+
+
+class Observation(task.ObservationConfig):
+    ceiling: Annotated[task.History, task.Quantity(1, "m", "command")] = 0
+    top_speed: Annotated[task.History, task.Quantity(1, "m/s")] = 2
+    visits: Annotated[task.History, task.Quantity(2)] = 3
+
+
+class Config(task.WorldConfig):
+    observation: Observation = Observation()
+
+    @property
+    def commands(self):
+        return {"ceiling": task.Command(0.4, 0.6)}
+
+
+class Memory(NamedTuple):
+    count: jax.Array
+    inside: tuple[jax.Array, jax.Array]
+    speeds: dict[str, jax.Array]
+
+
+class Visits(task.Task):
+    Config = Config
+
+    def reset(self, start):
+        return ()
+
+    def step(self, state, step):
+        zero = jnp.zeros_like(step.action[0])
+        return task.TaskStep(state, {"nothing": zero}, zero > 1.0, {})
+
+    def first_quantities(self, measured):
+        speed = jnp.linalg.norm(measured["ball_velocity"])
+        memory = Memory(
+            jnp.zeros((), jnp.int32), (jnp.array(False), measured["action"]), {"top": speed}
+        )
+        return memory, {"top_speed": speed[None], "visits": measured["ball_position"][:2]}
+
+    def next_quantities(self, memory, seen, measured):
+        inside = measured["ball_position"][2] < measured["ceiling"][0]
+        enters = inside & ~memory.inside[0]
+        count = memory.count + jnp.where(enters, 1, 0)
+        speed = jnp.maximum(memory.speeds["top"], jnp.linalg.norm(measured["ball_velocity"]))
+        change = measured["action"] - memory.inside[1]
+        place = jnp.stack([count.astype(speed.dtype), change @ jnp.arange(6.0)])
+        own = {
+            "top_speed": jnp.concatenate([speed[None, None], seen["top_speed"][:-1]]),
+            "visits": task.latest(seen["visits"], enters, enters | (speed > 2.0), place),
+        }
+        return Memory(count, (inside, measured["action"]), {"top": speed}), own
+"""
+
+
+@pytest.fixture(scope="module")
+def visits(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Name of the task in `VISITS`."""
+    file = tmp_path_factory.mktemp("tasks") / "visits.py"
+    file.write_text(VISITS, encoding="utf-8")
+    return f"{file}:Visits"
+
+
+# The ball is thrown sideways, and the arm moves.
+OF_VISITS = {
+    "observation": {"ball_position": 2, "action": 2, "ball_velocity": 1},
+    "randomization": {"command_interval": (0.05, 0.1), "ball_position_noise": (0.001, 0.001)},
 }
 
 
@@ -88,9 +168,9 @@ def input_name(quantity: str) -> str:
     return "past_actions" if quantity == "action" else quantity
 
 
-def make_run(folder: Path, env: dict) -> Path:
+def make_run(folder: Path, env: dict, task: str = "bounce") -> Path:
     """Writes a run with a random policy; its first input never varied in the training."""
-    config = TrainConfig(env=env, ppo={"hidden_layers": (24, 8)})
+    config = train_config(find_task(task))(task=task, env=env, ppo={"hidden_layers": (24, 8)})
     size = config.env.layout.size
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 1.5, size).astype(np.float32)
@@ -111,10 +191,11 @@ def make_run(folder: Path, env: dict) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs for each of ENVS, and the runs of the package's policies."""
+def runs(visits: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs for each of ENVS, of the task in `VISITS`, and of the package's policies."""
     folder = tmp_path_factory.mktemp("runs")
     made = {name: make_run(folder / name.replace(" ", "_"), env) for name, env in ENVS.items()}
+    made["another task"] = make_run(folder / "another_task", OF_VISITS, visits)
     shipped = {"pretrained": "pretrained", "robust": "pretrained/robust"}
     return made | {name: resource_path(folder) for name, folder in shipped.items()}
 
@@ -125,51 +206,202 @@ def policies(runs: dict[str, Path]) -> dict[str, DeployedPolicy]:
     return {name: load_policy(run) for name, run in runs.items()}
 
 
-@pytest.fixture
-def observations(runs: dict[str, Path]):
-    """Function (name) -> 1,000 observations, the actions of JAX, and the inputs by name."""
-
-    def draw(name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        checkpoint = find_checkpoint(runs[name])
-        config = load_run_config(checkpoint.run)
-        policy = reading.load_policy(checkpoint, config)
-        layout = config.env.layout
-        rng = np.random.default_rng(3)
-        # Some observations are beyond the clipping range of the normaliser.
-        spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
-        noise = spread * rng.normal(size=(1000, layout.size))
-        mean, std = (np.asarray(array) for array in policy.normalizer)
-        observation = (mean + std * noise).astype(np.float32)
-        networks = make_networks(config.ppo, layout.size, config.env.num_joints)
-        inputs = {
-            input_name(part.name): observation[:, layout[part.name]].reshape(
-                1000, getattr(config.env.observation, part.name), -1
-            )
-            for part in layout.parts
-        }
-        return np.asarray(act(networks, policy, observation)), inputs
-
-    return draw
+def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
+    """1,000 inputs of a policy's network by the names of the quantities, and the actions of JAX."""
+    checkpoint = find_checkpoint(runs[name])
+    config = load_run_config(checkpoint.run)
+    policy = reading.load_policy(checkpoint, config)
+    layout, counts = config.env.layout, config.env.observation.seen()
+    rng = np.random.default_rng(3)
+    # Some observations are beyond the clipping range of the normaliser.
+    spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
+    noise = spread * rng.normal(size=(1000, layout.size))
+    mean, std = (np.asarray(array) for array in policy.normalizer)
+    observation = (mean + std * noise).astype(np.float32)
+    inputs = {
+        name: observation[:, layout[name]].reshape(1000, count, -1)
+        for name, count in counts.items()
+    }
+    return inputs, network_of(config, policy)(inputs)
 
 
-@pytest.mark.parametrize("name", [*ENVS, "pretrained", "robust"])
-def test_onnx_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
-    expected, inputs = observations(name)
-    model = export_onnx(find_checkpoint(runs[name]))
-    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    (actions,) = session.run(["action"], inputs)
+def network_of(config: TrainConfig, policy: Policy):
+    """Function: histories [N, H, size] by the names of the quantities -> actions [N, n] of JAX."""
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
+
+    def network(histories: dict[str, np.ndarray]) -> np.ndarray:
+        parts = [np.asarray(histories[name]) for name in config.env.observation.seen()]
+        flat = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        return np.asarray(act(networks, policy, flat))
+
+    return network
+
+
+def session_of(run: Path) -> onnxruntime.InferenceSession:
+    """The exported graph of a run."""
+    model = export_onnx(find_checkpoint(run))
+    return onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+
+
+# Functions of a vector x [3], a matrix a [2, 3], a number s, whole numbers i [3], and truth values
+# b [3] and p. Together they have every operation that a graph may have.
+FUNCTIONS = {
+    "arithmetic": lambda x, s: -x * s + 2.0 - x / 3.0,
+    "functions": lambda x: jnp.sin(x) + jnp.cos(x) * jnp.tanh(x) + jnp.tan(x) - jnp.exp(x),
+    "of positive": lambda x: jnp.sqrt(jnp.abs(x)) + jnp.log(jnp.abs(x)) + jnp.abs(x) ** 0.7,
+    "powers": lambda x: x**2 + x**3 + jnp.square(x) + 1.0 / x**2,
+    "rounding": lambda x: jnp.floor(x) + jnp.ceil(x) + jnp.sign(x) + x % 0.3,
+    "limits": lambda x: jnp.clip(x, -0.5, 0.5) + jax.lax.clamp(-0.3, x, 0.7) + jnp.maximum(x, 0.1),
+    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x),
+    "no gradient": lambda x: jax.lax.stop_gradient(x) + jnp.copy(x),
+    "whole numbers": lambda i: jnp.abs(i) + i * 2 - jnp.minimum(i, 1) + jnp.sign(-i) + i * i,
+    "reductions": lambda i, x: jnp.sum(i) + i.max() - i.min() + jnp.mean(x) + x.max() - x.min(),
+    "of a matrix": lambda a: a.sum(0) + a.max(1).min() + jnp.var(a) + jnp.linalg.norm(a),
+    "truth": lambda b, i: jnp.any(b) & jnp.all(i < 2) | (b[0] != b[1]) ^ ~b[2],
+    "comparisons": lambda x, i: jnp.stack([x > 0.1, x >= i, x < i, x <= 0, i == 1, i != 2]),
+    "conversions": lambda x, b: x.astype(jnp.int32) + b.astype(jnp.int32) + x.astype(bool),
+    "a choice": lambda p, a, s: jnp.where(p, a, s) + jnp.where(a > 0, 1.0, a),
+    "a choice of truth": lambda p, b: jnp.where(p, b, ~b[::-1]),
+    "constants": lambda x: jnp.arange(3.0) * 2 + x + jnp.ones((2, 3))[0],
+    "slices": lambda x, a: jnp.concatenate([x[:1], a[1], x[:0], x[::-1], x[np.array([0, 2])]]),
+    "changes": lambda x: x.at[0].set(x[2]) + x.at[1:].set(4.0),
+    "moves": lambda x: jnp.concatenate([jnp.roll(x, 1), jnp.pad(x, 1), jnp.tile(x, 2), x]),
+    "shapes": lambda a: jnp.repeat(a, 2, 0).reshape(3, 4).T[:, None] + jnp.zeros((4, 2, 3)),
+    "parts": lambda x: sum(jnp.split(x, 3)) + jnp.append(x, 1.0)[3:],
+    "windows": lambda x: jax.lax.dynamic_slice(x, (1,), (2,)),
+    "an update": lambda x: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)),
+    "products": lambda a, x: a @ x + jnp.einsum("ij,ij->i", a, a) + x @ jnp.ones((3, 2)),
+    "outer products": lambda a, x: jnp.outer(x, x)[:2] + a @ a.T @ a + jnp.ones((2, 2)) @ a,
+    "cross": lambda x: jnp.cross(x, x[::-1]) + jnp.hypot(x[0], x[1]),
+}
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, np.ndarray]:
+    """Seven rows of the arguments of `FUNCTIONS`."""
+    rng = np.random.default_rng(0)
+    numbers = {"x": (7, 3), "a": (7, 2, 3), "s": (7,)}
+    floats = {k: rng.normal(size=shape).astype(np.float32) for k, shape in numbers.items()}
+    truths = {"b": rng.random((7, 3)) < 0.5, "p": rng.random(7) < 0.5}
+    return floats | truths | {"i": rng.integers(-3, 4, (7, 3)).astype(np.int32)}
+
+
+def graph_of(function, rows: dict[str, np.ndarray]) -> tuple[onnx.GraphProto, dict]:
+    """The graph of a function with the output `result`, and its inputs."""
+    given = {name: rows[name] for name in inspect.signature(function).parameters}
+    shapes = {k: jax.ShapeDtypeStruct(v.shape[1:], v.dtype) for k, v in given.items()}
+    graph = onnx_graph(lambda named: {"result": function(**named)}, shapes, "the task Test")
+    return graph, given
+
+
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_a_graph_computes_what_jax_computes(function, rows) -> None:
+    graph, given = graph_of(function, rows)
+    opset = [onnx.helper.make_opsetid("", 17)]
+    model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=8)
+    onnx.checker.check_model(model, full_check=True)
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    (result,) = session.run(["result"], given)
+    expected = np.asarray(jax.vmap(lambda named: function(**named))(given))
+    assert result.dtype == expected.dtype
+    np.testing.assert_allclose(result, expected, rtol=2e-5, atol=2e-6)
+
+
+REFUSED = {
+    "sort": lambda x: jnp.sort(x),
+    "atan2": lambda x: jnp.arctan2(x, x),
+    "scan": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: 2.0 * y, x),
+    "dynamic_slice": lambda x, i: x[i[0]],
+    "div of int32": lambda i: jax.lax.div(i, i),
+    "mul of float16": lambda x: x.astype(jnp.float16) * 2,
+}
+
+
+@pytest.mark.parametrize("operation", REFUSED)
+def test_an_operation_without_a_counterpart_is_named(operation: str, rows) -> None:
+    with pytest.raises(UserError, match=f"^the task Test uses the operation {operation}.*; use "):
+        graph_of(REFUSED[operation], rows)
+
+
+def test_a_command_with_the_name_of_a_measurement_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(VISITS.replace("ceiling", "time"), encoding="utf-8")
+    run = make_run(tmp_path / "run", {}, f"{tmp_path / 'mine.py'}:Visits")
+    with pytest.raises(UserError, match="the command time has the name of a measurement"):
+        export_onnx(find_checkpoint(run))
+
+
+@pytest.mark.parametrize("name", ["specification", "pretrained"])
+def test_onnx_equals_jax(name: str, runs: dict[str, Path]) -> None:
+    inputs, expected = draw_inputs(name, runs)
+    given = {input_name(quantity): values for quantity, values in inputs.items()}
+    (actions,) = session_of(runs[name]).run(["action"], given)
     np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-5)
     # Some actions are clipped and some are not.
     assert 0.0 < np.mean(np.abs(expected) == 1.0) < 0.9
 
 
+@pytest.mark.parametrize("name", ["all histories", "sensors", "another task", "robust"])
+def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> None:
+    """1,000 steps at once, some of them the first one."""
+    checkpoint, session = find_checkpoint(runs[name]), session_of(runs[name])
+    config = load_run_config(checkpoint.run)
+    inputs, _ = draw_inputs(name, runs)
+    own, rng = config.env.observation.seen("task"), np.random.default_rng(0)
+    given = {input_name(quantity): values for quantity, values in inputs.items()}
+    measured, remembered = {}, {}
+    for tensor in session.get_inputs():
+        shape = 1000, *tensor.shape[1:]
+        kind, _, quantity = tensor.name.partition("/")
+        if kind == "measured":
+            measured[quantity] = rng.normal(scale=0.3, size=shape).astype(np.float32)
+            given[tensor.name] = measured[quantity]
+        elif kind in ("memory", "step"):
+            draw = {
+                "tensor(float)": rng.normal(scale=0.3, size=shape).astype(np.float32),
+                "tensor(int32)": rng.integers(0, 9, shape).astype(np.int32),
+                "tensor(bool)": rng.random(shape) < 0.5,
+            }
+            given[tensor.name] = draw[tensor.type]
+            remembered[tensor.name] = given[tensor.name]
+    is_first = remembered.pop("step/is_first")
+    results = session.run(None, given)
+    results = dict(zip((output.name for output in session.get_outputs()), results, strict=True))
+
+    task = config.env.task(config.env)
+    newest = dict.fromkeys(QUANTITIES, np.zeros((1000, 6), np.float32)) | measured
+    start, first = jax.vmap(task.first_quantities)(newest)
+    # The inputs of a memory are in the order of its leaves.
+    memory = jax.tree.structure(start).unflatten(remembered.values())
+    past = {quantity: inputs[quantity] for quantity in own}
+    after, later = jax.vmap(task.next_quantities)(memory, past, newest)
+    seen = {
+        name: np.where(
+            is_first[:, None, None], np.asarray(first[name])[:, None], np.asarray(later[name])
+        )
+        for name in own
+    }
+    for quantity, values in seen.items():
+        np.testing.assert_allclose(results[f"next/{quantity}"], values, rtol=1e-6, atol=1e-5)
+        assert np.mean(values != inputs[quantity]) > 0.05
+    leaves = zip(jax.tree.leaves(start), jax.tree.leaves(after), strict=True)
+    for name, (new, old) in zip(remembered, leaves, strict=True):
+        shape = -1, *[1] * (np.ndim(new) - 1)
+        values = np.where(is_first.reshape(shape), new, old)
+        np.testing.assert_allclose(results[f"next/{name}"], values, rtol=1e-6, atol=1e-6)
+    network = network_of(config, reading.load_policy(checkpoint, config))
+    np.testing.assert_allclose(results["action"], network(inputs | seen), rtol=0.0, atol=2e-5)
+
+
 @pytest.mark.parametrize("name", ["all histories", "pretrained"])
-def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path], observations) -> None:
-    expected, inputs = observations(name)
+def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path]) -> None:
+    inputs, expected = draw_inputs(name, runs)
+    given = {input_name(quantity): values for quantity, values in inputs.items()}
     artefact = jax.export.deserialize(export_jax(find_checkpoint(runs[name])))
     assert set(artefact.platforms) == {"cpu", "cuda"}
     for count in (1, 1000):
-        some = {part: values[:count] for part, values in inputs.items()}
+        some = {part: values[:count] for part, values in given.items()}
         np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
 
 
@@ -178,19 +410,27 @@ def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) ->
     metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
     config = load_run_config(runs["sensors"])
     assert {p.name: p.history for p in metadata.observation} == {
-        input_name(q.name): n for q in QUANTITIES if (n := getattr(config.env.observation, q.name))
+        input_name(name): count for name, count in config.env.observation.seen().items()
     }
     assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
     assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7)) and metadata.steps == 64
     assert metadata.control_dt == config.env.control_dt
     assert metadata.randomization["camera_rate"] == (80.0, 130.0)
-    assert metadata.target_height_range == (0.4, 0.6)
+    assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
     assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
     assert metadata.torque_limits == (None,) * 6
-    for node in model.graph.input:
-        shape = [d.dim_value or d.dim_param for d in node.type.tensor_type.shape.dim]
-        (part,) = (p for p in metadata.observation if p.name == node.name)
-        assert shape == ["N", part.history, part.size]
+    shapes = {
+        tensor.name: [d.dim_value or d.dim_param for d in tensor.type.tensor_type.shape.dim]
+        for tensor in model.graph.input
+    }
+    for part in metadata.observation:
+        assert shapes[part.name] == ["N", part.history, part.size]
+    # The bounces depend on these measurements and on no other ones.
+    assert {name for name in shapes if name.startswith("measured/")} == {
+        f"measured/{name}"
+        for name in "ball_picture ball_position joint_angles joint_velocities paddle_position "
+        "target_height".split()
+    }
 
 
 def test_servo_targets_are_those_of_the_environment() -> None:
@@ -220,7 +460,7 @@ def test_paddle_position_is_that_of_mujoco(edited: bool, tmp_path: Path) -> None
         text = text.replace('name="Joint5"', 'name="Joint5" pos="-0.02 0.01 0.03"')
         assert text.count(' ref="0.4"') == 1 and text.count('name="Joint5" pos') == 1
     (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
-    metadata = describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
+    metadata = policy_metadata(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
     model = load_model(tmp_path / "arm.xml", 0.001)
     data, rng, chain = mujoco.MjData(model), np.random.default_rng(0), Chain(metadata)
     for _ in range(20):
@@ -239,42 +479,47 @@ def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
     )
     (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
     with pytest.raises(UserError, match="hangs on the joint 'track'.*remove the joint"):
-        describe(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
+        policy_metadata(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
 
 
-def measured_by(sensing: Sensing, target_height: float) -> dict[str, np.ndarray]:
+def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
     """Newest measurements in an environment's sensor memory."""
     names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
     measured = {name: np.asarray(sensing.seen[name][0]) for name in names}
-    return measured | {
-        "ball_position": np.asarray(sensing.picture.position),
-        "ball_velocity": np.asarray(sensing.picture.velocity),
-        "target_height": target_height,
-    }
+    return (
+        measured
+        | command
+        | {
+            "ball_position": np.asarray(sensing.picture.position),
+            "ball_velocity": np.asarray(sensing.picture.velocity),
+        }
+    )
 
 
-@pytest.mark.parametrize("name", ["all histories", "sensors"])
-def test_histories_are_those_of_the_environment(name: str, policies) -> None:
+@pytest.mark.parametrize("name", ["all histories", "sensors", "another task"])
+def test_histories_are_those_of_the_environment(name: str, runs, policies) -> None:
     """Policy and environment run side by side in a closed loop."""
-    env, policy = BounceBall(EnvConfig(**ENVS[name])), policies[name]
+    env, policy = Env(load_run_config(runs[name]).env), policies[name]
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
     policy.reset()
-    bounces, targets, reached = 0, set(), set()
+    own = {name: set() for name in env.config.observation.seen("task")}
+    commands, reached = set(), set()
     for i in range(300):
-        memory, task = state.pipeline_state.memory, state.pipeline_state.task
-        measured = measured_by(memory.sensing, task.target_height)
+        state_now = state.pipeline_state
+        measured = measured_by(state_now.memory.sensing, state_now.command)
         if name == "sensors":
-            measured["ball_age"] = memory.sensing.picture.age
-        before = None if i == 0 else policy.observation
+            measured["ball_age"] = state_now.memory.sensing.picture.age
         action = policy.step(measured | {"time": 7.0 + i * env.dt})
         np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
-        flight = env.layout["bounce_interval"]
-        bounces += i > 0 and before[flight][0] != policy.observation[flight][0]
-        targets.add(float(task.target_height))
+        for quantity, values in own.items():
+            values.add(tuple(policy.observation[env.layout[quantity]]))
+        commands |= set(map(float, state_now.command.values()))
         reached |= set(np.flatnonzero(policy.observation))
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not state.done, i
-    assert bounces >= 4 and len(targets) >= (5 if name == "sensors" else 1)
+    assert len(commands) >= (1 if name == "all histories" else 5)
+    # The start and at least four bounces or two visits.
+    assert min(map(len, own.values())) >= (3 if name == "another task" else 5)
     # Every entry changed, except the ball's orientation and spin.
     still = range(env.layout["ball_quaternion"].start + 1, env.layout["ball_quaternion"].stop)
     still = {*still, *range(*env.layout["ball_angular_velocity"].indices(env.layout.size))}
@@ -282,19 +527,20 @@ def test_histories_are_those_of_the_environment(name: str, policies) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: int) -> None:
+def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
+    seed: int, tmp_path: Path
+) -> None:
     """History lengths are random, and the ball follows an invented path over a moving paddle."""
     rng = np.random.default_rng(seed)
-    lengths = {quantity.name: int(rng.integers(0, 5)) for quantity in QUANTITIES}
+    lengths = {name: int(rng.integers(0, 5)) for name in QUANTITIES}
     lengths["bounce_interval"] += 1
-    env = TrainConfig(env={"observation": lengths}).env
-    metadata = describe(TrainConfig(env=env), 0)
-    chain, times = Chain(metadata), np.arange(200) * env.control_dt
+    env = EnvConfig(observation=lengths)
+    policy = load_policy(make_run(tmp_path / "run", {"observation": lengths}))
+    chain, times = Chain(policy.metadata), np.arange(200) * env.control_dt
     angles = np.array(env.default_joint_angles) + 0.05 * np.sin(times[:, None] * np.arange(3, 9))
     paddle = np.array([chain.paddle_position(a) for a in angles])
     ball = paddle + rng.normal(scale=0.01, size=paddle.shape)
     ball[:, 2] += 0.4 * np.abs(np.sin(5.0 * times)) + 0.02
-    actions = rng.uniform(-1.0, 1.0, (200, 6))
     truth = Kinematics(
         joint_angles=angles,
         ball_position=ball,
@@ -305,39 +551,42 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(seed: i
         paddle_position=paddle,
     )
     targets, ages = rng.uniform(0.4, 0.6, (200, 1)), 0.03 - 0.0001 * np.arange(200)[:, None]
-    measured = truth._asdict() | {"target_height": targets, "action": actions, "ball_age": ages}
-    given = {name: values for name, values in measured.items() if name != "action"}
+    measured = truth._asdict() | {"target_height": targets, "ball_age": ages, "ball_picture": ball}
+    task, own, action, intervals = env.task(env), env.observation.seen("task"), np.zeros(6), set()
+    memory = seen = None
 
-    def at(i: int, values: dict) -> dict:
-        return {name: array[i] for name, array in values.items()}
+    def first(measured: dict) -> tuple:
+        memory, values = task.first_quantities(measured)
+        seen = measured | values
+        return memory, {
+            name: jnp.broadcast_to(seen[name], (count, *seen[name].shape))
+            for name, count in env.observation.seen().items()
+        }
 
     @jax.jit
-    def remembered(memory, measured, near_height):
-        picture = memory.picture._replace(position=measured["ball_position"])
-        target = measured["target_height"][0]
-        return remember(memory, measured, picture, near_height, target, env.control_dt)
+    def following(memory, seen: dict, measured: dict) -> tuple:
+        memory, values = task.next_quantities(memory, {name: seen[name] for name in own}, measured)
+        return memory, remember(env.observation, seen, measured) | values
 
     with jax.enable_x64(True):
-        start = Kinematics(*(jnp.asarray(values[0]) for values in truth))
-        memory = start_sensing(
-            env.randomization, env.observation, env.control_dt, start, jnp.asarray(targets[0, 0])
-        )
-        histories = Histories(metadata, at(0, given) | {"ball_age": np.zeros(1)})
-        for i in range(1, 200):
-            near_height = paddle[i, 2] + env.bounce_max_distance
-            memory = remembered(memory, at(i, measured), near_height)
-            histories.add(at(i, given), actions[i])
-            for name, values in memory.seen.items():
-                seen = histories.values[input_name(name)]
-                np.testing.assert_allclose(seen, values, atol=1e-9, err_msg=f"{name} at {i}")
-    # There were at least three bounces.
-    intervals = histories.values["bounce_interval"]
-    assert np.count_nonzero(intervals) >= min(3, len(intervals))
+        for i in range(200):
+            now = {name: array[i] for name, array in measured.items()} | {"action": action}
+            memory, seen = following(memory, seen, now) if i else first(now)
+            action = policy.step({name: now[name] for name in policy.units if name in now})
+            for name, values in seen.items():
+                # The graph computes in single precision.
+                tolerance = 2e-6 if name in own else 1e-9
+                values = np.asarray(values).ravel()
+                found = policy.observation[env.layout[name]]
+                np.testing.assert_allclose(found, values, atol=tolerance, err_msg=f"{name}, {i}")
+            intervals.add(float(seen["bounce_interval"][0, 0]))
+    # The start and at least three bounces.
+    assert len(intervals) >= 4
 
 
 def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> None:
     """Without a measured age, a picture is new if the ball has moved."""
-    observation = dict.fromkeys((quantity.name for quantity in QUANTITIES), 0)
+    observation = dict.fromkeys(QUANTITIES, 0)
     observation |= {"ball_velocity": 1, "velocity": "differences"}
     policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
     assert policy.needs == ("ball_position",)
@@ -440,8 +689,11 @@ def test_wrong_measurements_are_refused_and_change_nothing(case: tuple, policies
 
 
 def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
-    names = [quantity.name for quantity in QUANTITIES]
-    observation = dict.fromkeys(names, 0) | {"ball_position": 2, "ball_quaternion": 1, "action": 1}
+    observation = dict.fromkeys(QUANTITIES, 0) | {
+        "ball_position": 2,
+        "ball_quaternion": 1,
+        "action": 1,
+    }
     policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
     assert policy.needs == ("ball_position",)
     policy.step({"ball_position": (1.0, 2.0, 3.0)})
@@ -454,10 +706,45 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["pretrained", "robust"])
 def test_the_shipped_file_is_a_fresh_export(name: str, runs: dict[str, Path]) -> None:
+    """Another version of JAX may write other nodes, but they compute the same."""
     file = runs[name] / f"{name}.onnx"
-    assert onnx.load(file) == onnx.load_from_string(export_onnx(find_checkpoint(runs[name]))), (
-        f"{file} is stale; write it with bounce-mjx export {name} --onnx {file}"
-    )
+    fresh = export_onnx(find_checkpoint(runs[name]))
+    stale = f"{file} is stale; write it with bounce-mjx export {name} --onnx {file}"
+    assert onnx.load(file).metadata_props == onnx.load_from_string(fresh).metadata_props, stale
+    policies = [DeployedPolicy(content, name) for content in (file.read_bytes(), fresh)]
+    for i in range(100):
+        time = 0.01 * i
+        height = 0.1 + abs(math.sin(5.0 * time)) / 3.0
+        measured = falling(time) | {"ball_position": [0.6, 0.01 * math.cos(time), height]}
+        actions = [policy.step(measured) for policy in policies]
+        np.testing.assert_allclose(*actions, atol=1e-5, err_msg=stale)
+
+
+def test_a_file_of_format_2_acts_as_before_unless_the_task_must_remember(
+    runs: dict[str, Path],
+) -> None:
+    new = onnx.load_from_string(export_onnx(find_checkpoint(runs["pretrained"])))
+    old = onnx.ModelProto.FromString(new.SerializeToString())
+    edit_entries(old, {"format": "2", "commands": None})
+    edit_entries(old, {"target_height_range": "[0.4, 0.6]", "bounce_max_distance": "0.12"})
+    policies = [DeployedPolicy(model.SerializeToString(), "a.onnx") for model in (old, new)]
+    assert policies[0].metadata.commands == policies[1].metadata.commands
+    for time in (0.0, 0.01, 0.03):
+        actions = [policy.step(falling(time)) for policy in policies]
+        np.testing.assert_array_equal(*actions)
+
+    entry = next(prop.value for prop in old.metadata_props if prop.key == "observation")
+    edit_entries(old, {"observation": entry.replace("ball_velocity", "apex_error")})
+    with pytest.raises(UserError, match="apex_error is unknown here; export the policy again"):
+        DeployedPolicy(old.SerializeToString(), "a.onnx")
+
+
+def edit_entries(model: onnx.ModelProto, texts: dict[str, str | None]) -> None:
+    """Sets entries of the metadata, or removes those that are None."""
+    entries = {prop.key: prop.value for prop in model.metadata_props} | texts
+    del model.metadata_props[:]
+    known = {name: text for name, text in entries.items() if text is not None}
+    onnx.helper.set_model_props(model, known)
 
 
 def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
@@ -483,7 +770,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),
-        "format is 1, not 2": older.SerializeToString(),
+        "format is 1, not 3": older.SerializeToString(),
     }
     for reason, content in broken.items():
         (tmp_path / "a.onnx").write_bytes(content)
@@ -517,6 +804,7 @@ WRONG_ENTRIES = {
     "chain": [[], {}, [{"joint": 0}], None],
     "observation": [[], {}, [["joint_angles", 1, 6, "rad"]]],
     "randomization": [{"ball_mass": 1.0}, []],
+    "commands": [{}, [], {"target_height": [0.4, 0.6]}, {"time": {"range": [0, 1], "unit": ""}}],
 }
 
 
@@ -544,7 +832,7 @@ def test_a_wrong_entry_is_refused_by_name(name: str, filtered: onnx.ModelProto) 
         with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file") as refusal:
             DeployedPolicy(edited(filtered, name, json.dumps(value)), "a.onnx")
         reason = str(refusal.value)
-        words = (name, "estimator", "joints", "inputs", "length than 1")
+        words = (name, "estimator", "joints", "input", "length than 1", "measurement")
         assert len(reason) < 400 and any(word in reason for word in words), (value, reason)
 
 
@@ -602,11 +890,59 @@ def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.Mode
 
 def test_a_network_that_gives_no_number_is_refused(filtered: onnx.ModelProto) -> None:
     copy = onnx.ModelProto.FromString(filtered.SerializeToString())
-    (bias,) = (tensor for tensor in copy.graph.initializer if tensor.name == "mean/bias")
-    array = onnx.numpy_helper.to_array(bias).copy()
-    array[0] = np.nan
-    bias.CopyFrom(onnx.numpy_helper.from_array(array, bias.name))
+    for tensor in copy.graph.initializer:
+        array = onnx.numpy_helper.to_array(tensor).copy()
+        # The biases of the last layer are among them.
+        if array.shape == (6,) and array.dtype == np.float32:
+            tensor.CopyFrom(onnx.numpy_helper.from_array(array * np.nan, tensor.name))
     with pytest.raises(UserError, match="a.onnx is no policy .*not finite"):
+        DeployedPolicy(copy.SerializeToString(), "a.onnx")
+
+
+HOSTILE_MEMORY = {
+    "endless": lambda model: tensor_shape(model, "memory/lowest").add(dim_value=10**9),
+    "huge": lambda model: [
+        tensor_shape(model, name).add(dim_value=10**15)
+        for name in ("memory/lowest", "next/memory/lowest")
+    ],
+    "of any size": lambda model: [
+        tensor_shape(model, name).add(dim_param="M")
+        for name in ("memory/lowest", "next/memory/lowest")
+    ],
+    "of text": lambda model: retype(model, onnx.TensorProto.STRING),
+    "of wide numbers": lambda model: retype(model, onnx.TensorProto.DOUBLE),
+    "without an end": lambda model: model.graph.output.remove(
+        next(o for o in model.graph.output if o.name == "next/memory/lowest")
+    ),
+}
+
+
+def tensor_shape(model: onnx.ModelProto, name: str):
+    """Dimensions of an input or an output."""
+    tensors = (*model.graph.input, *model.graph.output)
+    return next(t for t in tensors if t.name == name).type.tensor_type.shape.dim
+
+
+def retype(model: onnx.ModelProto, kind: int) -> None:
+    """Another type of a memory."""
+    for tensor in (*model.graph.input, *model.graph.output):
+        if tensor.name.endswith("memory/lowest"):
+            tensor.type.tensor_type.elem_type = kind
+
+
+@pytest.mark.parametrize("edit", HOSTILE_MEMORY.values(), ids=HOSTILE_MEMORY)
+def test_a_memory_of_another_size_is_refused(edit, filtered: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+    edit(copy)
+    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
+        DeployedPolicy(copy.SerializeToString(), "a.onnx")
+
+
+def test_an_unknown_output_is_refused(filtered: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+    copy.graph.output.append(onnx.helper.make_empty_tensor_value_info("more"))
+    copy.graph.node.append(onnx.helper.make_node("Identity", ["action"], ["more"]))
+    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
@@ -710,8 +1046,8 @@ def test_the_example_has_a_late_camera() -> None:
 def test_command_writes_both_files(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     export_command.main("pretrained --onnx policy.onnx --jax policy.jax".split())
-    shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
-    assert (tmp_path / "policy.onnx").read_bytes() == shipped
+    fresh = export_onnx(pretrained_checkpoint())
+    assert (tmp_path / "policy.onnx").read_bytes() == fresh
     artefact = jax.export.deserialize((tmp_path / "policy.jax").read_bytes())
     assert artefact.out_avals[0].shape[1:] == (6,)
     assert "written: policy.onnx" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bounce_mjx import BounceBall
-from bounce_mjx.deploy.export import describe
+from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.deploy.histories import Histories
 from bounce_mjx.gpu.scalars import as_scalars
 from bounce_mjx.learning.policy import act, make_networks
@@ -122,7 +122,7 @@ def test_filtered_velocity_is_several_times_better_than_differences(env, watched
 
 def test_numpy_equals_the_environment(env, watched) -> None:
     """A robot's histories, from the same measurements."""
-    metadata = describe(TrainConfig(env=ENV), 0)
+    metadata = policy_metadata(TrainConfig(env=ENV), 0)
 
     def measured(ball: int, t: int) -> dict[str, np.ndarray]:
         return {
@@ -132,7 +132,7 @@ def test_numpy_equals_the_environment(env, watched) -> None:
         }
 
     for ball in range(2):
-        histories = Histories(metadata, measured(ball, 0))
+        histories = Histories(metadata, metadata.observation, measured(ball, 0))
         for t in range(1, STEPS):
             histories.add(measured(ball, t), np.zeros(6))
             seen = np.concatenate([histories.values[name][0] for name in SEEN])
@@ -141,23 +141,23 @@ def test_numpy_equals_the_environment(env, watched) -> None:
 
 def test_metadata_has_the_constants_of_the_filter() -> None:
     settings = {"restitution": 0.8, "latency": 0.015, "air_drag": 0.1}
-    metadata = describe(TrainConfig(env=ENV | {"estimator": settings}), 0)
+    metadata = policy_metadata(TrainConfig(env=ENV | {"estimator": settings}), 0)
     assert (metadata.position, metadata.velocity) == ("filter", "filter")
     assert settings.items() <= metadata.estimator._asdict().items()
     # Half the paddle's thickness and the ball's radius.
     assert metadata.estimator.contact_distance == pytest.approx(0.0035 + 0.019)
     assert metadata.estimator.gravity == (0.0, 0.0, -9.81)
-    assert describe(TrainConfig(), 0).estimator is None
+    assert policy_metadata(TrainConfig(), 0).estimator is None
 
 
 def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
     """Every position differs, so that each is a new picture."""
-    metadata = describe(TrainConfig(env=ENV | {"estimator": {"latency": 0.02}}), 0)
+    metadata = policy_metadata(TrainConfig(env=ENV | {"estimator": {"latency": 0.02}}), 0)
     angles = np.array(metadata.default_joint_angles)
 
     def estimates(stamp: dict[str, np.ndarray]) -> list[np.ndarray]:
         fall = [{"ball_position": np.array([0.59, 0.0, 0.5 - 5e-4 * t * t])} for t in range(30)]
-        histories = Histories(metadata, fall[0] | {"joint_angles": angles} | stamp)
+        histories = Histories(metadata, metadata.observation, fall[0] | {"joint_angles": angles} | stamp)
         seen = []
         for measured in fall[1:]:
             histories.add(measured | {"joint_angles": angles} | stamp, np.zeros(6))
@@ -172,7 +172,7 @@ def test_pictures_without_time_stamps_have_the_expected_latency() -> None:
 def test_measurements_of_missed_steps_are_no_pictures() -> None:
     """A late call fills the missed control steps with interpolated measurements; to the filter, the
     last picture is still the newest."""
-    metadata = describe(TrainConfig(env=ENV), 0)
+    metadata = policy_metadata(TrainConfig(env=ENV), 0)
     angles = np.array(metadata.default_joint_angles)
 
     def measured(height: float, age: float) -> dict[str, np.ndarray]:
@@ -181,7 +181,7 @@ def test_measurements_of_missed_steps_are_no_pictures() -> None:
 
     seen = []
     for between, is_real in ((measured(0.45, 0.02), False), (measured(0.5, 0.03), True)):
-        histories = Histories(metadata, measured(0.5, 0.02))
+        histories = Histories(metadata, metadata.observation, measured(0.5, 0.02))
         histories.add(between, np.zeros(6), is_real)
         histories.add(measured(0.4, 0.02), np.zeros(6))
         seen.append([histories.values[name][0] for name in SEEN])

@@ -1,4 +1,4 @@
-"""The five results: counting, judging, and both engines."""
+"""The results of bouncing and of another task: counting, judging, and both engines."""
 
 import dataclasses
 import functools
@@ -11,17 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bounce_mjx.task.env import Memory
-from bounce_mjx.task.observation import OBSERVATION
-from bounce_mjx.task.state import State
 from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.env.env import Env, Memory
+from bounce_mjx.env.state import State
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
-from bounce_mjx.evaluation.policy_evaluation import Evaluation, evaluate_policy
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.episodes import (
+    make_evaluator,
+    make_reporting_evaluator,
+    reset_episodes,
+)
+from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
@@ -30,9 +34,13 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task import Tally
+from bounce_mjx.tasks.registry import find_task
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
+LAYOUT = EnvConfig().layout
+DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +67,12 @@ def states(rows) -> State:
         qpos=physics.qpos.at[6].set(columns["x"]).at[7].set(columns["y"]),
         qvel=physics.qvel.at[8].set(columns["vz"]),
     )
+    metrics = {name: columns[name] for name in ("bounced", "n_bounces", "apex_error")}
     return batch.replace(
         pipeline_state=batch.pipeline_state._replace(physics=physics),
         reward=columns["reward"],
         done=columns["done"],
-        metrics={name: columns[name] for name in ("bounced", "n_bounces", "apex_error")},
+        metrics=batch.metrics | metrics,
     )
 
 
@@ -74,18 +83,33 @@ def resting_state() -> State:
 
 def count(env, steps, first_step=0) -> Statistics:
     """Statistics after a list of steps; each step is a list of one dict per episode."""
-    statistics = empty_statistics(len(steps[0]))
+    statistics = empty_statistics(env, states(steps[0]))
     for i, rows in enumerate(steps, start=first_step):
         statistics = accumulate(env, statistics, states(rows), jnp.int32(i))
-    return jax.tree.map(np.asarray, statistics)
+    return flat(statistics)
 
 
-def test_empty_statistics():
-    statistics = empty_statistics(3)
+class Flat(dict):
+    """Every figure of statistics by its name, also as an attribute."""
+
+    __getattr__ = dict.__getitem__
+
+
+def flat(statistics: Statistics) -> Flat:
+    """The figures, with those that the task tallies, as NumPy arrays."""
+    statistics = jax.tree.map(np.asarray, statistics)
+    tally = statistics.tally
+    names = {"running", "steps", "episode_return", *tally.sums, *tally.maxima}
+    assert len(names) == 3 + len(tally.sums) + len(tally.maxima)
+    return Flat(statistics._asdict() | tally.sums | tally.maxima)
+
+
+def test_empty_statistics(env):
+    statistics = empty_statistics(env, states([{}] * 3))
     assert statistics.running.dtype == bool and np.all(statistics.running)
-    for name, value in statistics._asdict().items():
-        assert value.shape == (3,)
-        assert name == "running" or np.all(value == 0)
+    for name, value in flat(statistics).items():
+        if name not in ("running", "tally"):
+            assert value.shape == (3,) and np.all(value == 0)
 
 
 def test_episode_counts_up_to_its_end(env):
@@ -96,7 +120,7 @@ def test_episode_counts_up_to_its_end(env):
     np.testing.assert_array_equal(s.running, [False, True])
     np.testing.assert_array_equal(s.steps, [2, 4])
     np.testing.assert_array_equal(s.episode_return, [4, 8])
-    np.testing.assert_array_equal(s.max_bounces, [4, 3])
+    np.testing.assert_array_equal(s.n_bounces, [4, 3])
     np.testing.assert_array_equal(s.settled_steps, [2, 4])
     np.testing.assert_array_equal(s.centred_steps, [2, 4])
     np.testing.assert_array_equal(s.settled_bounces, [2, 4])
@@ -106,7 +130,7 @@ def test_episode_counts_up_to_its_end(env):
 
 def test_largest_count_is_recorded(env):
     s = count(env, [[{"n_bounces": n}] for n in (1.0, 2.0, 3.0, 1.0)])
-    np.testing.assert_array_equal(s.max_bounces, [3])
+    np.testing.assert_array_equal(s.n_bounces, [3])
 
 
 def test_settling_takes_two_seconds(env):
@@ -131,15 +155,16 @@ def test_bounces_settle_again_after_a_change_of_the_target(env):
         counter=jnp.zeros(4, jnp.int32),
         step=jnp.full(4, 901),
         phases=jnp.zeros((3, 4)),
-        target_age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
-        target_range=(jnp.full(4, 0.3), jnp.full(4, 0.8)),
+        command_age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
+        command_ranges={"target_height": (jnp.full(4, 0.3), jnp.full(4, 0.8))},
         actuation=None,
         sensing=None,
     )
     changing = batch.pipeline_state._replace(
-        world={"target_interval": jnp.full(4, 4.0)}, memory=memory
+        world={"command_interval": jnp.full(4, 4.0)}, memory=memory
     )
-    s = accumulate(env, empty_statistics(4), batch.replace(pipeline_state=changing), jnp.int32(900))
+    batch = batch.replace(pipeline_state=changing)
+    s = flat(accumulate(env, empty_statistics(env, batch), batch, jnp.int32(900)))
     np.testing.assert_array_equal(s.settled_bounces, [0, 0, 1, 1])
     np.testing.assert_array_equal(s.accurate_bounces, [0, 0, 1, 1])
     # The horizontal position does not depend on the target.
@@ -201,14 +226,17 @@ EPISODES = 200
 def statistics(**changes) -> Statistics:
     """Statistics of 200 episodes of 20 s that meet every result; `changes` replace fields."""
     perfect = {
-        "running": True, "steps": 2000, "episode_return": 20_000, "max_bounces": 40,
+        "running": True, "steps": 2000, "episode_return": 20_000, "n_bounces": 40,
         "settled_steps": 1800, "centred_steps": 1800, "settled_bounces": 30,
         "accurate_bounces": 30, "apex_error": 0.6, "rising_steps": 900, "rising_speed": 900,
     }  # fmt: skip
-    values = {name: np.broadcast_to(value, EPISODES) for name, value in perfect.items()}
-    values |= {name: np.broadcast_to(value, EPISODES) for name, value in changes.items()}
-    running = values.pop("running").astype(bool)
-    return Statistics(running, **{name: v.astype(np.float32) for name, v in values.items()})
+    assert changes.keys() <= perfect.keys()
+    values = {
+        name: np.broadcast_to(value, EPISODES).astype(bool if name == "running" else np.float32)
+        for name, value in (perfect | changes).items()
+    }
+    own = {name: values.pop(name) for name in ("running", "steps", "episode_return")}
+    return Statistics(**own, tally=Tally(values, {"n_bounces": values.pop("n_bounces")}))
 
 
 def first(number, value, rest):
@@ -233,9 +261,9 @@ def test_perfect_statistics_pass(env):
     ("result", "changes", "value", "passed"),
     [
         # 99% of 200 episodes is 198.
-        (BOUNCES, {"max_bounces": first(198, 3, 2)}, 99.0, True),
-        (BOUNCES, {"max_bounces": first(197, 3, 2)}, 98.5, False),
-        (BOUNCES, {"max_bounces": 2}, 0.0, False),
+        (BOUNCES, {"n_bounces": first(198, 3, 2)}, 99.0, True),
+        (BOUNCES, {"n_bounces": first(197, 3, 2)}, 98.5, False),
+        (BOUNCES, {"n_bounces": 2}, 0.0, False),
         # 95% of 1,800 steps are 1,710, of 30 bounces 28.5.
         (HORIZONTAL, {"centred_steps": 1710}, 95.0, True),
         (HORIZONTAL, {"centred_steps": first(1, 1709, 1710)}, 100 * 341999 / 360000, False),
@@ -304,7 +332,7 @@ def test_nothing_to_measure_is_shown_as_a_dash(env):
     assert " - " in row and "FAIL" in row
     (row,) = [row for row in results_markdown(report).splitlines() if "| height |" in row]
     assert row.split(" | ")[2:] == ["-", ">= 95", "FAIL |"]
-    assert "|apex error| -, " in details_line(report)
+    assert "apex error -, " in details_line(report)
 
     good = judge(env, statistics())
     rows = show(seeds_table({0: report, 1: good, 2: None})).splitlines()
@@ -336,7 +364,9 @@ def test_seeds_have_one_line_of_80_columns_each(env):
     report = judge(env, statistics())
     seeds = [2**31 - 2, 2**31 - 1, 0]
     rows = show(seeds_table({seeds[0]: report, seeds[1]: report, 0: None})).splitlines()
-    assert [row.split()[0] for row in rows[2:]] == [*map(str, seeds), "mean", "std"]
+    # The names of the columns take three lines.
+    assert [row.split()[0] for row in rows[4:]] == [*map(str, seeds), "mean", "std"]
+    assert all(len(row) <= 80 for row in rows)
 
 
 def test_readme_shows_the_table_as_it_is_printed(env):
@@ -360,7 +390,8 @@ def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
 
 
 def test_fresh_statistics_fail_without_a_crash(env):
-    report = judge(env, empty_statistics(4)._replace(running=jnp.zeros(4, bool)))
+    fresh = empty_statistics(env, states([{}] * 4))
+    report = judge(env, fresh._replace(running=jnp.zeros(4, bool)))
     assert [result.passed for result in report.results] == [False] * 5
     assert report.score == (True, 0, 0.0, 0.0)
 
@@ -385,11 +416,11 @@ def test_upward_speed_is_judged_only_for_low_targets(target_range, judged):
 
 
 def test_upward_speed_is_judged_by_the_drawn_targets(env):
-    drawing = BounceBall(EnvConfig(randomization={"target_height": (0.3, 0.8)}))
+    drawing = BounceBall(EnvConfig(target_height_range=(0.3, 0.8)))
     fast = statistics(rising_speed=9000)
     assert judge(drawing, fast).results[SPEED].passed is None
-    assert judge(drawing, fast, target_heights=(0.5, 0.5)).results[SPEED].passed is False
-    assert judge(env, fast, target_heights=(0.8, 0.8)).results[SPEED].passed is None
+    assert judge(drawing, fast, {"target_height": (0.5, 0.5)}).results[SPEED].passed is False
+    assert judge(env, fast, {"target_height": (0.8, 0.8)}).results[SPEED].passed is None
 
 
 def half_in_half(low, high):
@@ -402,8 +433,8 @@ def half_in_half(low, high):
     ("result", "changes", "margin"),
     [
         # Of 200 episodes 2 may fail, and half of them with a margin.
-        (BOUNCES, {"max_bounces": first(199, 3, 2)}, 1.0),
-        (BOUNCES, {"max_bounces": first(198, 3, 2)}, 0.0),
+        (BOUNCES, {"n_bounces": first(199, 3, 2)}, 1.0),
+        (BOUNCES, {"n_bounces": first(198, 3, 2)}, 0.0),
         (STABLE, {"running": first(199, True, False)}, 1.0),
         (STABLE, {"running": first(198, True, False)}, 0.0),
         (SPEED, {"rising_speed": 900 * half_in_half(1.20, 1.67)}, 1.0),
@@ -440,7 +471,7 @@ def test_the_margin_is_the_spread_of_evaluations_of_64_episodes(env):
 
 
 def test_no_margin_without_judgement(env):
-    report = judge(env, statistics(), target_heights=(0.8, 0.8))
+    report = judge(env, statistics(), {"target_height": (0.8, 0.8)})
     assert report.results[SPEED].margin is None
     assert report.passed_with_margin
 
@@ -467,7 +498,7 @@ def test_score_orders_by_results_met_and_margin_and_then_by_return():
 
 
 def test_report_as_json(env):
-    report = judge(env, statistics(max_bounces=2))
+    report = judge(env, statistics(n_bounces=2))
     data = json.loads(json.dumps(report.to_dict()))
     assert data["passed"] is False
     assert [r["passed"] for r in data["results"]] == [False, True, True, True, True]
@@ -496,8 +527,8 @@ def holding_policy(networks):
     tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
 
     def apply(params, obs):
-        wanted = home + tilt * (obs[..., OBSERVATION["target_height"]] > 0.5)
-        mean = params["gain"] * (wanted - obs[..., OBSERVATION["joint_angles"]])
+        wanted = home + tilt * (obs[..., LAYOUT["target_height"]] > 0.5)
+        mean = params["gain"] * (wanted - obs[..., LAYOUT["joint_angles"]])
         return Gaussian(mean, jnp.ones_like(mean))
 
     network = networks.policy_network._replace(apply=apply)
@@ -509,19 +540,20 @@ def test_evaluator_equals_a_python_loop(networks):
     episodes, key = 6, jax.random.key(21)
     env = BounceBall(EnvConfig(episode_seconds=2.6))
     networks, holding = holding_policy(networks)
-    actual = make_evaluator(env, networks, episodes)(holding, key)
+    actual = flat(make_evaluator(env, networks, episodes)(holding, key))
+    del actual["tally"]
 
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     act = jax.jit(lambda obs: policy.act(networks, holding, obs))
-    expected = {name: np.zeros(episodes) for name in Statistics._fields}
+    expected = {name: np.zeros(episodes) for name in actual}
     for i, episode_key in enumerate(jax.random.split(key, episodes)):
-        state, sums = reset(episode_key), dict.fromkeys(Statistics._fields, 0.0)
+        state, sums = reset(episode_key), dict.fromkeys(actual, 0.0)
         for t in range(260):
             state = step(state, act(state.obs))
             physics = state.pipeline_state.physics
             sums["steps"] += 1
             sums["episode_return"] += float(state.reward)
-            sums["max_bounces"] = max(sums["max_bounces"], float(state.metrics["n_bounces"]))
+            sums["n_bounces"] = max(sums["n_bounces"], float(state.metrics["n_bounces"]))
             if t >= 200:
                 sums["settled_steps"] += 1
                 sums["centred_steps"] += abs(physics.qpos[6] - TARGET_X) <= 0.05
@@ -544,7 +576,7 @@ def test_evaluator_equals_a_python_loop(networks):
     assert expected["settled_bounces"].sum() > 0
     for name, value in expected.items():
         # Each contact magnifies the rounding of the differently compiled steps.
-        np.testing.assert_allclose(getattr(actual, name), value, rtol=1e-2, err_msg=name)
+        np.testing.assert_allclose(actual[name], value, rtol=1e-2, err_msg=name)
 
 
 class CountingBall(BounceBall):
@@ -583,13 +615,14 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     assert env.backend == "fused"
     key = jax.random.key(31)
     shares, shares_on_c = [], []
-    fused = make_reporting_evaluator(env, networks, 8, shares.append)(random_policy, key)
+    fused = flat(make_reporting_evaluator(env, networks, 8, shares.append)(random_policy, key))
     mujoco = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)(random_policy, key)
+    mujoco = flat(mujoco)
     assert shares == shares_on_c == [1.0], "each second of simulated time is reported"
-    assert np.any(fused.max_bounces > 0), "a contact is wanted"
+    assert np.any(fused.n_bounces > 0), "a contact is wanted"
     assert not np.all(fused.running), "an end is wanted"
     np.testing.assert_array_equal(mujoco.running, fused.running)
-    np.testing.assert_array_equal(mujoco.max_bounces, fused.max_bounces)
+    np.testing.assert_array_equal(mujoco.n_bounces, fused.n_bounces)
     np.testing.assert_allclose(mujoco.steps, fused.steps, rtol=0, atol=1)
     np.testing.assert_allclose(mujoco.rising_steps, fused.rising_steps, rtol=0, atol=1)
     np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
@@ -597,37 +630,52 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
 
 
-def test_one_target_height_replaces_the_drawn_ones(random_policy, monkeypatch):
-    """Also where the world of the training draws and changes it."""
-    drawn = {"target_height": (0.3, 0.8), "target_interval": (2.0, 4.0), "air_drag": (0.0, 0.1)}
-    config = EnvConfig(randomization=drawn, episode_seconds=0.5)
-    built = []
+def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
+    """The world and the command of the first episode in evaluations with these options, and the
+    reports; without a simulation."""
+    seen, reports = [], []
 
     def make_evaluator(env, networks, episodes):
-        built.append(env)
-        return lambda policy, key: empty_statistics(episodes)
+        def evaluate(policy, key, ranges):
+            start = reset_episodes(env, key, episodes, ranges)
+            state = jax.tree.map(lambda x: x[..., 0], start.pipeline_state)
+            seen.append((state.world, state.command))
+            return statistics(rising_speed=9000)
+
+        return evaluate
 
     monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
-    evaluate_policy(random_policy, config, PPOConfig(), episodes=2, target_height=0.5)
-    (env,) = built
-    assert env.config.target_heights == (0.5, 0.5)
-    assert env.config.randomization.terms == ("air_drag",)
+    for each in options:
+        reports.append(evaluate_policy(None, config, PPOConfig(), each).report)
+    return seen, reports
 
 
-def test_a_nominal_evaluation_draws_no_worlds(random_policy, monkeypatch):
-    drawn = {"target_height": (0.3, 0.8), "air_drag": (0.1, 0.2)}
-    config = EnvConfig(randomization=drawn, episode_seconds=0.05)
-    worlds = []
+def test_one_value_replaces_a_drawn_command(monkeypatch):
+    """Also where the world of the training draws and changes it; the rest of the world stays. The
+    report is judged by that value."""
+    drawn = {"command_interval": (2.0, 4.0), "air_drag": (0.1, 0.2)}
+    config = EnvConfig(target_height_range=(0.3, 0.8), randomization=drawn)
+    options = EvaluationOptions(episodes=2)
+    fixed = options._replace(commands={"target_height": 0.5})
+    ((world, command), (own_world, own_command)), reports = seen_worlds(
+        monkeypatch, config, fixed, options
+    )
+    assert command["target_height"] == 0.5 != own_command["target_height"]
+    assert world.keys() == {"air_drag"} and 0.1 <= world["air_drag"] <= 0.2
+    assert own_world.keys() == drawn.keys()
+    # Too fast for a low target; at others the speed is not judged.
+    assert [report.results[SPEED].passed for report in reports] == [False, None]
 
-    def make_evaluator(env, networks, episodes):
-        worlds.append(env.reset(jax.random.PRNGKey(0)).pipeline_state.world)
-        return lambda policy, key: empty_statistics(episodes)
 
-    monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
-    for nominal in (False, True):
-        evaluate_policy(random_policy, config, PPOConfig(), episodes=2, nominal=nominal)
-    assert 0.1 <= worlds[0]["air_drag"] <= 0.2
-    assert worlds[1] == {}
+def test_a_nominal_evaluation_draws_no_worlds(monkeypatch):
+    config = EnvConfig(randomization={"air_drag": (0.1, 0.2)})
+    options = EvaluationOptions(episodes=2)
+    nominal = options._replace(nominal=True)
+    fixed = nominal._replace(commands={"target_height": 0.5})
+    seen, _ = seen_worlds(monkeypatch, config, options, nominal, fixed)
+    assert 0.1 <= seen[0][0]["air_drag"] <= 0.2
+    assert seen[1][0] == seen[2][0] == {}
+    assert seen[2][1] == {"target_height": 0.5}
 
 
 def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
@@ -636,17 +684,17 @@ def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     mjcf.write_text(text.replace(' iterations="4"', ' iterations="1"'), encoding="utf-8")
     env_config = EnvConfig(mjcf=mjcf, episode_seconds=0.05)
     ppo_config = PPOConfig(hidden_layers=(16,))
-    evaluate = functools.partial(evaluate_policy, random_policy, env_config, ppo_config, episodes=2)
-    on_c = evaluate(physics="mujoco")
+    evaluate = functools.partial(evaluate_policy, random_policy, env_config, ppo_config)
+    on_c = evaluate(EvaluationOptions(2, physics="mujoco"))
     (warning,) = on_c.warnings
     assert on_c.engine == "mujoco" and 'iterations="1"' in warning
-    assert evaluate().warnings == ()
+    assert evaluate(EvaluationOptions(2)).warnings == ()
 
 
 def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_path):
     """The warnings are printed unchanged, and a missing figure is null in the file."""
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
-    evaluation = Evaluation(report, "mujoco", ("the solver [CG] stops.",))
+    evaluation = PolicyEvaluation(report, "mujoco", ("the solver [CG] stops.",))
     said_first, now = [], 0.0
     monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
 
@@ -670,7 +718,79 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
     # A line after each tenth, and never more often than every 10 s.
     assert re.findall(r"(\d+)% evaluated", shown) == ["10", "20"]
     assert "warning: the solver [CG] stops.\n" in shown
-    assert "|apex error| -" in shown
+    assert "apex error -," in shown
     plain = json.loads(results.read_text(), parse_constant=pytest.fail)
     assert plain["results"][HEIGHT]["value"] is None
     assert plain["details"]["mean_apex_error_m"] is None
+
+
+# Another task
+
+
+@pytest.fixture(scope="module")
+def dribbling() -> Env:
+    return Env(find_task(DRIBBLE).Config(ball_init_pos=(0.6, 0.0, 0.2)))
+
+
+def test_another_task_is_counted_and_judged_by_itself(dribbling):
+    """Three invented episodes of its events, the last of which ends early."""
+    start = jax.vmap(dribbling.reset, out_axes=-1)(jax.random.split(jax.random.key(0), 3))
+    statistics = empty_statistics(dribbling, start)
+    # Steps 199 and 200 end after 2.00 and 2.01 s, and only the latter counts.
+    rows = [
+        (199, [1, 1, 1], [1, 1, 1], [0, 0, 0]),
+        (200, [1, 1, 0], [1, 1, 0], [0, 0, 0]),
+        (201, [0, 1, 0], [0, 0, 0], [0, 0, 1]),
+        (202, [0, 1, 1], [0, 1, 1], [0, 0, 0]),
+    ]
+    for step, apexes, low, done in rows:
+        metrics = {"apexes": jnp.array(apexes, float), "low_apexes": jnp.array(low, float)}
+        now = start.replace(
+            metrics=start.metrics | metrics, done=jnp.array(done), reward=jnp.ones(3)
+        )
+        statistics = accumulate(dribbling, statistics, now, jnp.int32(step))
+    report = judge(dribbling, statistics)
+    assert [result.name for result in report.results] == ["height", "rate", "stable"]
+    # Of 4 apexes 3 are low; they came in 3 + 3 + 2 steps of 10 ms.
+    values = [result.value for result in report.results]
+    np.testing.assert_allclose(values, [75.0, 4 / 0.08, 100 * 2 / 3], rtol=1e-5)
+    assert [result.passed for result in report.results] == [False, True, False]
+    assert report.summary == "1 of 3 results met"
+    assert details_line(report) == "3 episodes: return 4, length 0.04 s (means)"
+    rows = show(seeds_table({0: report, 1: None})).splitlines()
+    assert rows[2].split()[:4] == ["seed", "height", "rate", "stable"]
+    assert rows[3].split() == ["0", "75.00", "50.00", "66.67", "FAIL"]
+
+
+def test_the_evaluation_of_another_task_takes_its_commands(dribbling, monkeypatch):
+    given = []
+
+    def results(self, episodes):
+        given.append(episodes.commands)
+        return (Result("none", "", 1.0, "", True),)
+
+    monkeypatch.setattr(type(dribbling.task), "results", results)
+    monkeypatch.setattr(
+        policy_evaluation,
+        "make_evaluator",
+        lambda env, *_: (
+            lambda policy, key, ranges: empty_statistics(env, reset_episodes(env, key, 2, ranges))
+        ),
+    )
+    options = EvaluationOptions(2, commands={"apex": 0.07})
+    for each in (options, EvaluationOptions(2)):
+        evaluate_policy(None, dribbling.config, PPOConfig(), each)
+    assert given == [{"apex": (0.07, 0.07)}, {"apex": (0.065, 0.085)}]
+
+
+def test_a_detail_is_shown_in_its_unit():
+    fixed = {"episodes": 8.0, "mean_return": 12.4, "mean_length_s": 1.0}
+    own = {
+        "mean_error_m": 0.0123, "mean_speed_m_s": 1.5, "hits": 34.0, "mean_load": None,
+        "mean_tilt_rad": np.pi, "mean_gap_m": None,
+    }  # fmt: skip
+    report = Report((Result("a", "", 1.0, "", True),), fixed | own)
+    assert details_line(report) == (
+        "8 episodes: error 1.23 cm, speed 1.50 m/s, load -, tilt 180.0 deg, gap -, return 12, "
+        "length 1.00 s (means), hits 34.0"
+    )

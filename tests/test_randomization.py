@@ -1,6 +1,7 @@
 """Randomised worlds: draws, late actions, late and noisy sensors, pushes and targets."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -517,7 +518,8 @@ EPISODES, STEPS, DT = 32, 150, 0.01
 
 
 def trajectory() -> tuple[np.ndarray, np.ndarray]:
-    """Trajectory of a bouncing ball over a swaying arm: qpos and qvel [T + 1]."""
+    """Trajectory of a bouncing ball over a swaying arm: qpos and qvel [T + 1]. The ball starts at
+    rest."""
     time = DT * np.arange(STEPS + 1)
     qpos, qvel = np.zeros((STEPS + 1, 13)), np.zeros((STEPS + 1, 12))
     qpos[:, 9] = 1.0
@@ -532,6 +534,7 @@ def trajectory() -> tuple[np.ndarray, np.ndarray]:
         z, vz = z + vz * DT, vz - 9.81 * DT
         if z < 0.075 and vz < 0.0:
             vz = 2.2 + 0.3 * np.sin(t)
+    qvel[0, 6:9] = 0.0
     return qpos, qvel
 
 
@@ -540,6 +543,8 @@ class Watch(NamedTuple):
 
     world: dict
     phase: np.ndarray
+    first: dict
+    """Values of each part at the reset [N, n, size]."""
     parts: dict
     """Values of each part [N, T, n, size], the newest first."""
     actions: np.ndarray
@@ -566,7 +571,8 @@ def watching(camera: bool, velocity: str):
             pipeline = start.pipeline_state._replace(physics=physics)
             # The first memory must also have the ball of the trajectory.
             memory = env._first_memory(pipeline, env.kinematics(pipeline), key)
-            start = start.replace(pipeline_state=pipeline._replace(memory=memory))
+            pipeline = pipeline._replace(memory=memory)
+            start = start.replace(pipeline_state=pipeline, obs=env.observe(pipeline))
 
             def step(state, inputs):
                 action, physics = inputs
@@ -577,7 +583,7 @@ def watching(camera: bool, velocity: str):
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
             _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
-            return start.pipeline_state.world, memory.phases[0], *seen
+            return start.pipeline_state.world, memory.phases[0], start.obs, *seen
 
         return jax.vmap(of_one)(keys, ranges)
 
@@ -585,14 +591,17 @@ def watching(camera: bool, velocity: str):
         ranges = {name: PERFECT[name] for name in sensors} | changed
         ranges = {n: tuple(jnp.full(EPISODES, e) for e in r) for n, r in ranges.items()}
         keys = jax.random.split(jax.random.PRNGKey(0), EPISODES)
-        world, phase, obs, targets, privileged = jax.device_get(watch(ranges, keys))
-        parts = {
-            part.name: obs[..., env.layout[part.name]].reshape(
-                EPISODES, STEPS, PARTS[part.name], -1
-            )
-            for part in env.layout.parts
-        }
-        return Watch(world, phase, parts, actions, targets, privileged)
+        world, phase, first, obs, targets, privileged = jax.device_get(watch(ranges, keys))
+
+        def parts(obs: np.ndarray) -> dict[str, np.ndarray]:
+            return {
+                part.name: obs[..., env.layout[part.name]].reshape(
+                    *obs.shape[:-1], PARTS[part.name], -1
+                )
+                for part in env.layout.parts
+            }
+
+        return Watch(world, phase, parts(first), parts(obs), actions, targets, privileged)
 
     return run
 
@@ -602,30 +611,28 @@ def watch(float64):
     return watching(camera=True, velocity="measured")
 
 
-def ball_path() -> CubicHermiteSpline:
-    """Position of the ball between the control steps, by the positions and velocities at them."""
+def ball_path() -> Callable[[np.ndarray], np.ndarray]:
+    """Position of the ball between the control steps, by the positions and velocities at them. The
+    ball rests before the reset."""
     qpos, qvel = trajectory()
-    return CubicHermiteSpline(DT * np.arange(STEPS + 1), qpos[:, 6:9], qvel[:, 6:9])
+    path = CubicHermiteSpline(DT * np.arange(STEPS + 1), qpos[:, 6:9], qvel[:, 6:9])
+    return lambda times: path(np.maximum(times, 0.0))
 
 
 def pictures(world: dict, phase: float, w: int):
-    """Measured position, velocity and age at each control step, simulated frame by frame: the
+    """Measured position, velocity and age at the reset and each control step, frame by frame: the
     camera takes picture n at (n + phase) / rate, and the picture arrives after the latency."""
     qpos, qvel = trajectory()
     time = DT * np.arange(STEPS + 1)
     rate, latency = float(world["camera_rate"][w]), float(world["ball_latency"][w])
-    taken = (np.arange(2000) + phase) / rate
+    taken = (np.arange(-100, 2000) + phase) / rate
     taken = taken[taken < time[-1]]
 
     positions = ball_path()(taken)
     velocities = np.stack([np.interp(taken, time, column) for column in qvel[:, 6:9].T], axis=1)
-    for now in time[1:]:
-        arrived = np.flatnonzero(taken + latency <= now + 1e-4 / rate)
-        if len(arrived):
-            n = arrived[-1]
-            yield n, positions[n], velocities[n], now - taken[n]
-        else:
-            yield -1, qpos[0, 6:9], qvel[0, 6:9], now
+    for now in time:
+        n = np.flatnonzero(taken + latency <= now + 1e-4 / rate)[-1]
+        yield n, positions[n], velocities[n], now - taken[n]
 
 
 def test_camera_is_that_of_a_simulation(watch) -> None:
@@ -634,9 +641,13 @@ def test_camera_is_that_of_a_simulation(watch) -> None:
     for w in range(EPISODES):
         expected = list(pictures(seen.world, seen.phase[w], w))
         _, position, velocity, age = (np.array(x) for x in zip(*expected, strict=True))
-        np.testing.assert_allclose(seen.parts["ball_position"][w, :, 0], position, atol=2e-5)
-        np.testing.assert_allclose(seen.parts["ball_velocity"][w, :, 0], velocity, atol=2e-3)
-        np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], age, atol=2e-6)
+        for name, values, atol in (
+            ("ball_position", position, 2e-5),
+            ("ball_velocity", velocity, 2e-3),
+            ("ball_age", age[:, None], 2e-6),
+        ):
+            np.testing.assert_allclose(seen.parts[name][w, :, 0], values[1:], atol=atol)
+            np.testing.assert_allclose(seen.first[name][w, 0], values[0], atol=atol)
     held = np.diff(seen.parts["ball_position"][:, :, 0], axis=1) == 0.0
     rate = np.asarray(seen.world["camera_rate"])
     assert np.all(held.all(axis=2).any(axis=1)[rate < 90]), "a slow camera holds its picture"
@@ -647,11 +658,11 @@ def test_lost_pictures_do_not_come_later(watch) -> None:
     seen = watch(frame_drop=(0.3, 0.3), camera_rate=(60.0, 60.0))
     new, lost = 0, 0
     for w in range(EPISODES):
-        expected = list(pictures(seen.world, seen.phase[w], w))
+        reset, *expected = pictures(seen.world, seen.phase[w], w)
         position, age = seen.parts["ball_position"][w, :, 0], seen.parts["ball_age"][w, :, 0, 0]
-        last = trajectory()[0][0, 6:9]
+        last = reset[1]
         for t, now in enumerate(expected):
-            due = now[0] > (expected[t - 1][0] if t else -1)
+            due = now[0] > (expected[t - 1] if t else reset)[0]
             is_new = due and np.abs(position[t] - now[1]).max() < 2e-5
             last = now[1] if is_new else last
             np.testing.assert_allclose(position[t], last, atol=2e-5)
@@ -708,9 +719,27 @@ def test_servo_targets_start_from_the_measured_angles(watch) -> None:
     """With the noise that the policy saw. The servo shares the error of its encoder's zero, which
     therefore has no effect on the true target."""
     seen = watch(joint_angle_noise=(0.01, 0.01), encoder_bias=(-0.05, 0.05))
-    measured = seen.parts["joint_angles"][:, :-1, 0] - seen.world["encoder_bias"][:, None]
-    np.testing.assert_allclose(seen.targets[:, 1:], measured + 0.02 * seen.actions[1:], atol=1e-7)
-    assert np.abs(measured - trajectory()[0][1:-1, :6]).max() > 0.03
+    angles = seen.parts["joint_angles"][:, :-1, 0]
+    angles = np.concatenate([seen.first["joint_angles"][:, :1], angles], axis=1)
+    measured = angles - seen.world["encoder_bias"][:, None]
+    np.testing.assert_allclose(seen.targets, measured + 0.02 * seen.actions, atol=1e-7)
+    assert np.abs(measured - trajectory()[0][:-1, :6]).max() > 0.03
+
+
+def test_the_first_observation_is_measured_like_the_others(watch) -> None:
+    """Its errors have the sizes of all others, and histories repeat it."""
+    sizes = {"ball_position": 0.02, "joint_angle": 0.01, "joint_velocity": 0.2}
+    noisy = {f"{name}_noise": (size, size) for name, size in sizes.items()}
+    seen, clean = watch(**noisy), watch()
+    names = ("ball_position", "joint_angles", "joint_velocities")
+    for name, size in zip(names, sizes.values(), strict=True):
+        first = seen.first[name]
+        error = (first - clean.first[name])[:, 0].ravel()
+        assert stats.kstest(error / size, "norm").pvalue > 1e-3
+        np.testing.assert_array_equal(first, first[:, :1].repeat(PARTS[name], axis=1))
+    bias = watch(encoder_bias=(-0.05, 0.05))
+    error = bias.first["joint_angles"][:, 0] - trajectory()[0][0, :6]
+    np.testing.assert_allclose(error, bias.world["encoder_bias"], atol=1e-9)
 
 
 def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
@@ -780,7 +809,8 @@ def test_bounces_are_those_of_the_measurements(watch) -> None:
                 assert part["bounce_interval"][t, i, 0] == pytest.approx(interval, abs=1e-9)
                 flown = np.flatnonzero(low[:s])
                 flight = ball[flown[-1] if len(flown) else 0 : s, 2]
-                apex = max(flight.max(), trajectory()[0][0, 8] if not len(flown) else 0.0)
+                start = seen.first["ball_position"][w, 0, 2]
+                apex = max(flight.max(), start if not len(flown) else 0.0)
                 assert part["apex_error"][t, i, 0] == pytest.approx(apex - target, abs=1e-9)
 
 

@@ -14,7 +14,6 @@ import types
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-
 Hook = Callable[[types.ModuleType], None]
 
 

@@ -21,7 +21,12 @@ from rich.progress import (
 from bounce_mjx.commands.run_options import RunOptions, parse_with_commands
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, Physics
+from bounce_mjx.evaluation.config import (
+    DEFAULT_EPISODES,
+    DEFAULT_SEED,
+    EvaluationOptions,
+    Physics,
+)
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.training.loop_fusion import join_loops
@@ -88,11 +93,9 @@ def main(args: Sequence[str] | None = None) -> None:
                 policy,
                 config.env,
                 config.ppo,
-                episodes=command.episodes,
-                seed=command.seed,
-                commands=commands,
-                nominal=command.nominal,
-                physics=command.physics,
+                EvaluationOptions(
+                    command.episodes, command.seed, command.physics, command.nominal, commands
+                ),
                 started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
                 progress=progress.show,
             )

@@ -13,14 +13,19 @@ from bounce_mjx.commands.run_options import RunOptions
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
+from bounce_mjx.evaluation.config import (
+    DEFAULT_CONDITION_EPISODES,
+    DEFAULT_SEED,
+    EvaluationOptions,
+    Physics,
+)
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import resource_path
 from bounce_mjx.training.loop_fusion import join_loops
 
 if TYPE_CHECKING:
-    from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
+    from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
     from bounce_mjx.evaluation.suite import Condition
     from bounce_mjx.learning.policy import Policy
     from bounce_mjx.runs.config import TrainConfig
@@ -79,13 +84,15 @@ def main(args: Sequence[str] | None = None) -> None:
         shipped = checkpoint.run in map(resource_path, SHIPPED.values())
         out = command.out or (Path("robustness") if shipped else checkpoint.run)
         _make_folder(out)
+        outcomes = _measure(command, config, policy, conditions, console)
         report = RobustnessReport(
             checkpoint=str(checkpoint.folder),
             steps=checkpoint.steps,
             suite=str(suite),
             episodes=command.episodes,
             seed=command.seed,
-            outcomes=_measure(command, config, policy, conditions, console),
+            measured=outcomes[0].measured,
+            outcomes=outcomes,
         )
         console.print(robustness_table(report))
         _write(out, report)
@@ -98,10 +105,11 @@ def _measure(
     policy: "Policy",
     conditions: "Sequence[Condition]",
     console: Console,
-) -> "list[Outcome]":
+) -> "list[ConditionOutcome]":
     """Measures all conditions and shows a progress bar."""
     from bounce_mjx.evaluation.robustness import measure_conditions
 
+    options = EvaluationOptions(command.episodes, command.seed, command.physics)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("conditions", total=len(conditions))
@@ -109,9 +117,7 @@ def _measure(
             policy,
             config.ppo,
             conditions,
-            episodes=command.episodes,
-            seed=command.seed,
-            physics=command.physics,
+            options,
             progress=lambda done: bar.update(task, completed=done),
         )
 

@@ -1,4 +1,4 @@
-"""The Kalman filter of the ball in NumPy: the twin of `task/estimator.py`, by the same code."""
+"""The Kalman filter of the ball in NumPy: the twin of `world/estimator.py`, by the same code."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from bounce_mjx.world.ball_filter import BallFilter
 _MEMORY = 0.3
 
 
-class Estimator:
+class RobotEstimator:
     """The filter with its track of one ball."""
 
     def __init__(

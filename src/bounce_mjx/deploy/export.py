@@ -1,34 +1,41 @@
-"""A trained policy as one ONNX graph, or as a compiled JAX function.
+"""A trained policy as one ONNX graph, or its network as a compiled JAX function.
 
 Both have a separate input for each part of the observation. The runtime checks the names and shapes
 of the inputs; a single vector would hide a wrong order.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.deploy import metadata as metadata_module
-from bounce_mjx.deploy.metadata import FORMAT, Link, Metadata, Part
+from bounce_mjx.deploy.graph import EXTRA, onnx_graph
+from bounce_mjx.deploy.metadata import (
+    FORMAT,
+    IS_FIRST,
+    MEASURED,
+    NEXT,
+    UNITS,
+    CommandRange,
+    Hinge,
+    Input,
+    Metadata,
+    to_entries,
+)
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import Policy, act, make_networks
-from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD
 from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.estimator import filter_constants, paddle_normal
-from bounce_mjx.world.observation import parts
+from bounce_mjx.world.observation import ObservationConfig
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
-
-_EXTRA = "'bounce_mjx[export]'"
 
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
@@ -40,63 +47,84 @@ _ACTION = (
 
 
 def export_onnx(checkpoint: Checkpoint) -> bytes:
-    """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping and metadata.
+    """Exports a checkpoint's policy as an ONNX file: normaliser, network, clipping, what the task
+    remembers of the measurements, and metadata.
 
     The inputs are float32 [N, history, size], named after the quantities (`past_actions` for
-    action); the output is `action`, float32 [N, n].
+    action); the output is `action`, float32 [N, n]. If the policy sees quantities of the task's
+    own, their inputs are the histories before the step, and each output `next/<name>` is the input
+    `<name>` of the next step (`deploy.network`).
 
     Raises:
-      UserError: the checkpoint is damaged, its arm cannot be exported, or onnx is not installed.
+      UserError: the checkpoint is damaged, its arm or its task cannot be exported, or onnx is not
+        installed.
     """
+    with needed("onnx", EXTRA):
+        import onnx
     config = load_run_config(checkpoint.run)
     policy = load_policy(checkpoint, config)
-    metadata = describe(config, checkpoint.steps)
-    return _onnx_model(policy, metadata, len(config.ppo.hidden_layers)).SerializeToString(
-        deterministic=True
+    metadata = policy_metadata(config, checkpoint.steps)
+    with jax.enable_x64(False):
+        function, inputs = _control_step(config.env, _network(config, policy))
+        graph = onnx_graph(function, inputs, f"the task {config.env.task.__name__}")
+    texts = {
+        part.name: f"the newest first; {part.unit or 'no unit'}" for part in _inputs(config.env)
+    }
+    for tensor in (*graph.input, *graph.output):
+        tensor.doc_string = (texts | {"action": metadata.action}).get(tensor.name, "")
+    model = onnx.helper.make_model(
+        graph,
+        producer_name="bounce_mjx",
+        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
     )
+    onnx.helper.set_model_props(model, to_entries(metadata))
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString(deterministic=True)
 
 
 def export_jax(checkpoint: Checkpoint) -> bytes:
     """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
 
     `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, n] for any N; `inputs` is
-    a dict with the names and shapes of `export_onnx`.
+    a dict of the histories [N, history, size] of all quantities, named as for `export_onnx`.
 
     Raises:
       UserError: the checkpoint is damaged, or flatbuffers is not installed.
     """
-    with needed("flatbuffers", _EXTRA):
+    with needed("flatbuffers", EXTRA):
         # JAX serialises with it.
         import flatbuffers  # noqa: F401
     config = load_run_config(checkpoint.run)
-    policy = load_policy(checkpoint, config)
-    parts = _parts(config.env)
-    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
-
-    def call(inputs: dict[str, jax.Array]) -> jax.Array:
-        flat = [inputs[p.name].reshape(-1, p.history * p.size) for p in parts]
-        return act(networks, policy, jnp.concatenate(flat, axis=-1))
-
+    network = jax.jit(jax.vmap(_network(config, load_policy(checkpoint, config))))
     (n,) = jax.export.symbolic_shape("n")
-    shapes = {p.name: jax.ShapeDtypeStruct((n, p.history, p.size), jnp.float32) for p in parts}
-    return jax.export.export(jax.jit(call), platforms=("cpu", "cuda"))(shapes).serialize()
+    shapes = {
+        name: jax.ShapeDtypeStruct((n, *row.shape), row.dtype)
+        for name, row in _histories(config.env).items()
+    }
+    return jax.export.export(network, platforms=("cpu", "cuda"))(shapes).serialize()
 
 
-def describe(config: TrainConfig, steps: int) -> Metadata:
+def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     """Metadata of a run's policy.
 
     Args:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, or its paddle hangs on a joint that is no hinge
-        with a servo.
+      UserError: the MJCF file is missing, its paddle hangs on a joint that is no hinge with a
+        servo, or a command has the name of a measurement.
     """
     env = config.env
+    if taken := env.commands.keys() & UNITS.keys():
+        raise UserError(
+            f"the command {min(taken)} has the name of a measurement; give it another name in "
+            f"the task {env.task.__name__}"
+        )
     m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
-    chain, paddle, normal = _chain(m, env.default_joint_angles)
-    filtered = env.observation.is_filtered
+    chain, paddle, normal = _hinges(m, env.default_joint_angles)
+    filtered, velocity = env.observation.is_filtered, env.observation.velocity
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
     limited = m.actuator_forcelimited[servos]
@@ -104,9 +132,10 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
         format=FORMAT,
         steps=steps,
         joint_names=joint_names(m),
-        observation=_parts(env),
-        position=env.observation.position,
-        velocity=env.observation.velocity,
+        observation=_inputs(env),
+        # Without a quantity that sees it, there is no filter.
+        position=env.observation.position if filtered else "measured",
+        velocity=velocity if filtered or velocity != "filter" else "measured",
         estimator=filter_constants(env, m) if filtered else None,
         control_dt=env.control_dt,
         action=_ACTION,
@@ -124,20 +153,22 @@ def describe(config: TrainConfig, steps: int) -> Metadata:
             )
         ),
         default_joint_angles=env.default_joint_angles,
-        target_height_range=env.target_heights,
+        commands={
+            name: CommandRange((command.low, command.high), command.unit)
+            for name, command in env.commands.items()
+        },
         randomization={name: getattr(env.randomization, name) for name in env.randomization.terms},
-        bounce_max_distance=env.bounce_max_distance,
         chain=chain,
         paddle=paddle,
         paddle_normal=normal,
     )
 
 
-def _parts(env: WorldConfig) -> tuple[Part, ...]:
+def _inputs(env: WorldConfig) -> tuple[Input, ...]:
+    histories = env.observation.seen()
     return tuple(
-        Part(_INPUT_NAMES.get(q.name, q.name), history, q.size, q.unit)
-        for q in parts(env.num_joints)
-        if (history := getattr(env.observation, q.name))
+        Input(_INPUT_NAMES.get(part.name, part.name), histories[part.name], part.size, part.unit)
+        for part in env.observation.parts(env.num_joints)
     )
 
 
@@ -145,9 +176,9 @@ def _plain(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-def _chain(
+def _hinges(
     m: mujoco.MjModel, default_joint_angles: Sequence[float]
-) -> tuple[tuple[Link, ...], tuple[float, ...], tuple[float, ...]]:
+) -> tuple[tuple[Hinge, ...], tuple[float, ...], tuple[float, ...]]:
     """Hinges from the world to the paddle, and in the last hinge's frame the paddle's centre and
     the normal of the face that is the upper one at the default joint angles."""
     addresses = find_addresses(m)
@@ -169,7 +200,7 @@ def _chain(
                 )
             anchor = m.jnt_pos[joint]
             links.append(
-                Link(
+                Hinge(
                     joint=addresses.arm_joints.index(joint),
                     position=_plain(position + _rotated(anchor, quaternion)),
                     quaternion=_plain(quaternion),
@@ -195,63 +226,57 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return result
 
 
-def _onnx_model(policy: Policy, metadata: Metadata, num_hidden_layers: int) -> Any:
-    """ONNX model of a policy network; flax names the layers MLP_0/hidden_i and Dense_0."""
-    with needed("onnx", _EXTRA):
-        import onnx
-        from onnx import helper, numpy_helper
-
-    nodes, constants = [], []
-
-    def constant(name: str, value: Any, dtype: type = np.float32) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
-        return name
-
-    def node(kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
-        return output
-
-    parts = metadata.observation
-    flat = [node("Flatten", [p.name], f"{p.name}/flat", axis=1) for p in parts]
-    x = node("Concat", flat, "observation", axis=1)
-    mean, std = (np.asarray(a) for a in policy.normalizer)
-    x = node("Sub", [x, constant("normalizer/mean", mean)], "normalizer/centred")
-    x = node("Div", [x, constant("normalizer/std", std)], "normalizer/scaled")
-    limits = [
-        constant("normalizer/least", -MAX_NORMALIZED),
-        constant("normalizer/most", MAX_NORMALIZED),
-    ]
-    x = node("Clip", [x, *limits], "normalizer/clipped")
-    varied = constant("normalizer/varied", std > MIN_STD, bool)
-    x = node("Where", [varied, x, constant("normalizer/zero", 0.0)], "normalizer/output")
-
-    params = policy.params["params"]
-    hidden = params["MLP_0"]
-    for i in range(num_hidden_layers):
-        name = f"hidden_{i}"
-        weights = [constant(f"{name}/{k}", hidden[name][k]) for k in ("kernel", "bias")]
-        x = node("Gemm", [x, *weights], f"{name}/linear")
-        x = node("Mul", [x, node("Sigmoid", [x], f"{name}/sigmoid")], f"{name}/silu")
-    weights = [constant(f"mean/{k}", params["Dense_0"][k]) for k in ("kernel", "bias")]
-    x = node("Gemm", [x, *weights], "mean")
-    limits = [constant("action/least", -1.0), constant("action/most", 1.0)]
-    node("Clip", [x, *limits], "action")
-
-    def tensor(name: str, shape: list, text: str) -> Any:
-        return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape, text)
-
-    inputs = [
-        tensor(p.name, ["N", p.history, p.size], f"the newest first; {p.unit or 'no unit'}")
-        for p in parts
-    ]
-    outputs = [tensor("action", ["N", len(metadata.joint_names)], metadata.action)]
-    graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
-    model = helper.make_model(
-        graph,
-        producer_name="bounce_mjx",
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        ir_version=_IR_VERSION,
+def _network(config: TrainConfig, policy: Policy) -> Callable[[dict[str, jax.Array]], jax.Array]:
+    """Histories [history, size] by the inputs' names -> action [J]."""
+    names = [part.name for part in _inputs(config.env)]
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
+    return lambda histories: act(
+        networks, policy, jnp.concatenate([histories[name].ravel() for name in names])
     )
-    helper.set_model_props(model, metadata_module.to_entries(metadata))
-    onnx.checker.check_model(model, full_check=True)
-    return model
+
+
+def _histories(env: WorldConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    return {part.name: _floats(part.history, part.size) for part in _inputs(env)}
+
+
+def _floats(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+
+def _control_step(
+    env: WorldConfig, network: Callable[[dict[str, jax.Array]], jax.Array]
+) -> tuple[Callable[[dict], dict], dict[str, jax.ShapeDtypeStruct]]:
+    """A control step as a function of named arrays, and their shapes: the action, and what the task
+    remembers of the measurements, as the environment computes it."""
+    task, own = env.task(env), env.observation.seen("task")
+    if not own:
+        return lambda given: {"action": network(given)}, _histories(env)
+    measured = {
+        name: _floats(env.num_joints if quantity.size is None else quantity.size)
+        for name, quantity in ObservationConfig.quantities().items()
+    }
+    measured |= dict.fromkeys(env.commands, _floats(1)) | {"ball_picture": _floats(3)}
+    leaves, tree = jax.tree.flatten_with_path(jax.eval_shape(task.first_quantities, measured)[0])
+    memory = {
+        f"memory/{jax.tree_util.keystr(path, simple=True, separator='/')}": leaf
+        for path, leaf in leaves
+    }
+
+    def control_step(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        values = {name: given[f"{MEASURED}{name}"] for name in measured}
+        past = {name: given[name] for name in own}
+        before = tree.unflatten([given[name] for name in memory])
+        start, first = task.first_quantities(values)
+        after, later = task.next_quantities(before, past, values)
+        first = {name: jnp.broadcast_to(first[name], past[name].shape) for name in own}
+        remembered, seen = jax.tree.map(
+            lambda new, next_one: jnp.where(given[IS_FIRST], new, next_one),
+            (start, first),
+            (after, {name: later[name] for name in own}),
+        )
+        kept = seen | dict(zip(memory, jax.tree.leaves(remembered), strict=True))
+        action = {"action": network(given | seen)}
+        return action | {f"{NEXT}{name}": value for name, value in kept.items()}
+
+    inputs = _histories(env) | {f"{MEASURED}{name}": shape for name, shape in measured.items()}
+    return control_step, inputs | memory | {IS_FIRST: jax.ShapeDtypeStruct((), bool)}

@@ -10,14 +10,31 @@ from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 from bounce_mjx.deploy.strict import read
 from bounce_mjx.world.ball_filter import Constants
 
-FORMAT = 2
-"""Version of the entries; readers refuse other versions."""
+FORMAT = 3
+"""Version of the entries; readers refuse other versions, except 2."""
+
+UNITS = {
+    "joint_angles": "rad",
+    "joint_velocities": "rad/s",
+    "ball_position": "m",
+    "ball_velocity": "m/s",
+    "ball_age": "s",
+    "ball_quaternion": "w, x, y, z",
+    "ball_angular_velocity": "rad/s",
+    "time": "s",
+}
+"""Measurements that every policy accepts, and their units. A task's commands are further ones."""
 
 Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
 
+IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
+"""Names in the graph of a policy whose task remembers measurements: an input, which is true in the
+first step; what precedes a quantity's newest value; and what precedes an output for the input of
+the same name in the next step."""
 
-class Part(NamedTuple):
+
+class Input(NamedTuple):
     """One input of the network."""
 
     name: str
@@ -30,7 +47,7 @@ class Part(NamedTuple):
     """Unit of the entries; empty for a pure number."""
 
 
-class Link(NamedTuple):
+class Hinge(NamedTuple):
     """A hinge between the world and the paddle, in the frame of the previous hinge."""
 
     joint: Annotated[int, (0, 1000)]
@@ -45,6 +62,15 @@ class Link(NamedTuple):
     """Joint angle of the unturned hinge, rad."""
 
 
+class CommandRange(NamedTuple):
+    """A command, which is a measurement for the policy."""
+
+    range: tuple[Length, Length]
+    """Its range in the training."""
+    unit: str
+    """Unit; empty for a pure number."""
+
+
 class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
@@ -53,7 +79,7 @@ class Metadata(NamedTuple):
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
-    observation: tuple[Part, ...]
+    observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
     position: Literal["measured", "filter"]
     """Source of ball_position: `measured`, or `filter` for the estimate of the Kalman filter."""
@@ -77,19 +103,25 @@ class Metadata(NamedTuple):
     """Largest torque of each servo, N m; None for a servo without a limit."""
     default_joint_angles: tuple[float, ...]
     """Joint angles at the start of an episode, rad."""
-    target_height_range: tuple[float, float]
-    """Range of target heights in the training, m."""
+    commands: dict[str, CommandRange]
+    """What is wished of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
     documents their units; missing terms were not randomised."""
-    bounce_max_distance: Length
-    """Largest height above the paddle at which the ball counts as near it, m."""
-    chain: tuple[Link, ...]
+    chain: tuple[Hinge, ...]
     """The hinges from the world to the paddle."""
     paddle: Vector
     """Centre of the paddle in the frame of the last hinge, m."""
     paddle_normal: tuple[float, float, float]
     """Unit normal of the paddle's upper face in the frame of the last hinge."""
+
+
+def measurement_sizes(metadata: Metadata) -> dict[str, int]:
+    """Number of entries of each measurement, in the order of `UNITS`, and of each command."""
+    joints = dict.fromkeys(("joint_angles", "joint_velocities"), len(metadata.joint_names))
+    vectors = dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), 3)
+    sizes = joints | vectors | {"ball_quaternion": 4}
+    return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
@@ -99,10 +131,13 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for anything else."""
-    missing = [name for name in Metadata._fields if name not in entries]
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
-        raise ValueError(f"its format is {given}, not {FORMAT}")
+        if given != 2:
+            raise ValueError(f"its format is {given}, not {FORMAT}")
+        command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
+        entries = entries | {"commands": json.dumps({"target_height": command})}
+    missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):
         raise ValueError("its network has a memory, which this version does not run")
@@ -120,6 +155,8 @@ def _plain(value: Any) -> Any:
     """A value with groups in place of named tuples."""
     if hasattr(value, "_asdict"):
         return {name: _plain(inner) for name, inner in value._asdict().items()}
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
     return [_plain(inner) for inner in value] if isinstance(value, tuple) else value
 
 
@@ -135,6 +172,8 @@ def _check(metadata: Metadata) -> None:
     ):
         if len(getattr(metadata, name)) != count:
             raise ValueError(f"its {name} are not of {count} joints")
+    if taken := metadata.commands.keys() & UNITS.keys():
+        raise ValueError(f"its command {min(taken)} has the name of a measurement")
     if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):
         raise ValueError("one of its joint_ranges ends below its start")
     if not metadata.chain or any(link.joint >= count for link in metadata.chain):

@@ -5,27 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.histories import OF_BOUNCES, Histories, Measurements
-from bounce_mjx.deploy.metadata import Metadata, from_entries
-from bounce_mjx.errors import UserError, needed
+from bounce_mjx.deploy.histories import Histories, Measurements
+from bounce_mjx.deploy.metadata import UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.network import Network
+from bounce_mjx.errors import MissingPackage, UserError
 
 _MAX_PAUSE = 1.0
 # Measurements beyond it are not of a robot.
 _LARGEST = 1e6
-_LOG_ERRORS_ONLY = 3
-
-UNITS = {
-    "joint_angles": "rad",
-    "joint_velocities": "rad/s",
-    "ball_position": "m",
-    "ball_velocity": "m/s",
-    "ball_age": "s",
-    "ball_quaternion": "w, x, y, z",
-    "ball_angular_velocity": "rad/s",
-    "target_height": "m",
-    "time": "s",
-}
-"""Measurements accepted by a step, and their units."""
 
 
 class DeployedPolicy:
@@ -45,23 +32,22 @@ class DeployedPolicy:
         Raises:
           UserError: the file is not a policy from `bounce-mjx export`, or onnxruntime is missing.
         """
-        with needed("onnxruntime", "onnxruntime"):
-            import onnxruntime
-        options = onnxruntime.SessionOptions()
-        # The network is too small to share between threads.
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = _LOG_ERRORS_ONLY
         try:
-            self._session = onnxruntime.InferenceSession(
-                model, options, providers=["CPUExecutionProvider"]
-            )
-            entries = self._session.get_modelmeta().custom_metadata_map
-            self.metadata: Metadata = from_entries(entries)
-            self._shapes = _shapes(len(self.metadata.joint_names))
-            self._check_inputs()
-            self.reset()
+            self._network = Network(model)
+            self.metadata: Metadata = self._network.metadata
+            self.units = UNITS | {
+                name: c.unit or "no unit" for name, c in self.metadata.commands.items()
+            }
+            """Measurements that a step accepts, and their units."""
+            self._sizes = measurement_sizes(self.metadata)
+            self.needs = self._needs()
+            """Measurements required in every step."""
             # A network that fails or gives no numbers fails here, and not on the robot.
-            self._act({p.name: np.zeros((p.history, p.size)) for p in self.metadata.observation})
+            self.reset()
+            for _ in range(2):
+                self.step({name: np.zeros(self._sizes[name]) for name in self.needs})
+        except MissingPackage:
+            raise
         # onnxruntime raises exceptions of many types for a damaged file.
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
@@ -69,13 +55,12 @@ class DeployedPolicy:
                 f"{source} is no policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
-        self.needs = self._needs()
-        """Measurements required in every step; `UNITS` has their units."""
         self.reset()
 
     def reset(self) -> None:
         """Forgets the past. The next step fills the whole history with its measurements."""
         self._histories: Histories | None = None
+        self._network.reset()
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
@@ -88,8 +73,9 @@ class DeployedPolicy:
             `metadata.joint_names`; from the newest picture of the ball `ball_position` [3] (m),
             `ball_velocity` [3] (m/s), `ball_age` (time since the picture was taken, s),
             `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
-            (rad/s; default 0); `target_height` (m); `time` of any clock (s). The measurements in
-            `needs` are required. Without `time`, a step is one control step after the last one.
+            (rad/s; default 0); each command in `metadata.commands`; `time` of any clock (s). The
+            measurements in `needs` are required. Without `time`, a step is one control step after
+            the last one.
 
             With `time`, the elapsed time is rounded to control steps. A call less than half a
             control step after the last one, or before it, is a repetition: it changes nothing and
@@ -110,18 +96,20 @@ class DeployedPolicy:
         if steps == 0:
             return self._action.copy()
         if self._histories is None:
-            self._histories = Histories(self.metadata, measured)
+            self._histories = Histories(self.metadata, self._network.observed, measured)
         else:
-            for i in range(1, steps + 1):
+            for i in range(1, steps):
                 share = i / steps
                 between = {
                     name: (1.0 - share) * self._measured[name] + share * value
                     for name, value in measured.items()
                     if name in self._measured
                 }
-                last = i == steps
-                self._histories.add(measured if last else measured | between, self._action, last)
-        action = self._act(self._histories.values)
+                self._histories.add(measured | between, self._action, is_real=False)
+                if self._network.memory:
+                    self._network.step(self._histories.values, self._histories.newest)
+            self._histories.add(measured, self._action)
+        action = self._network.step(self._histories.values, self._histories.newest)
         self._measured, self._time, self._action = measured, time, action
         return self._action.copy()
 
@@ -145,68 +133,33 @@ class DeployedPolicy:
         targets = self._measured["joint_angles"] + self.metadata.action_scale * action
         return np.clip(targets, low, high)
 
-    def _act(self, values: dict[str, np.ndarray]) -> np.ndarray:
-        """Action [J] of the network for values [history, size] by name."""
-        inputs = {name: value[None].astype(np.float32) for name, value in values.items()}
-        (actions,) = self._session.run(["action"], inputs)
-        if not np.all(np.isfinite(actions)):
-            raise UserError("the network gives an action that is not finite; stop the robot")
-        return actions[0].astype(float)
-
     @property
     def observation(self) -> np.ndarray:
         """Inputs of the network at the last step in one vector, with the newest value of each
         quantity first; empty before the first step."""
-        values = [] if self._histories is None else self._histories.values.values()
-        return np.concatenate([np.zeros(0), *(value.ravel() for value in values)])
-
-    def _check_inputs(self) -> None:
-        """Raises ValueError if the network does not match its metadata."""
-        stated = {p.name: [p.history, p.size] for p in self.metadata.observation}
-        actual = {i.name: i.shape[1:] for i in self._session.get_inputs()}
-        outputs = {o.name: o.shape[1:] for o in self._session.get_outputs()}
-        sizes = self._sizes()
-        if unknown := stated.keys() - sizes:
-            raise ValueError(f"its input {min(unknown)} is unknown here")
-        if wrong := [name for name, (_, size) in stated.items() if size != sizes[name]]:
-            raise ValueError(f"its input {wrong[0]} must have the size {sizes[wrong[0]]}")
-        expected = {"action": [len(self.metadata.joint_names)]}
-        if stated != actual or outputs != expected or len(stated) < len(self.metadata.observation):
-            raise ValueError("its inputs or outputs are not as its metadata states")
-
-    def _sizes(self) -> dict[str, int]:
-        """Number of entries of one value of each input that a network may have."""
-        sizes = {name: shape[0] for name, shape in self._shapes.items() if name != "time"}
-        derived = {
-            "paddle_position": 3,
-            "apex_error": 1,
-            "bounce_position": 2,
-            "bounce_interval": 1,
-        }
-        joints = ("past_actions", "bounce_joint_angles", "bounce_joint_velocities")
-        return sizes | derived | dict.fromkeys(joints, len(self.metadata.joint_names))
+        if self._histories is None:
+            return np.zeros(0)
+        values = self._histories.values | self._network.memory
+        return np.concatenate([values[i.name].ravel() for i in self.metadata.observation])
 
     def _needs(self) -> tuple[str, ...]:
-        seen = {part.name for part in self.metadata.observation}
-        needs = {
-            "joint_angles": {"joint_angles", "paddle_position"} | OF_BOUNCES,
-            "joint_velocities": {"joint_velocities", "bounce_joint_velocities"},
-            "ball_position": {"ball_position"} | OF_BOUNCES,
-            "ball_velocity": {"ball_velocity"},
-            "ball_age": {"ball_age"},
-            "target_height": {"target_height", "apex_error"},
-        }
+        reads = self._network.reads
+        users = {name: {name} for name in ("joint_angles", "joint_velocities", "ball_age")}
+        users["joint_angles"].add("paddle_position")
+        users["ball_position"] = {"ball_position", "ball_picture"}
+        users["ball_velocity"] = {"ball_velocity"}
         if self.metadata.velocity != "measured":
-            needs["ball_position"] |= needs.pop("ball_velocity")
+            users["ball_position"] |= users.pop("ball_velocity")
         if self.metadata.estimator is not None:
-            needs["joint_angles"] |= needs["ball_position"]
-        return tuple(name for name, users in needs.items() if users & seen)
+            users["joint_angles"] |= users["ball_position"]
+        users |= {name: {name} for name in self.metadata.commands}
+        return tuple(name for name in self.units if users.get(name, set()) & reads)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
         """Copies of the measurements as arrays, with defaults for optional ones."""
         for name in measurements:
-            if name not in self._shapes:
-                raise UserError(f"{name} is no measurement; a step takes {', '.join(self._shapes)}")
+            if name not in self.units:
+                raise UserError(f"{name} is no measurement; a step takes {', '.join(self.units)}")
         missing = [name for name in self.needs if name not in measurements]
         if missing:
             raise UserError(
@@ -218,7 +171,7 @@ class DeployedPolicy:
         for name, value in measurements.items():
             limit = np.inf if name == "time" else _LARGEST
             label = f"the measurement {name}"
-            checked[name] = _array(label, value, self._shapes[name], UNITS[name], limit)
+            checked[name] = _array(label, value, (self._sizes[name],), self.units[name], limit)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
@@ -234,14 +187,6 @@ class DeployedPolicy:
                 f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
             )
         return max(0, round(elapsed / self.metadata.control_dt))
-
-
-def _shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the measurements, in the order of `UNITS`."""
-    shapes = dict.fromkeys(UNITS, (1,))
-    shapes |= {"joint_angles": (num_joints,), "joint_velocities": (num_joints,)}
-    shapes |= dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), (3,))
-    return shapes | {"ball_quaternion": (4,)}
 
 
 def _array(label: str, value: Any, shape: tuple[int, ...], unit: str, limit: float) -> np.ndarray:

@@ -185,13 +185,12 @@ class Env:
           share: probability that each term is drawn; by default, the config's.
         """
         check_unedited(self.mj_model, self._fingerprint)
-        config, addresses = self.config, self._addresses
         given = self.ranges() if ranges is None else ranges
         ranges = {name: ends for name, ends in given.items() if name in TERMS}
-        world, parameters = {}, PhysicsParameters()
+        world, parameters, memory_rng = {}, PhysicsParameters(), None
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
-            share = config.randomization.share if share is None else share
+            share = self.config.randomization.share if share is None else share
             world = draw_world(ranges, world_rng, jnp.result_type(float), self.action_size, share)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
@@ -202,16 +201,51 @@ class Env:
                     for own, drawn in zip(self._randomize(world_rng), parameters, strict=True)
                 )
             )
-        n = self.action_size
+        commands = self.config.commands
+        ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
-        commands = config.commands
-        draws = jax.random.uniform(rng, (2 * n + 3 + len(commands),), minval=-1.0, maxval=1.0)
-        dtype = draws.dtype
-        zero = jnp.zeros((), dtype)
+        size = 2 * self.action_size + 3
+        draws = jax.random.uniform(rng, (size + len(commands),), minval=-1.0, maxval=1.0)
+        physics = self._first_physics(draws[:size], world)
+        command = {
+            name: low + (high - low) * 0.5 * (draws[size + i] + 1.0)
+            for i, (name, (low, high)) in enumerate(ends.items())
+        }
+        no_action = jnp.zeros(self.action_size, draws.dtype)
+        state = EnvState(physics, command, no_action, parameters=parameters, world=world)
+        truth = self.kinematics(state)
+        state = state._replace(task=self.task.reset(Start(truth, command)))
+        if memory_rng is not None:
+            memory = self._first_memory(state, truth, memory_rng)
+            if "command_interval" in world:
+                memory = memory._replace(
+                    command_ranges=jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends)
+                )
+            state = state._replace(memory=memory)
+        zero = jnp.zeros((), draws.dtype)
+        # The names alone: no step is computed.
+        step = Step(truth, command, no_action, no_action)
+        metrics = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
+        return State(
+            pipeline_state=state,
+            obs=self.observe(state, truth),
+            reward=zero,
+            done=zero,
+            metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
+        )
 
+    def _first_physics(self, draws: jax.Array, world: World) -> PhysicsState:
+        """The arm and the ball at a reset.
+
+        Args:
+          draws: numbers from -1 to 1 for the angle and the velocity of each joint, and for the
+            ball's position [2 n + 3].
+        """
+        config, addresses, n = self.config, self._addresses, self.action_size
+        dtype = draws.dtype
         qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
-        qvel = [zero] * self.mj_model.nv
+        qvel = [jnp.zeros((), dtype)] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
             qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
             qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[n + i]
@@ -227,36 +261,8 @@ class Env:
         ):
             for i, entry in enumerate(entries if term in world else ()):
                 qpos[entry] = qpos[entry] + world[term][i]
-        physics = PhysicsState(
+        return PhysicsState(
             jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
-        )
-
-        ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
-        command = {
-            name: low + (high - low) * 0.5 * (draws[2 * n + 3 + i] + 1.0)
-            for i, (name, (low, high)) in enumerate(ends.items())
-        }
-        last_action = jnp.zeros(n, dtype)
-        state = EnvState(physics, command, last_action, parameters=parameters, world=world)
-        truth = self.kinematics(state)
-        task = self.task.reset(Start(truth, command))
-        state = state._replace(task=task)
-        if world or self._needs_sensing:
-            memory = self._first_memory(state, truth, memory_rng)
-            if "command_interval" in world:
-                memory = memory._replace(
-                    command_ranges=jax.tree.map(lambda end: jnp.asarray(end, dtype), ends)
-                )
-            state = state._replace(memory=memory)
-        # The names alone: no step is computed.
-        step = Step(truth, command, last_action, last_action)
-        metrics = jax.eval_shape(lambda: _metrics(self.task.step(task, step), dtype))
-        return State(
-            pipeline_state=state,
-            obs=self.observe(state, truth),
-            reward=zero,
-            done=zero,
-            metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -416,7 +422,7 @@ class Env:
     def _first_memory(self, state: EnvState, truth: Kinematics, rng: jax.Array) -> Memory:
         config, dtype = self.config, truth.ball_position.dtype
         counter = jax.lax.bitcast_convert_type(jax.random.bits(rng, dtype=jnp.uint32), jnp.int32)
-        return Memory(
+        memory = Memory(
             counter=counter,
             step=jnp.zeros((), jnp.int32),
             phases=noise.uniform(counter, noise.Stream.COMMAND, (3,), dtype),
@@ -427,30 +433,27 @@ class Env:
                 config.control_dt,
                 self.servo_targets(state.physics, jnp.zeros(self.action_size, dtype)),
             ),
-            sensing=self._first_sensing(state, truth) if self._needs_sensing else None,
-            estimate=None
-            if self._estimator is None
-            else self._estimator.start(
-                truth.ball_position, self._estimator.plane(state.physics.qpos)
-            ),
+            sensing=None,
         )
+        return self._first_measurements(state, truth, memory) if self._needs_sensing else memory
 
-    def _first_sensing(self, state: EnvState, truth: Kinematics) -> Sensing:
+    def _first_measurements(self, state: EnvState, truth: Kinematics, memory: Memory) -> Memory:
+        """The memory with the measurements of a reset, which the histories repeat. The ball has
+        rested until then."""
         config = self.config
-        measured = truth._asdict() | _entries(state.command)
-        measured |= {
-            "action": state.last_action,
-            "ball_age": jnp.zeros_like(truth.ball_position[:1]),
-        }
+        balls = sensing.resting_ball(config.randomization, config.control_dt, truth)
+        picture = self._picture(state.world, balls, sensing.picture_long_ago(truth), memory)
+        angles, measured = self._measured(state, truth, memory, picture)
+        if self._estimator is not None:
+            plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
+            memory = memory._replace(estimate=self._estimator.start(picture, state.world, plane))
         task, own = self.task.first_quantities(measured)
-        return sensing.start_sensing(
-            config.randomization,
-            config.observation,
-            config.control_dt,
-            truth,
-            measured | own,
-            task,
-        )
+        values = measured | own
+        seen = {
+            name: jnp.broadcast_to(values[name], (count, *values[name].shape))
+            for name, count in config.observation.seen().items()
+        }
+        return memory._replace(sensing=Sensing(balls, picture, seen, task))
 
     def _next_memory(self, state: EnvState, truth: Kinematics) -> Memory:
         """The memory after a control step: time, and the measurements of the new state."""
@@ -458,27 +461,13 @@ class Env:
         memory = memory._replace(
             step=memory.step + 1, command_age=memory.command_age + config.control_dt
         )
-        if memory.sensing is None:
+        past = memory.sensing
+        if past is None:
             return memory
         ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
-        balls = jnp.concatenate([ball[None], memory.sensing.balls[:-1]])
-        past = memory.sensing._replace(balls=balls)
-        picture = sensing.take_picture(
-            config.observation,
-            state.world,
-            past,
-            memory.counter,
-            memory.phases[0],
-            memory.step,
-            config.control_dt,
-        )
-        angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
-        paddle = truth.paddle_position
-        if self._misjudges_paddle:
-            paddle = self.engine.paddle_position(
-                MODEL_PARAMETERS, self._measured_qpos(state.physics, angles)
-            )
-        ball_position, ball_velocity = picture.position, picture.velocity
+        balls = jnp.concatenate([ball[None], past.balls[:-1]])
+        picture = self._picture(state.world, balls, past.picture, memory)
+        angles, measured = self._measured(state, truth, memory, picture)
         if self._estimator is not None:
             plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
             estimate = self._estimator.next(
@@ -486,24 +475,51 @@ class Env:
             )
             memory = memory._replace(estimate=estimate)
             if config.observation.position == "filter":
-                ball_position = estimate.position
+                measured["ball_position"] = estimate.position
             if config.observation.velocity == "filter":
-                ball_velocity = estimate.velocity
-        measured = truth._asdict() | {
+                measured["ball_velocity"] = estimate.velocity
+        seen = sensing.remember(config.observation, past.seen, measured)
+        own = {name: past.seen[name] for name in config.observation.seen("task")}
+        task, own = self.task.next_quantities(past.task, own, measured)
+        return memory._replace(sensing=Sensing(balls, picture, seen | own, task))
+
+    def _picture(
+        self, world: World, balls: jax.Array, last: sensing.Picture, memory: Memory
+    ) -> sensing.Picture:
+        """The last picture of the ball that has arrived at a control step."""
+        return sensing.take_picture(
+            self.config.observation,
+            world,
+            balls,
+            last,
+            memory.counter,
+            memory.phases[0],
+            memory.step,
+            self.config.control_dt,
+        )
+
+    def _measured(
+        self, state: EnvState, truth: Kinematics, memory: Memory, picture: sensing.Picture
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Measured joint angles [n], and the measured value [size] of each quantity of the world
+        and of each command."""
+        angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
+        paddle = truth.paddle_position
+        if self._misjudges_paddle:
+            paddle = self.engine.paddle_position(
+                MODEL_PARAMETERS, self._measured_qpos(state.physics, angles)
+            )
+        return angles, truth._asdict() | {
             "joint_angles": angles,
             "joint_velocities": velocities,
-            "ball_position": ball_position,
-            "ball_velocity": ball_velocity,
+            "ball_position": picture.position,
+            "ball_velocity": picture.velocity,
             "paddle_position": paddle,
             **_entries(state.command),
             "action": state.last_action,
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
-        seen = sensing.remember(config.observation, past.seen, measured)
-        own = {name: past.seen[name] for name in config.observation.seen("task")}
-        task, own = self.task.next_quantities(past.task, own, measured)
-        return memory._replace(sensing=past._replace(picture=picture, seen=seen | own, task=task))
 
     def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
         """qpos [nq] with measured joint angles [n]."""

@@ -1,1 +1,1 @@
-"""Evaluation of a policy: its episodes, their statistics and the five expected results."""
+"""Evaluation of a policy: its episodes, their statistics and the expected results."""

@@ -65,7 +65,7 @@ def make_mujoco_evaluator(
         ball_velocity = _ball_velocity(env.mj_model)
         models = episode_models(env, states.pipeline_state.parameters)
         data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
-        statistics = empty_statistics(episodes)
+        statistics = empty_statistics(env, states)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
                 actions, states, inputs = decide(policy, states)

@@ -1,6 +1,6 @@
 """Settings of the evaluations, and their defaults."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 DEFAULT_EPISODES = 1024
 DEFAULT_SEED = 20_000
@@ -11,3 +11,20 @@ DEFAULT_CONDITION_EPISODES = 64
 
 Physics = Literal["config", "fused", "mjx", "mujoco"]
 """Engine of an evaluation: "mujoco" is MuJoCo's C engine, "config" the choice in the config."""
+
+
+class EvaluationOptions(NamedTuple):
+    """How a policy is measured."""
+
+    episodes: int = DEFAULT_EPISODES
+    """Number of episodes, each from its own reset."""
+    seed: int = DEFAULT_SEED
+    """The seed of the resets."""
+    physics: Physics = "config"
+    nominal: bool = False
+    """Whether the worlds are the model's own; else they are drawn as in the training."""
+    commands: dict[str, float] = {}
+    """Commands by name with one value for all episodes; the others are drawn as in the training."""
+
+
+DEFAULT_OPTIONS = EvaluationOptions()

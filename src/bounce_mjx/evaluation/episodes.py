@@ -9,9 +9,10 @@ import numpy as np
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
-from bounce_mjx.evaluation.recording import Recording, empty_recording, record
+from bounce_mjx.evaluation.recording import empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
 
@@ -66,13 +67,10 @@ def run_episodes(
 
 
 def _begin(env: Env, states: State, recorded: int) -> _Episodes:
-    episodes = states.done.shape[-1]
     return _Episodes(
         states=states,
-        statistics=empty_statistics(episodes),
-        recording=empty_recording(
-            env.config.episode_steps, env.action_size, min(recorded, episodes)
-        ),
+        statistics=empty_statistics(env, states),
+        recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
         step=jnp.int32(0),
     )
 
@@ -106,9 +104,9 @@ def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | Non
     """The initial states of N episodes, batch last; consumes the key.
 
     Args:
-      ranges: the ranges of C conditions, each end [C, ...]. Every condition has N / C episodes, and
-        all conditions use the same keys, so that they differ only in their ranges. The default is
-        one condition with the config's ranges.
+      ranges: the ranges of C conditions, each end [C, ...], as for `Env.reset`. Every condition has
+        N / C episodes, and all conditions use the same keys, so that they differ only in their
+        ranges. The default is one condition with the config's ranges.
     """
     if ranges is None:
         return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
@@ -122,20 +120,20 @@ def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | Non
 
 def make_reporting_evaluator(
     env: Env, networks: Networks, episodes: int, progress: Callable[[float], None]
-) -> Callable[[Policy, jax.Array], Statistics]:
+) -> Callable[..., Statistics]:
     """Like `make_evaluator`, but calls `progress` every second of simulated time with the share of
     the time limit that is simulated."""
 
     @jax.jit
-    def start(key: jax.Array) -> _Episodes:
-        return _begin(env, reset_episodes(env, key, episodes), recorded=0)
+    def start(key: jax.Array, ranges: Ranges | None) -> _Episodes:
+        return _begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
 
     @jax.jit
     def go_on(policy: Policy, now: _Episodes, last_step: jax.Array) -> _Episodes:
         return _run_until(env, networks, policy, now, last_step)
 
-    def evaluate(policy: Policy, key: jax.Array) -> Statistics:
-        now, limit = start(key), env.config.episode_steps
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
+        now, limit = start(key, ranges), env.config.episode_steps
         second = max(1, round(1.0 / env.dt))
         for done in range(0, limit, second):
             now = go_on(policy, now, np.int32(min(done + second, limit)))

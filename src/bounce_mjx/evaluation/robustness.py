@@ -1,4 +1,4 @@
-"""Robustness of a policy: its five results in every condition of a suite."""
+"""Robustness of a policy: its results in every condition of a suite."""
 
 import json
 import os
@@ -14,14 +14,15 @@ from pydantic import Field
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import DEFAULT_CONDITION_EPISODES, DEFAULT_SEED, Physics
+from bounce_mjx.evaluation.config import EvaluationOptions, Physics
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
-from bounce_mjx.evaluation.suite import Condition, neutral_range
+from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.evaluation.suite import Condition
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig, Ranges
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
 # Terms without a neutral value, or with a high cost in the physics: only the conditions that need
 # such a term are simulated with it.
@@ -32,8 +33,8 @@ _SEPARATE_TERMS = frozenset(
 _CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH_PER_CORE = 1024, 16_384, 128
 
 
-class Outcome(pydantic.BaseModel):
-    """Five results of a policy in one condition."""
+class ConditionOutcome(pydantic.BaseModel):
+    """Results of a policy in one condition."""
 
     perturbation: str
     group: str
@@ -43,12 +44,16 @@ class Outcome(pydantic.BaseModel):
     """Whether the training ranges of the policy contain the condition."""
     physics: Literal["fused", "mjx", "mujoco"]
     """Name of the engine."""
-    values: dict[str, float | None]
-    """The five results by name; None if there was nothing to measure."""
+    values: Annotated[dict[str, float | None], Field(min_length=1)]
+    """The results by name; None if there was nothing to measure."""
     failed: list[str]
     """Names of results that miss their bounds."""
+    lasted: float
+    """Share of the episodes that lasted until their time limit."""
     mean_length_s: float
     """Mean length of the episodes, s."""
+    measured: Annotated[dict[str, str], Field(exclude=True)] = {}
+    """What each result measures, with its unit; not stored."""
 
     @property
     def passed(self) -> bool:
@@ -66,7 +71,16 @@ class RobustnessReport(pydantic.BaseModel):
     episodes: int
     """Number of episodes in each condition."""
     seed: int
-    outcomes: Annotated[list[Outcome], Field(min_length=1, max_length=10_000)]
+    measured: dict[str, str] = {}
+    """What each result measures, with its unit."""
+    outcomes: Annotated[list[ConditionOutcome], Field(min_length=1, max_length=10_000)]
+
+    @pydantic.model_validator(mode="after")
+    def _check_results(self):
+        names = self.outcomes[0].values.keys()
+        if any(outcome.values.keys() != names for outcome in self.outcomes):
+            raise ValueError("an outcome lacks a result")
+        return self
 
     @property
     def passed(self) -> bool:
@@ -91,13 +105,10 @@ def measure_conditions(
     policy: Policy,
     ppo_config: PPOConfig,
     conditions: Sequence[Condition],
-    *,
-    episodes: int = DEFAULT_CONDITION_EPISODES,
-    seed: int = DEFAULT_SEED,
-    physics: Physics = "config",
+    options: EvaluationOptions,
     progress: Callable[[int], None] = lambda done: None,
-) -> list[Outcome]:
-    """Measures the five results of a deterministic policy, in the order of the conditions.
+) -> list[ConditionOutcome]:
+    """Measures the results of a deterministic policy, in the order of the conditions.
 
     One compiled program simulates all conditions with the same structure; their ranges are its
     inputs. The episodes of all conditions start from the same keys. In place of the mjx engine,
@@ -105,8 +116,8 @@ def measure_conditions(
 
     Args:
       ppo_config: config of the policy's training; it defines the networks.
-      episodes: number of episodes in each condition.
-      physics: engine; "mujoco" is MuJoCo's C engine, "config" the choice in the config.
+      options: the number of episodes in each condition, their seed and the engine; a condition has
+        its own world and commands.
       progress: callback for the number of finished conditions.
 
     Raises:
@@ -116,72 +127,81 @@ def measure_conditions(
     for index, condition in enumerate(conditions):
         key = json.dumps(condition.env.model_dump(mode="json"))
         programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
-    outcomes: list[Outcome | None] = [None] * len(conditions)
+    outcomes: list[ConditionOutcome | None] = [None] * len(conditions)
     done = 0
     for (_, separate), indices in programs.items():
         members = [conditions[index] for index in indices]
-        env = Env(_spanning_config(members, physics))
+        env = Env(_spanning_config(members, options.physics))
         dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
-        on_c = physics == "mujoco" or dry_in_mjx
+        on_c = options.physics == "mujoco" or dry_in_mjx
+        engine = "mujoco" if on_c else env.engine.name
         networks = make_networks(ppo_config, env.observation_size, env.action_size)
-        size = _batch_size(len(members), episodes, on_c)
+        size = _batch_size(len(members), options.episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator
-        evaluate = make(env, networks, size * episodes)
+        evaluate = make(env, networks, size * options.episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
             # Padding the last call with a repeated condition avoids compiling another shape.
             padded = batch + [batch[-1]] * (size - len(batch))
-            statistics = evaluate(policy, jax.random.PRNGKey(seed), _stacked_ranges(env, padded))
+            ranges = _stacked_ranges(env, padded)
+            statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
             for i, condition in enumerate(batch):
-                own = slice(i * episodes, (i + 1) * episodes)
-                episode_statistics = jax.tree.map(lambda x, own=own: x[own], statistics)
-                report = judge(env, episode_statistics, condition.target_heights)
-                outcomes[indices[start + i]] = Outcome(
-                    perturbation=condition.perturbation.name,
-                    group=condition.perturbation.group,
-                    unit=condition.perturbation.unit,
-                    strength=condition.strength,
-                    trained=condition.trained,
-                    physics="mujoco" if on_c else env.engine.name,
-                    values={result.name: result.value for result in report.results},
-                    failed=[r.name for r in report.results if r.passed is False],
-                    mean_length_s=report.details["mean_length_s"],
-                )
+                own = slice(i * options.episodes, (i + 1) * options.episodes)
+                of_condition = jax.tree.map(lambda x, own=own: x[own], statistics)
+                outcome = _outcome(env, condition, of_condition, engine)
+                outcomes[indices[start + i]] = outcome
             done += len(batch)
             progress(done)
     return outcomes
 
 
+def _outcome(
+    env: Env, condition: Condition, statistics: Statistics, engine: str
+) -> ConditionOutcome:
+    report = judge(env, statistics, condition.commands)
+    return ConditionOutcome(
+        perturbation=condition.perturbation.name,
+        group=condition.perturbation.group,
+        unit=condition.perturbation.unit,
+        strength=condition.strength,
+        trained=condition.trained,
+        physics=engine,
+        values={result.name: result.value for result in report.results},
+        failed=[result.name for result in report.results if result.passed is False],
+        lasted=float(np.mean(statistics.running)),
+        mean_length_s=report.details["mean_length_s"],
+        measured={result.name: result.measured for result in report.results},
+    )
+
+
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> WorldConfig:
-    """Task with all terms of the conditions active, in ranges that contain all their ranges."""
+    """Config with all terms of the conditions active, in ranges that contain all their ranges."""
     env = conditions[0].env
     spans = {}
     for name in sorted({name for condition in conditions for name in condition.ranges}):
-        ranges = [_range(condition, name) for condition in conditions]
-        spans[name] = (
-            min(float(np.min(low)) for low, _ in ranges),
-            max(float(np.max(high)) for _, high in ranges),
-        )
+        if name in TERMS:
+            ranges = [condition.range(name) for condition in conditions]
+            spans[name] = (
+                min(float(np.min(low)) for low, _ in ranges),
+                max(float(np.max(high)) for _, high in ranges),
+            )
     changes = {"randomization": RandomizationConfig(**spans)}
     if physics in ("fused", "mjx"):
         changes["physics"] = physics
     return env.model_copy(update=changes)
 
 
-def _range(condition: Condition, term: str) -> tuple[np.ndarray, np.ndarray]:
-    given = condition.ranges.get(term)
-    return neutral_range(term, condition.env) if given is None else given
-
-
 def _stacked_ranges(env: Env, conditions: Sequence[Condition]) -> Ranges | None:
-    """Ranges of C conditions, each end [C, ...]; None if no term is active."""
-    terms = env.config.randomization.terms
+    """Ranges of C conditions, each end [C, ...]; None if no term is active and the commands have
+    the ranges of the config."""
+    own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
+    changed = [n for n in own if any(condition.commands[n] != own[n] for condition in conditions)]
     return {
         name: tuple(
             jnp.asarray(np.stack(ends), jnp.float32)
-            for ends in zip(*(_range(condition, name) for condition in conditions), strict=True)
+            for ends in zip(*(condition.range(name) for condition in conditions), strict=True)
         )
-        for name in terms
+        for name in (*env.config.randomization.terms, *changed)
     } or None
 
 

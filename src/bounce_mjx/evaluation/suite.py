@@ -5,6 +5,7 @@
 
 import difflib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -15,6 +16,7 @@ from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.tasks.registry import find_task, is_file
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
@@ -44,7 +46,7 @@ NOMINAL = "nominal"
 """Name of the condition without perturbation, which is always measured."""
 
 _SIGNS = {"strength": 1.0, "-strength": -1.0}
-# Interval of target changes for a constant target, s.
+# Interval of command changes for constant commands, s.
 _NEVER = 1e9
 
 Bounds = tuple[np.ndarray, np.ndarray]
@@ -59,8 +61,11 @@ class Perturbation(StrictModel):
     unit: str = ""
     """Unit of the strengths, one of `UNITS`."""
     strengths: tuple[Finite, ...] = ()
+    task: str | None = None
+    """Name of the task that it is for; by default, it is for all."""
     terms: dict[str, Any] = {}
-    """Values for terms of `env.randomization`: see `configs/robustness.yaml`."""
+    """Values for terms of `env.randomization` and for commands of the task: see
+    `configs/robustness.yaml`."""
     settings: dict[str, Any] = {}
     """New values for settings of `env`, by dotted names."""
     trained_ranges: bool = False
@@ -80,24 +85,28 @@ class Condition(NamedTuple):
     strength: float | None
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: WorldConfig
-    """Task of the policy, without randomisation."""
+    """World and task of the policy, without randomisation."""
     ranges: dict[str, Bounds]
-    """Lower and upper ends of the perturbed terms' ranges, in the shapes of the terms."""
+    """Lower and upper ends of the perturbed terms' and commands' ranges, in the shapes of the
+    terms."""
     trained: bool
     """Whether the training ranges of the policy contain the condition."""
 
+    def range(self, name: str) -> Bounds:
+        """Range of a term or of a command; neutral if it is not perturbed."""
+        return self.ranges.get(name) or neutral_range(name, self.env)
+
     @property
-    def target_heights(self) -> tuple[float, float]:
-        """Range of all target heights, m."""
-        low, high = self.ranges.get("target_height", self.env.target_height_range)
-        return float(low), float(high)
+    def commands(self) -> dict[str, tuple[float, float]]:
+        """Range of each command."""
+        return {name: tuple(map(float, self.range(name))) for name in self.env.commands}
 
 
 def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
     """Reads the conditions of a suite file, the nominal condition first.
 
     Args:
-      trained: task of the policy's training; each condition replaces its randomisation.
+      trained: config of the policy's training; each condition replaces its randomisation.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -112,7 +121,9 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
             reason = "is taken" if perturbation.name in names else "is empty"
             raise UserError(f"{source}: the name {reason}; give each perturbation its own name")
         names.add(perturbation.name)
-        _check(perturbation, source)
+        if not _is_for(perturbation, trained, source):
+            continue
+        _check(perturbation, (*TERMS, *trained.commands), source)
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
@@ -121,20 +132,48 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
     return conditions
 
 
-def neutral_range(term: str, env: WorldConfig) -> Bounds | None:
-    """Range of a term without effect on the world; None if the term has no such value."""
-    low = high = TERMS[term].nominal
-    if term == "push_interval":
+def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
+    """Range of a term without effect on the world, None if the term has no such value; or that of
+    a command in an unperturbed world.
+
+    It is the task's default range of the command for all policies that were trained with it, so
+    that those with wider ranges are measured like the others; else the policy's own.
+    """
+    if name in env.commands:
+        low, high, *_ = env.commands[name]
+        default = type(env)().commands[name]
+        if low <= default.low and default.high <= high:
+            low, high = default.low, default.high
+    elif name == "push_interval":
         low = high = DEFAULT_PUSH_INTERVAL
-    elif term == "target_interval":
+    elif name == "command_interval":
         low = high = _NEVER
-    elif term == "target_height":
-        low, high = env.target_height_range
-    return None if low is None else _shaped(term, env.num_joints, low, high)
+    else:
+        low = high = TERMS[name].nominal
+    return None if low is None else _shaped(name, env.num_joints, low, high)
 
 
-def _check(p: Perturbation, source: str) -> None:
-    """Checks a perturbation's own keys."""
+def _is_for(perturbation: Perturbation, trained: WorldConfig, source: str) -> bool:
+    """Whether a perturbation is for the policy's task."""
+    if perturbation.task is None:
+        return True
+    if is_file(perturbation.task):
+        raise UserError(
+            f"{source}: the task {shorten(perturbation.task)} is a file; give the name of a task, "
+            "or leave it out"
+        )
+    try:
+        return issubclass(trained.task, find_task(perturbation.task))
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
+
+
+def _check(p: Perturbation, known: Sequence[str], source: str) -> None:
+    """Checks a perturbation's own keys.
+
+    Args:
+      known: names of all terms and commands.
+    """
     if p.unit not in UNITS:
         known = ", ".join(unit for unit in UNITS if unit)
         raise UserError(f"{source}: the unit {shorten(p.unit)!r} is unknown; give one of {known}")
@@ -151,9 +190,9 @@ def _check(p: Perturbation, source: str) -> None:
             "strength for a value, or leave strengths out"
         )
     for term in p.terms:
-        if term not in TERMS:
-            near = difflib.get_close_matches(term, TERMS, n=1)
-            advice = f"did you mean {near[0]}?" if near else f"known terms are {', '.join(TERMS)}"
+        if term not in known:
+            near = difflib.get_close_matches(term, known, n=1)
+            advice = f"did you mean {near[0]}?" if near else f"known terms are {', '.join(known)}"
             raise UserError(f"{source}: unknown term {shorten(term)}; {advice}")
 
 
@@ -173,9 +212,7 @@ def _condition(
             term: _bounds(term, trained.num_joints, entry, value, source)
             for term, entry in perturbation.terms.items()
         }
-    spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
-    # Raises an error for values outside a term's limits.
-    validate(WorldConfig, dict(env) | {"randomization": spans}, source)
+    _check_limits(env, ranges, source)
     contained = not differing_keys(env, plain) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
     )
@@ -185,7 +222,7 @@ def _condition(
 def _with_settings(
     env: WorldConfig, settings: dict[str, Any], strength: float | None, source: str
 ) -> WorldConfig:
-    """Task with changed settings."""
+    """A config with changed settings."""
     if not settings:
         return env
     values = env.model_dump()
@@ -200,7 +237,7 @@ def _with_settings(
                 "terms of the randomisation under terms"
             )
         group[key] = _filled_in(value, strength)
-    changed = validate(WorldConfig, values, source)
+    changed = validate(type(env), values, source)
     if changed.layout != env.layout:
         raise UserError(
             f"{source}: it changes the quantities of the observation, which the policy's network "
@@ -218,10 +255,26 @@ def _filled_in(value: Any, strength: float | None) -> Any:
     return _SIGNS[value] * strength if isinstance(value, str) and value in _SIGNS else value
 
 
+def _check_limits(env: WorldConfig, ranges: dict[str, Bounds], source: str) -> None:
+    """Fails for values outside of the limits of a term or of a command."""
+    spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
+    for name, (low, high) in list(spans.items()):
+        if name not in env.commands:
+            continue
+        least, greatest = env.commands[name].least, env.commands[name].greatest
+        if low < least or high > greatest:
+            raise UserError(
+                f"{source}: {name} ({low}, {high}) leaves {least:g} to {greatest:g}; narrow the "
+                "range"
+            )
+        del spans[name]
+    validate(type(env), dict(env) | {"randomization": spans}, source)
+
+
 def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, source: str) -> Bounds:
     """Range of a term from its entry in the suite: a value, a list with one value for each entry of
     the term, or a mapping {from, to} of either."""
-    size = math.prod(TERMS[term].shape(num_joints))
+    size = math.prod(_shape(term, num_joints))
     ends = [entry, entry]
     if isinstance(entry, dict):
         if entry.keys() != {"from", "to"}:
@@ -253,7 +306,7 @@ def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, sour
 
 def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape; a list of one value also fits a scalar term."""
-    shape = TERMS[term].shape(num_joints)
+    shape = _shape(term, num_joints)
 
     def shaped(end: Any) -> np.ndarray:
         array = np.asarray(end, np.float64)
@@ -264,9 +317,17 @@ def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     return shaped(low), shaped(high)
 
 
+def _shape(term: str, num_joints: int) -> tuple[int, ...]:
+    """Shape of a term; a command is a number."""
+    return TERMS[term].shape(num_joints) if term in TERMS else ()
+
+
 def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
-    """Whether the training range of a term contains other bounds."""
-    drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
+    """Whether the training range of a term or of a command contains other bounds."""
+    if term in trained.commands:
+        drawn = trained.commands[term][:2]
+    else:
+        drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
     if drawn is None:
         return False
     (low, high), tolerance = drawn, 1e-9

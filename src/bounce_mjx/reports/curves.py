@@ -13,6 +13,8 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import identify_robot
+from bounce_mjx.runs.task import identify_task
+from bounce_mjx.task.shown import Curve
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
@@ -21,7 +23,7 @@ _MAX_NAMED = 3
 _MAX_LOG_BYTES = 2**28
 
 
-class Curve(NamedTuple):
+class LoggedCurve(NamedTuple):
     """N points of one quantity over the training."""
 
     steps: np.ndarray
@@ -34,10 +36,10 @@ class RunCurves(NamedTuple):
     """The curves of one run."""
 
     run: Path
-    curves: dict[str, Curve]
+    curves: dict[str, LoggedCurve]
     """Curves by the scalar's name, such as "episode/return"."""
     solved_steps: int | None
-    """Environment steps at the first evaluation that met all five results."""
+    """Environment steps at the first evaluation that met all results."""
 
 
 class Group(NamedTuple):
@@ -47,6 +49,8 @@ class Group(NamedTuple):
     """The first settings that distinguish this group from the others, and the number of seeds or
     runs."""
     runs: list[RunCurves]
+    task_curves: tuple[Curve, ...] = ()
+    """What the runs' task logs."""
 
 
 def read_curves(run: Path) -> RunCurves:
@@ -82,7 +86,7 @@ def read_curves(run: Path) -> RunCurves:
         if not values:
             continue
         steps = sorted(values)
-        curves[name] = Curve(np.array(steps), np.array([values[step] for step in steps]))
+        curves[name] = LoggedCurve(np.array(steps), np.array([values[step] for step in steps]))
     if not curves:
         raise UserError(
             f"{run} holds no TensorBoard scalars; train longer, or give another run's folder"
@@ -97,25 +101,29 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     Raises:
       UserError: a run has no config or no scalars.
     """
-    groups: dict[str, dict[Path, int]] = {}
+    groups: dict[str, dict[Path, TrainConfig]] = {}
     settings: dict[str, dict[str, Any]] = {}
     for run in runs:
         config = load_run_config(run)
-        flat = _settings(config)
+        # The paths of the run's own copies would make every run a group of its own.
+        flat = _settings(config) | {"task": identify_task(config.task)}
         if config.env.mjcf is not None:
-            # The path of the run's own copy would make every run a group of its own.
             flat["env.mjcf"] = identify_robot(config.env.mjcf, run)
         key = json.dumps(flat)
-        groups.setdefault(key, {})[run] = config.seed
+        groups.setdefault(key, {})[run] = config
         settings[key] = flat
     labels = _differences(list(settings.values()))
     return [
-        Group(_label(differences, [*seeds.values()]), [read_curves(run) for run in seeds])
-        for differences, seeds in zip(labels, groups.values(), strict=True)
+        Group(
+            _label(differences, [config.seed for config in configs.values()]),
+            [read_curves(run) for run in configs],
+            next(iter(configs.values())).env.task.curves,
+        )
+        for differences, configs in zip(labels, groups.values(), strict=True)
     ]
 
 
-def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean and standard deviation over runs, at the steps [N] that all runs have.
 
     Returns:

@@ -13,21 +13,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.recording import Recording, apex_errors, hit_points, settled_bounces
-from bounce_mjx.evaluation.statistics import MAX_APEX_ERROR, SETTLING_SECONDS
+from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.task.rewards import TERM_NAMES
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
 
-# Tags of the log, their titles in the figure, and the factor to the displayed unit.
-CURVES = (
-    ("episode/return", "return of an episode", 1.0),
-    ("episode/bounces", "bounces in a row at its end", 1.0),
-    ("task/apex_error", "|apex − target height|, cm", 100.0),
-)
+_REWARD = "reward/"
 # Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _GREY = "#777777"
@@ -46,15 +42,15 @@ _STYLE = {
 
 
 def curves_figure(groups: Sequence[Group]) -> Figure:
-    """Return, bounces and apex error over the training, with a dotted line where a run first met
-    all five results."""
+    """The return and the curves of the task over the training, with a dotted line where a run first
+    met all results."""
+    shown = [Curve("episode/return", "", title="return of an episode")]
+    for group in groups:
+        shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
     with style():
-        figure = Figure(figsize=(10.0, 3.2))
-        grid = figure.subplots(
-            1, 3, gridspec_kw=dict(left=0.06, right=0.985, top=0.91, bottom=0.26, wspace=0.22)
-        )
-        for axes, (name, title, factor) in zip(grid, CURVES, strict=True):
-            _draw_curve(axes, groups, name, title, factor)
+        figure, panels = _panels(len(shown), columns=3, size=2.1, top=0.3, bottom=0.8, wspace=0.22)
+        for axes, curve in zip(panels, shown, strict=True):
+            _draw_curve(axes, groups, curve)
             axes.set_ylim(bottom=0.0)
             for group, colour in _coloured(groups):
                 for run in group.runs:
@@ -66,24 +62,14 @@ def curves_figure(groups: Sequence[Group]) -> Figure:
 
 def rewards_figure(groups: Sequence[Group]) -> Figure:
     """The weighted reward terms over the training."""
-    columns = 5
-    rows = -(-len(TERM_NAMES) // columns)
-    height = 1.8 * rows
+    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
+    terms = [name for name in logged if name.startswith(_REWARD)]
     with style():
-        figure = Figure(figsize=(10.0, height))
-        # The margins, in inches, do not depend on the number of rows.
-        margins = dict(top=1.0 - 0.7 / height, bottom=0.6 / height)
-        grid = figure.subplots(
-            rows,
-            columns,
-            squeeze=False,
-            gridspec_kw=dict(left=0.06, right=0.985, wspace=0.42, hspace=0.55, **margins),
-        )
-        for axes, name in zip(grid.flat, TERM_NAMES, strict=False):
-            _draw_curve(axes, groups, f"reward/{name}", name.replace("_", " "), 1.0)
+        figure, panels = _panels(len(terms), columns=5, size=1.4, top=0.7, bottom=0.6, wspace=0.42)
+        for axes, name in zip(panels, terms, strict=True):
+            title = name.removeprefix(_REWARD).replace("_", " ")
+            _draw_curve(axes, groups, Curve(name, "", title=title))
             axes.set_xlabel("")
-        for axes in grid.flat[len(TERM_NAMES) :]:
-            axes.remove()
         figure.suptitle(
             "weighted reward terms over environment steps, mean of a control step", fontsize=10
         )
@@ -92,25 +78,31 @@ def rewards_figure(groups: Sequence[Group]) -> Figure:
 
 
 def evaluation_figure(env: Env, recording: Recording) -> Figure:
-    """The ball's height and its target over the first recorded episode, and the apex errors and
-    the hits on the paddle of all recorded episodes."""
+    """The heights of ball and paddle over the first recorded episode, and what the task draws of
+    all recorded episodes."""
     recording = jax.device_get(recording)
-    bounces = settled_bounces(recording, round(SETTLING_SECONDS / env.dt))
+    plots = env.task.plots(recording)
+    rows = 1 + -(-len(plots) // 2)
+    height = 2.8 * rows
     with style():
-        figure = Figure(figsize=(10.0, 5.6))
+        figure = Figure(figsize=(10.0, height))
         grid = figure.add_gridspec(
-            2,
+            rows,
             2,
             width_ratios=(1.5, 1.0),
-            left=0.05,
+            left=0.06,
             right=0.985,
-            top=0.94,
-            bottom=0.08,
+            top=1.0 - 0.34 / height,
+            bottom=0.45 / height,
             hspace=0.36,
         )
         _draw_heights(figure.add_subplot(grid[0, :]), env, recording)
-        _draw_apex_errors(figure.add_subplot(grid[1, 0]), apex_errors(recording, bounces))
-        _draw_hits(figure.add_subplot(grid[1, 1]), env, hit_points(env, recording, bounces))
+        for i, plot in enumerate(plots):
+            axes = figure.add_subplot(grid[1 + i // 2, i % 2])
+            if isinstance(plot, Hits):
+                _draw_hits(axes, env, plot, paddle_points(env, recording, plot.steps))
+            else:
+                _draw_histogram(axes, plot)
     return figure
 
 
@@ -148,9 +140,32 @@ def _coloured(groups: Sequence[Group]) -> list[tuple[Group, str]]:
     return [(group, _COLOURS[i % len(_COLOURS)]) for i, group in enumerate(groups)]
 
 
-def _draw_curve(axes: Axes, groups: Sequence[Group], name: str, title: str, factor: float) -> None:
+def _panels(
+    count: int, columns: int, size: float, top: float, bottom: float, wspace: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a number of panels in rows.
+
+    Args:
+      size: height of a row, in.
+      top, bottom: margins, in.
+    """
+    columns = max(1, min(columns, count))
+    rows = max(1, -(-count // columns))
+    height = size * rows + top + bottom
+    figure = Figure(figsize=(10.0, height))
+    margins = dict(left=0.06, right=0.985, top=1.0 - top / height, bottom=bottom / height)
+    grid = figure.subplots(
+        rows, columns, squeeze=False, gridspec_kw=dict(wspace=wspace, hspace=0.55, **margins)
+    )
+    for axes in grid.flat[count:]:
+        axes.remove()
+    return figure, [*grid.flat[:count]]
+
+
+def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
     standard deviation on each side."""
+    name, factor = shown.tag, shown.scale
     for group, colour in _coloured(groups):
         curves = [run.curves[name] for run in group.runs if name in run.curves]
         if not curves:
@@ -165,7 +180,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], name: str, title: str, fact
             axes.fill_between(
                 steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
             )
-    axes.set_title(title)
+    axes.set_title(literal(shown.title))
     axes.set_xlabel("environment steps")
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(FuncFormatter(_steps_label))
@@ -182,51 +197,58 @@ def _value_label(value: float, _) -> str:
 
 
 def _add_legend(figure: Figure, groups: Sequence[Group], *, solved: bool) -> None:
-    axes = figure.axes[0]
     handles = [
-        axes.plot([], [], color=colour, linewidth=1.6, label=literal(group.label))[0]
+        Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
         for group, colour in _coloured(groups)
     ]
     if solved and any(run.solved_steps is not None for group in groups for run in group.runs):
-        handles += axes.plot([], [], color=_GREY, linestyle=":", label="all five results met")
+        handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))
     figure.legend(handles=handles, loc="lower center", ncols=min(3, len(handles)))
 
 
 def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     """The first recorded episode, up to its end."""
-    steps = int(np.asarray(recording.running[:, 0]).sum())
+    steps = int(recording.running[:, 0].sum())
     time = env.dt * (1 + np.arange(steps))
-    target = float(recording.target_height[0, 0])
-    axes.axhspan(
-        target - MAX_APEX_ERROR, target + MAX_APEX_ERROR, color="#009E73", alpha=0.12, lw=0
-    )
-    axes.axhline(target, color="#009E73", label=f"target {target:.2f} m, ± {MAX_APEX_ERROR} m")
+    commands = {name: values[:, 0].tolist() for name, values in recording.command.items()}
+    levels = [
+        env.task.levels({name: values[step] for name, values in commands.items()})
+        for step in range(steps)
+    ]
+    for i, name in enumerate(levels[0]):
+        heights = [level[name] for level in levels]
+        constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""
+        label = literal(f"{name}{constant}")
+        axes.plot(time, heights, color=_COLOURS[(2 + i) % len(_COLOURS)], label=label)
     axes.plot(time, recording.ball[:steps, 2, 0], color=_COLOURS[0], label="ball")
     axes.plot(time, recording.paddle[:steps, 2, 0], color=_COLOURS[1], label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
     axes.set_ylim(bottom=0.0)
     axes.set_title("height over the first recorded episode, m", loc="left")
     axes.set_xlabel("time, s")
-    axes.legend(loc="lower right", ncols=3, bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
+    axes.legend(
+        loc="lower right", ncols=2 + len(levels[0]), bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0
+    )
 
 
-def _draw_apex_errors(axes: Axes, errors: np.ndarray) -> None:
-    axes.set_title(f"apex minus target height, cm ({len(errors):,} bounces after 2 s)")
-    axes.set_ylabel("bounces")
-    if not len(errors):
-        _note_no_bounce(axes)
+def _draw_histogram(axes: Axes, plot: Histogram) -> None:
+    values, bound = plot.values, plot.bound
+    axes.set_title(literal(f"{plot.title} ({len(values):,} {plot.counted})"))
+    axes.set_ylabel(literal(plot.counted))
+    if not len(values):
+        _note(axes, f"no {plot.counted}")
         return
-    half = max(1.25 * MAX_APEX_ERROR, 1.05 * float(np.abs(errors).max()))
-    axes.hist(100 * errors, bins=51, range=(-100 * half, 100 * half), color=_COLOURS[0])
+    half = max(1.25 * bound, 1.05 * float(np.abs(values).max()))
+    axes.hist(values, bins=51, range=(-half, half), color=_COLOURS[0])
     for side in (-1, 1):
-        axes.axvline(side * 100 * MAX_APEX_ERROR, color="#009E73", linestyle="--")
+        axes.axvline(side * bound, color=_COLOURS[2], linestyle="--")
     axes.axvline(0.0, color=_GREY, linewidth=0.8)
 
 
-def _draw_hits(axes: Axes, env: Env, points: np.ndarray) -> None:
+def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     """The paddle's outline with a dot for each hit."""
-    half_x, half_y = env.mj_model.geom("blocker").size[:2]
-    axes.set_title(f"hits on the paddle, cm ({len(points):,})")
+    half_x, half_y = env.mj_model.geom_size[find_addresses(env.mj_model).paddle_geom, :2]
+    axes.set_title(literal(f"{plot.title} ({len(points):,})"))
     axes.add_patch(
         Rectangle(
             (-100 * half_y, -100 * half_x),
@@ -252,16 +274,9 @@ def _draw_hits(axes: Axes, env: Env, points: np.ndarray) -> None:
     axes.set_xlabel("paddle's y")
     axes.set_ylabel("paddle's x")
     if not len(points):
-        _note_no_bounce(axes)
+        _note(axes, "none")
 
 
-def _note_no_bounce(axes: Axes) -> None:
-    axes.text(
-        0.5,
-        0.5,
-        "no bounce after 2 s",
-        ha="center",
-        va="center",
-        transform=axes.transAxes,
-        color=_GREY,
-    )
+def _note(axes: Axes, text: str) -> None:
+    place = dict(ha="center", va="center", transform=axes.transAxes)
+    axes.text(0.5, 0.5, literal(text), color=_GREY, **place)

@@ -16,7 +16,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
-from bounce_mjx.evaluation.recording import RECORDED_EPISODES, Recording
+from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.curves import group_runs
@@ -33,6 +33,7 @@ from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.task.shown import Recording
 
 REPORT_FILE = "report.html"
 

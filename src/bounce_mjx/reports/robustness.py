@@ -1,5 +1,6 @@
 """Robustness reports as a table and as a figure."""
 
+import string
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -15,29 +16,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.robustness import Outcome, RobustnessReport
+from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
 from bounce_mjx.reports.figures import literal, style
-from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.reports.tables import short_text
 from bounce_mjx.runs.files import read_json
 
 ROBUSTNESS_FILE = "robustness.json"
 
-# Names of the results, and their initials in the figure.
-_INITIALS = {
-    "consecutive bounces": "B",
-    "horizontal position": "X",
-    "height": "H",
-    "upward speed": "V",
-    "stable": "S",
-}
-_HEADERS = {
-    "stable": "stable",
-    "consecutive bounces": "bounce",
-    "horizontal position": "x",
-    "height": "height",
-    "upward speed": "speed",
-}
 # Vermilion, sand and blue, which colour-blind readers can distinguish.
 _COLOURS = LinearSegmentedColormap.from_list("stable", ["#c2451e", "#f4e3c3", "#2b7bba"])
 # Most of the colour range covers the interesting shares near 100%.
@@ -59,10 +45,7 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
     if not path.is_file():
         return None
     try:
-        report = read_json(path, RobustnessReport)
-        if any(_HEADERS.keys() - outcome.values.keys() for outcome in report.outcomes):
-            raise ValueError("an outcome lacks a result")
-        return report
+        return read_json(path, RobustnessReport)
     except (OSError, ValueError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); delete it, or write it again with bounce-mjx "
@@ -79,17 +62,24 @@ def summary(report: RobustnessReport) -> str:
 
 
 def robustness_table(report: RobustnessReport) -> Table:
-    """Table of the five results in each condition; an asterisk marks a missed bound."""
+    """Table of the results in each condition; an asterisk marks a missed bound."""
+    letters = result_letters(report)
+    described = [
+        f"{letters[name]}  {name}" + f": {report.measured[name]}" * (name in report.measured)
+        for name in letters
+    ]
     table = Table(
-        title=f"{summary(report)} (shares in %, speed in m/s, * misses its bound)",
+        title=summary(report),
         title_justify="left",
+        caption=escape("\n".join([*described, "*  misses its bound"])),
+        caption_justify="left",
         box=box.SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
         pad_edge=False,
     )
     table.add_column("condition")
     table.add_column("strength", justify="right")
-    for header in (*_HEADERS.values(), ""):
+    for header in (*(f"{letter} " for letter in letters.values()), ""):
         table.add_column(header, justify="right")
     for rows in _perturbations(report.outcomes):
         for i, outcome in enumerate(rows):
@@ -100,11 +90,22 @@ def robustness_table(report: RobustnessReport) -> Table:
     return table
 
 
+def result_letters(report: RobustnessReport) -> dict[str, str]:
+    """A letter for each result: an initial of its name that no other has, if there is one. The
+    results with the fewest words choose first."""
+    letters = dict.fromkeys(report.outcomes[0].values, "")
+    for name in sorted(letters, key=lambda name: len(name.split())):
+        wanted = [word[0] for word in name.split()] + [*name, *string.ascii_letters]
+        free = [x.upper() for x in wanted if x.isalnum() and x.upper() not in letters.values()]
+        letters[name] = free[0] if free else "?"
+    return letters
+
+
 def robustness_figure(report: RobustnessReport) -> Figure:
-    """Chart of perturbations by strength. The colour of a cell shows the share of stable episodes.
-    A cell has a tick or the initials of the missed results; a frame marks conditions within the
-    training ranges."""
-    columns = _columns(report.outcomes)
+    """Chart of perturbations by strength. The colour of a cell shows the share of the episodes
+    that last until their time limit. A cell has a tick or the letters of the missed results; a
+    frame marks conditions within the training ranges."""
+    columns, letters = _columns(report.outcomes), result_letters(report)
     lines = max(sum(_lines(group) for group in column) for column in columns)
     height = _LINE * lines + _TOP + _BOTTOM
     with style():
@@ -126,8 +127,9 @@ def robustness_figure(report: RobustnessReport) -> Figure:
             axes.set_xlim(0.0, max(8, cells))
             axes.set_ylim(lines, 0.0)
             axes.axis("off")
-            _draw_column(axes, column)
-        _draw_legend(figure, height, any(outcome.trained for outcome in report.outcomes[1:]))
+            _draw_column(axes, column, letters)
+        framed = any(outcome.trained for outcome in report.outcomes[1:])
+        _draw_legend(figure, height, letters, framed)
     return figure
 
 
@@ -143,22 +145,23 @@ def _engines_text(report: RobustnessReport) -> str:
     return f"on {names[most]}{''.join(others)}"
 
 
-def _figures(outcome: Outcome) -> Iterable[str]:
-    """Cells of a table row for the five results."""
-    for name in _HEADERS:
-        text = figure_text(outcome.values[name], ".2f" if name == "upward speed" else ".1f")
+def _figures(outcome: ConditionOutcome) -> Iterable[str]:
+    """Cells of a table row for the results."""
+    for name, value in outcome.values.items():
+        text = short_text(value)
         yield f"[red]{text}*" if name in outcome.failed else f"{text} "
 
 
-def _perturbations(outcomes: Sequence[Outcome]) -> list[list[Outcome]]:
+def _perturbations(outcomes: Sequence[ConditionOutcome]) -> list[list[ConditionOutcome]]:
     """Outcomes grouped by perturbation, in the order of the suite."""
     return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
 
 
-Group = tuple[str, list[list[Outcome]]]
+_Heading = tuple[str, list[list[ConditionOutcome]]]
+"""A group's name, and the outcomes of each of its perturbations."""
 
 
-def _columns(outcomes: Sequence[Outcome]) -> list[list[Group]]:
+def _columns(outcomes: Sequence[ConditionOutcome]) -> list[list[_Heading]]:
     """Groups of perturbations in two columns of about equal length."""
     rows = _perturbations(outcomes)
     groups = [(name, list(members)) for name, members in groupby(rows, lambda row: row[0].group)]
@@ -168,13 +171,13 @@ def _columns(outcomes: Sequence[Outcome]) -> list[list[Group]]:
     return [groups[:split], groups[split:]] if groups[split:] else [groups[:split]]
 
 
-def _lines(group: Group) -> float:
+def _lines(group: _Heading) -> float:
     """Height of a group in lines, including its heading and a gap."""
     name, rows = group
     return len(rows) + (0.3 if name == NOMINAL else 1.6)
 
 
-def _draw_column(axes: Axes, groups: Sequence[Group]) -> None:
+def _draw_column(axes: Axes, groups: Sequence[_Heading], letters: dict[str, str]) -> None:
     y = 0.0
     for name, rows in groups:
         if name != NOMINAL:
@@ -190,15 +193,16 @@ def _draw_column(axes: Axes, groups: Sequence[Group]) -> None:
                 -0.15, y + 0.5, literal(label), ha="right", va="center", fontsize=8, color=_INK
             )
             for x, outcome in enumerate(row):
-                _draw_cell(axes, x, y, outcome)
+                _draw_cell(axes, x, y, outcome, letters)
             _draw_frames(axes, y, [outcome.trained for outcome in row])
             y += 1.0
         y += 0.3
 
 
-def _draw_cell(axes: Axes, x: float, y: float, outcome: Outcome) -> None:
-    share = outcome.values["stable"] or 0.0
-    shade = float(_SCALE(share))
+def _draw_cell(
+    axes: Axes, x: float, y: float, outcome: ConditionOutcome, letters: dict[str, str]
+) -> None:
+    shade = float(_SCALE(100.0 * outcome.lasted))
     axes.add_patch(
         Rectangle((x + 0.03, y + 0.04), 0.94, 0.92, facecolor=_COLOURS(shade), edgecolor="none")
     )
@@ -206,7 +210,7 @@ def _draw_cell(axes: Axes, x: float, y: float, outcome: Outcome) -> None:
     if outcome.strength is not None:
         text = f"{outcome.strength:g}".replace("-", "\u2212")
         axes.text(x + 0.5, y + 0.3, text, ha="center", va="center", fontsize=7.5, color=ink)
-    missed = "".join(initial for name, initial in _INITIALS.items() if name in outcome.failed)
+    missed = "".join(letter for name, letter in letters.items() if name in outcome.failed)
     axes.text(
         x + 0.5,
         y + (0.5 if outcome.strength is None else 0.71),
@@ -239,16 +243,24 @@ def _draw_frames(axes: Axes, y: float, trained: Sequence[bool]) -> None:
         x += width
 
 
-def _draw_legend(figure: Figure, height: float, framed: bool) -> None:
+def _draw_legend(figure: Figure, height: float, letters: dict[str, str], framed: bool) -> None:
     bar = figure.add_axes((0.02, 0.52 / height, 0.22, 0.14 / height))
     scale = ScalarMappable(_SCALE, _COLOURS)
     figure.colorbar(scale, cax=bar, orientation="horizontal", ticks=(0, 50, 75, 90, 100))
-    bar.set_title("stable episodes, %", fontsize=8)
+    bar.set_title("episodes until the time limit, %", fontsize=8)
     bar.tick_params(labelsize=8, length=0)
-    initials = "   ".join(f"{initial} {name}" for name, initial in _INITIALS.items())
+    first = next(iter(letters.values()))
+    missed = literal("   ".join(f"{letter} {name}" for name, letter in letters.items()))
     handles = [
         Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
-        Line2D([], [], marker="$H$", linestyle="", color=_INK, label=f"missed: {initials}"),
+        Line2D(
+            [],
+            [],
+            marker=f"${next(iter(letters.values()))}$",
+            linestyle="",
+            color=_INK,
+            label=literal(f"missed: {missed}"),
+        ),
     ]
     if framed:
         handles.insert(

@@ -1,26 +1,55 @@
 """The results of an evaluation as tables and lines of text."""
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
 from bounce_mjx.evaluation.results import Report, Result
 
+# Ends of the names of figures, the units that are shown, and the factors to them.
+_UNITS = {
+    "_m_s": ("m/s", 1.0),
+    "_rad_s": ("rad/s", 1.0),
+    "_m": ("cm", 100.0),
+    "_s": ("s", 1.0),
+    "_rad": ("deg", math.degrees(1.0)),
+    "_kg": ("kg", 1.0),
+    "_N": ("N", 1.0),
+}
 
-def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0, unit: str = "") -> str:
+
+class _Detail(NamedTuple):
+    """A figure of the task's own, beside the results."""
+
+    title: str
+    unit: str
+    value: float | None
+    """In the unit."""
+    is_mean: bool
+
+
+def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0) -> str:
     """A measured figure times `scale`, as text; "-" if there was nothing to measure."""
-    return "-" if value is None else f"{scale * value:{spec}}{unit}"
+    return "-" if value is None else f"{scale * value:{spec}}"
+
+
+def short_text(value: float | None) -> str:
+    """A measured figure as text with one digit after the point, or two below 10."""
+    return figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
 
 
 def _plain_table(title: str) -> Table:
-    """A table without lines, so that the five results fit into 80 columns."""
+    """A table without lines, so that the results fit into 80 columns."""
     return Table(
         title=escape(title), title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
     )
 
 
 def results_table(report: Report, title: str) -> Table:
-    """The five results as a table."""
+    """The results as a table."""
     table = _plain_table(title)
     for column in ("result", "measured"):
         table.add_column(column)
@@ -39,18 +68,17 @@ def results_table(report: Report, title: str) -> Table:
 
 def seeds_table(reports: dict[int, Report | None]) -> Table:
     """The best checkpoint of each seed, with the mean and the standard deviation over the seeds:
-    the five results, the consecutive bounces and the apex error.
+    the results, and the task's other figures.
 
     Args:
       reports: reports by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
     table = _plain_table("best checkpoint of each seed")
-    table.add_column("seed", justify="right")
-    for result in known[0].results:
-        table.add_column(result.name.split()[0], justify="right")
-    for column in ("bounces", "apex, cm", "all met"):
-        table.add_column(column, justify="right")
+    results = [result.name for result in known[0].results]
+    own = [f"{d.title}, {d.unit}" if d.unit else d.title for d in _details(known[0])]
+    for header in ("seed", *results, *own, "all met"):
+        table.add_column(header.replace(" ", "\n"), justify="right")
 
     for seed, report in reports.items():
         if report is None:
@@ -59,30 +87,25 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
         met = "[green]pass" if report.passed else "[red]FAIL"
         table.add_row(str(seed), *map(figure_text, _seed_figures(report)), met)
     table.add_section()
-    columns = list(zip(*map(_seed_figures, known), strict=True))
+    figures = list(zip(*map(_seed_figures, known), strict=True))
     passed = sum(report.passed for report in known)
     # If a seed lacks a figure, the mean of the other seeds would be too favourable.
     for name, statistic, met in (
         ("mean", np.mean, f"{passed}/{len(reports)}"),
         ("std", np.std, ""),
     ):
-        cells = [figure_text(None if None in c else statistic(c)) for c in columns]
+        cells = [figure_text(None if None in each else statistic(each)) for each in figures]
         table.add_row(name, *cells, met)
     return table
 
 
 def _seed_figures(report: Report) -> list[float | None]:
     """A seed's row in the table."""
-    apex_error = report.details["mean_apex_error_m"]
-    return [
-        *[result.value for result in report.results],
-        report.details["mean_consecutive_bounces"],
-        None if apex_error is None else 100.0 * apex_error,
-    ]
+    return [item.value for item in (*report.results, *_details(report))]
 
 
 def results_markdown(report: Report) -> str:
-    """The five results as a Markdown table."""
+    """The results as a Markdown table."""
     lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
     for result in report.results:
         # An unescaped | would begin a new cell.
@@ -99,11 +122,25 @@ def verdict(result: Result) -> str:
 
 def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
-    details = report.details
-    apex_error = figure_text(details["mean_apex_error_m"], ".1f", 100.0, " cm")
-    return (
-        f"{details['episodes']:.0f} episodes: "
-        f"{details['mean_consecutive_bounces']:.1f} consecutive bounces, "
-        f"|apex error| {apex_error}, return {details['mean_return']:.0f}, "
-        f"length {details['mean_length_s']:.2f} s (means)"
-    )
+    details, own = report.details, _details(report)
+    units = ["" if d.value is None else f" {d.unit}".rstrip() for d in own]
+    texts = [f"{d.title} {short_text(d.value)}{u}" for d, u in zip(own, units, strict=True)]
+    means = [text for text, detail in zip(texts, own, strict=True) if detail.is_mean]
+    others = [text for text in texts if text not in means]
+    means += [f"return {details['mean_return']:.0f}", f"length {details['mean_length_s']:.2f} s"]
+    line = ", ".join([f"{', '.join(means)} (means)", *others])
+    return f"{details['episodes']:.0f} episodes: {line}"
+
+
+def _details(report: Report) -> list[_Detail]:
+    """The task's own figures."""
+    found = []
+    for name, value in report.details.items():
+        if name in ("episodes", "mean_return", "mean_length_s"):
+            continue
+        end = next((end for end in _UNITS if name.endswith(end)), "")
+        unit, factor = _UNITS.get(end, ("", 1.0))
+        title = name.removesuffix(end).removeprefix("mean_").replace("_", " ")
+        value = None if value is None else factor * value
+        found.append(_Detail(title, unit, value, name.startswith("mean_")))
+    return found

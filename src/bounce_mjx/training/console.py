@@ -88,8 +88,9 @@ class Reporter:
             self._last[name] = np.where(np.isfinite(means[name]), means[name], last)
         rate = means["speed/steps_per_second"][0]
         figures = f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s"
-        for digits, (tag, values) in enumerate(self._last.items()):
-            figures += f"  {tag.rpartition('/')[2]} {_mean_and_deviation(values, digits)}"
+        for tag, values in self._last.items():
+            form = ".0f" if tag == "episode/return" else ".3g"
+            figures += f"  {tag.rpartition('/')[2]} {_mean_and_deviation(values, form)}"
         left = self._time_left(steps)
         self._progress.update(self._task, completed=steps, figures=figures, left=left)
         if not self._console.is_terminal:
@@ -182,10 +183,10 @@ def _finite_mean(values: np.ndarray) -> np.ndarray:
     return np.where(number > 0, total / np.maximum(number, 1), math.nan)
 
 
-def _mean_and_deviation(values: np.ndarray, digits: int) -> str:
+def _mean_and_deviation(values: np.ndarray, form: str) -> str:
     if len(values) == 1:
-        return f"{values[0]:.{digits}f}"
-    return f"{np.mean(values):.{digits}f} +- {np.std(values):.{digits}f}"
+        return f"{values[0]:{form}}"
+    return f"{np.mean(values):{form}} +- {np.std(values):{form}}"
 
 
 def _short(rate: float) -> str:

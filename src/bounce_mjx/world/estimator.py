@@ -64,13 +64,18 @@ class Estimator:
         normal = self._engine.paddle_position(above, qpos) - paddle
         return self._filter.plane(paddle, normal)
 
-    def start(self, ball_position: jax.Array, plane: jax.Array) -> Estimate:
-        """Estimate at a reset, where the ball is at rest."""
+    def start(self, picture: Picture, world: World, plane: jax.Array) -> Estimate:
+        """Estimate at a reset, where the ball is at rest.
+
+        Args:
+          picture: the first one.
+          plane: `plane` of the measured joint angles [4].
+        """
         return Estimate(
-            track=self._filter.start(ball_position, jnp.zeros_like(ball_position[0])),
+            track=self._filter.start(picture.position, self.age(picture, world)),
             planes=jnp.broadcast_to(plane, (self._num_planes, 4)),
-            position=ball_position,
-            velocity=jnp.zeros_like(ball_position),
+            position=picture.position,
+            velocity=jnp.zeros_like(picture.position),
         )
 
     def age(self, picture: Picture, world: World) -> jax.Array:

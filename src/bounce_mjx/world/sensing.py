@@ -20,6 +20,10 @@ SENSOR_TERMS = frozenset(
 """Terms that make measurements differ from the truth."""
 
 
+# Age, s, and number of pictures, that no control step has.
+_LONG_AGO = 1e6
+
+
 class Picture(NamedTuple):
     """Last picture of the ball that arrived and was not lost."""
 
@@ -30,7 +34,7 @@ class Picture(NamedTuple):
     age: jax.Array
     """Time since the picture was taken [], s."""
     number: jax.Array
-    """Number of the last picture due since the reset []; negative before the first picture."""
+    """Number of the last picture due since the reset []; negative for those taken before it."""
 
 
 class Sensing(NamedTuple):
@@ -50,33 +54,19 @@ def is_needed(randomization: RandomizationConfig, observation: ObservationConfig
     return bool(SENSOR_TERMS & set(randomization.terms)) or not observation.is_momentary
 
 
-def start_sensing(
-    randomization: RandomizationConfig,
-    observation: ObservationConfig,
-    control_dt: float,
-    truth: Kinematics,
-    values: dict[str, jax.Array],
-    task: Any,
-) -> Sensing:
-    """Memory at a reset: the history repeats the present state, measured without error.
-
-    Args:
-      values: value [size] of each observed quantity.
-      task: what the task remembers of the measurements.
-    """
-    dtype = truth.ball_position.dtype
+def resting_ball(
+    randomization: RandomizationConfig, control_dt: float, truth: Kinematics
+) -> jax.Array:
+    """`Sensing.balls` at a reset, before which the ball rested."""
     length = math.ceil(oldest_picture(randomization) / control_dt - 1e-6) + 1
     ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
-    zero = jnp.zeros((), dtype)
-    return Sensing(
-        balls=jnp.broadcast_to(ball, (length, 6)),
-        picture=Picture(truth.ball_position, truth.ball_velocity, zero, -jnp.ones((), dtype)),
-        seen={
-            name: jnp.broadcast_to(values[name], (count, *values[name].shape))
-            for name, count in observation.seen().items()
-        },
-        task=task,
-    )
+    return jnp.broadcast_to(ball, (length, 6))
+
+
+def picture_long_ago(truth: Kinematics) -> Picture:
+    """The picture before the first one, so long ago that the difference of both is no velocity."""
+    zero = jnp.zeros_like(truth.ball_position[0])
+    return Picture(truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO)
 
 
 def oldest_picture(randomization: RandomizationConfig) -> float:
@@ -99,7 +89,8 @@ def joint_angle_noise(
 def take_picture(
     observation: ObservationConfig,
     world: World,
-    sensing: Sensing,
+    balls: jax.Array,
+    last: Picture,
     counter: jax.Array,
     phase: jax.Array,
     step: jax.Array,
@@ -110,14 +101,15 @@ def take_picture(
     A camera takes pictures at its own rate, independent of the control steps. Between two control
     steps, the ball's path is the cubic with the true positions and velocities at both, which is
     exact in free flight; the velocity is interpolated linearly. Each picture arrives after the
-    latency or is lost.
+    latency or is lost; the first one is not lost.
 
     Args:
-      sensing: the memory, including the ball of this control step.
+      balls: `Sensing.balls`, including the ball of this control step.
+      last: the last picture at the control step before.
       phase: share of a picture interval that had passed at the reset [].
       step: control steps since the reset [].
     """
-    dtype, last = sensing.balls.dtype, sensing.picture
+    dtype = balls.dtype
     steps = step.astype(dtype)
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
@@ -129,7 +121,7 @@ def take_picture(
         number, age = steps, latency
     age = jnp.maximum(age, 0.0)
     whole = jnp.floor(age)
-    newer, older = taken(sensing.balls, whole), taken(sensing.balls, whole + 1.0)
+    newer, older = taken(balls, whole), taken(balls, whole + 1.0)
     share = age - whole
     position, velocity = _between(newer, older, share, control_dt)
 
@@ -139,7 +131,7 @@ def take_picture(
     arrived = due
     if "frame_drop" in world:
         lost = noise.uniform(counter, noise.Stream.FRAME_DROP, (), dtype) < world["frame_drop"]
-        arrived = due & ~lost
+        arrived = due & (~lost | (step == 0))
     held_age = last.age + control_dt
     if observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
