@@ -29,8 +29,9 @@ from rich.console import Console
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx import BounceBall, EnvConfig, task
 from bounce_mjx.commands import play, train, view
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import StopRequest
@@ -52,9 +53,9 @@ from bounce_mjx.viewers.controllers import (
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display, _primitive, body_scenes
 from bounce_mjx.viewers.offscreen import choose_backend
-from bounce_mjx.viewers.options import Address, PageStart
+from bounce_mjx.viewers.options import Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.pace import Pace
-from bounce_mjx.viewers.page import open_server
+from bounce_mjx.viewers.page import open_server, write_page
 from bounce_mjx.viewers.scene import Scene, camera_pose
 from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import (
@@ -65,8 +66,9 @@ from bounce_mjx.viewers.simulation import (
     of_environment,
     resample,
 )
-from bounce_mjx.viewers.watch import TrainingPage, results_list
+from bounce_mjx.viewers.watch import TrainingPage, _Panel, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
+from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 from tiny_runs import TINY
 
@@ -466,6 +468,8 @@ class Client:
         self._labels: list[str] = []
         self.texts: list[str] = []
         self.values: dict[str, object] = {}
+        self.sliders: dict[str, tuple[float, float, float]] = {}
+        self.lines: list[str] = []
         self.keys: list[str] = []
         self.camera: dict[str, list[float]] = {}
         self.download = b""
@@ -494,6 +498,10 @@ class Client:
             props = message.get("props", {})
             if "label" in props:
                 self._controls[props["label"]] = message["uuid"]
+            if message["type"] == "GuiSliderMessage":
+                self.sliders[props["label"]] = props["min"], props["max"], props["step"]
+            if message["type"] == "GuiUplotMessage":
+                self.lines += [line["label"] for line in props["series"]]
             if "hotkey" in props:
                 self.keys.append(props["hotkey"])
             if message["type"].startswith("SetCamera"):
@@ -778,6 +786,9 @@ def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:
 
 def test_keys_act_as_in_the_window(page) -> None:
     client, did = page
+    client.control("push the ball right")
+    assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
+    assert client.lines == ["s", "ball", "target", "paddle"]
     client.press("target height up")
     wait_until(lambda: did["target"][-1] == pytest.approx(0.55))
     client.press("slower")
@@ -881,17 +892,22 @@ def test_the_page_of_a_training_shows_its_newest_policy(
             raise RuntimeError("the\nend")
 
     watch(monkeypatch, Simulation, "step", step)
+    points: list[tuple[float, ...]] = []
+    watch(monkeypatch, _Panel, "refresh", lambda panel: points.extend(panel._points))
     printed = io.StringIO()
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
-    means = {"episode/return": 1.0, "episode/bounces": NAN, "speed/steps_per_second": 2e6}
-    training.block(500_000, means)
+    means = {"episode/return": 1.0, "episode/bounces": NAN, "task/apex_error": 0.02}
+    training.block(500_000, means | {"speed/steps_per_second": 2e6})
     training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
     wait_until(lambda: exchangeable.policy == 0.5)
     while not any("500,000 of 50,000,000 steps" in text for text in client.texts):
         client.receive()
     assert any("1 of 2 results met" in text for text in client.texts)
+    np.testing.assert_allclose(points[0], (0.5, 1.0, NAN, 2.0))
+    titles = ("return of an episode", "bounces in a row at its end", "|apex − target height|, cm")
+    assert [line for line in client.lines if line in titles] == list(titles)
     # A page that fails leaves the training alone.
     stop.set()
     wait_until(
@@ -957,6 +973,135 @@ def test_an_invalid_camera_is_ignored(page) -> None:
         client.look(position=[position, 0.0, 0.0])
         client.set(client.control("robots"), number)
         wait_until(lambda number=number: did["shown"][-1] == number)
+
+
+# Other tasks
+
+
+class StillConfig(WorldConfig):
+    """A task without commands."""
+
+
+class Still(task.Task):
+    Config = StillConfig
+
+    def reset(self, start: task.Start) -> tuple:
+        return ()
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        reward = {"calm": -jnp.sum(jnp.square(step.action))}
+        return task.TaskStep((), reward, jnp.array(False), {})
+
+
+class LeanConfig(WorldConfig):
+    """A command that may be negative, and a fixed one without a unit."""
+
+    @property
+    def commands(self) -> dict[str, task.Command]:
+        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1)
+        return {"lean_angle": angle, "pace": task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)}
+
+
+class Lean(Still):
+    Config = LeanConfig
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        twice = 2.0 * step.command["lean_angle"]
+        return super().step(state, step)._replace(metrics={"twice": twice})
+
+    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+        place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
+        return (task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0)),)
+
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        return {"shelf": 0.3, "wall": 0.2 + command["lean_angle"]}
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"twice": f"{metrics['twice']:.1f}", "pace": f"{command['pace']:.0f}"}
+
+
+@pytest.fixture(scope="module")
+def leaning() -> Simulation:
+    env = Env(LeanConfig(physics="fused"))
+    return Simulation(env, make_zero_controller(env), 2, seed=0)
+
+
+@pytest.fixture(scope="module")
+def still() -> Simulation:
+    env = Env(StillConfig(physics="fused"))
+    return Simulation(env, make_zero_controller(env), 1, seed=0)
+
+
+def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatch) -> None:
+    leaning.command = {}
+    with served(leaning, monkeypatch) as client:
+        client.control("push the ball right")
+        sliders = {"angle, rad": (-0.2, 0.2, 0.02), "pace": (1.0, 3.0, 0.2)}
+        assert {label: client.sliders[label] for label in sliders} == sliders
+        assert client.sliders.keys() == {"speed", "robots", "speed, m/s", *sliders}
+        assert client.lines == ["s", "ball", "shelf", "wall", "paddle"]
+        (legend,) = {text for text in client.texts if "orange line" in text}
+        assert "red box</b> high wall<" in legend and "<b>T G</b> lean angle," in legend
+        assert any(">calm<" in text for text in client.texts)
+        client.press("lean angle up")
+        wait_until(lambda: leaning.command == {"lean_angle": 0.1})
+        wait_until(lambda: "twice 0.2   pace 2" in client.labels())
+        for _ in range(2):
+            client.press("lean angle up")
+        wait_until(lambda: leaning.command == {"lean_angle": 0.2})
+        client.set(client.control("pace"), 3.0)
+        wait_until(lambda: leaning.command == {"lean_angle": 0.2, "pace": 3.0})
+    leaning.command = {}
+
+
+def test_keys_of_the_window_move_the_first_command_within_its_limits(leaning: Simulation) -> None:
+    window = native._Window(leaning, 1.0)
+    for key, end in (("T", 0.3), ("G", -0.3)):
+        for _ in range(8):
+            window._press(ord(key))
+        assert leaning.command == {"lean_angle": pytest.approx(end)}
+    leaning.step()
+    (_, _, names, values), (_, _, keys, meanings) = window._texts()
+    assert dict(zip(names.split("\n"), values.split("\n"), strict=True))["twice"] == "-0.6"
+    help_ = dict(zip(keys.split("\n"), meanings.split("\n"), strict=True))
+    assert help_["T / G"] == "lean angle"
+    leaning.command = {}
+
+
+def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
+    still: Simulation, monkeypatch
+) -> None:
+    with served(still, monkeypatch) as client:
+        client.control("push the ball right")
+        assert client.sliders.keys() == {"speed", "robots", "speed, m/s"}
+        assert "".join(client.keys) == "spaceRMNIKJL"
+        assert client.lines == ["s", "ball", "paddle"]
+        (legend,) = {text for text in client.texts if "orange line" in text}
+        assert "T G" not in legend
+    window = native._Window(still, 1.0)
+    window._press(ord("T"))
+    assert still.command == {} and "T / G" not in native._help(still.env)
+
+
+def test_a_replay_shows_the_commands_of_any_task(
+    leaning: Simulation, tmp_path: Path, monkeypatch
+) -> None:
+    shown = []
+    watch(monkeypatch, Scene, "update", lambda _, frames: shown.extend(frames))
+    leaning.command = {"lean_angle": 0.1, "pace": 1.5}
+    write_page(tmp_path / "a.html", leaning, leaning.record(0.2), fps=20)
+    assert (tmp_path / "a.html").exists() and len(shown) == 4
+    for frame in shown:
+        np.testing.assert_allclose(frame.command["lean_angle"], [0.1, 0.1])
+        np.testing.assert_array_equal(frame.command["pace"], [1.5, 1.5])
+    leaning.command = {}
+
+
+def test_policies_of_different_tasks_are_not_shown_together() -> None:
+    shown = [show.Shown(config(), None, "") for config in (LeanConfig, StillConfig)]
+    options = ViewerOptions(viewer="browser")
+    with pytest.raises(UserError, match="different tasks; show one at a time"):
+        show.show(shown, options, commands={}, console=Console())
 
 
 # The world's sliders
@@ -1307,6 +1452,13 @@ def test_mistakes_give_one_sentence(fails, main, case: tuple, monkeypatch) -> No
     flags, *words = case
     sentence = fails(main, flags.split())
     assert not [word for word in words if word not in sentence], sentence
+
+
+def test_a_task_without_a_script_is_named(fails, monkeypatch) -> None:
+    monkeypatch.setattr(Simulation, "__init__", None)
+    dribble = f"{Path(__file__).parent.parent / 'examples/dribble_task.py'}:Dribble"
+    sentence = fails(view.main, ["--task", dribble, *"--actions scripted --html a.html".split()])
+    assert "no scripted controller" in sentence and "--actions random or zero" in sentence
 
 
 def test_without_opengl_the_package_is_named(fails, monkeypatch) -> None:
