@@ -277,6 +277,18 @@ def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
         np.testing.assert_allclose(inwards, ranges[:, side] - sign * 0.025, rtol=0, atol=2e-6)
 
 
+def test_action_adds_to_the_last_target_within_its_lead():
+    """The arm does not move meanwhile; the targets lead it by at most max_lead and one action."""
+    env = BounceBall(EnvConfig(action={"base": "target", "max_lead": 0.05}))
+    state = env.reset(jax.random.key(0))
+    angles = state.pipeline_state.physics.qpos[:6]
+    for lead in (0.02, 0.04, 0.06, 0.07, 0.07):
+        state, control = env.begin_step(state, jnp.ones(6))
+        np.testing.assert_allclose(control.ctrl - angles, lead, atol=1e-6)
+    _, control = env.begin_step(state, -jnp.ones(6))
+    np.testing.assert_allclose(control.ctrl - angles, 0.03, atol=1e-6)
+
+
 def test_action_is_clipped_to_one(reset, step):
     state = reset(jax.random.key(0))
     signs = jnp.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])

@@ -38,7 +38,8 @@ RESULT = r"rests +episodes"
 ALLOWED = {
     "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
-    "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py", "world/ball_filter.py", "world/observation.py",
+    "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
+    "world/ball_filter.py", "world/observation.py",
 }  # fmt: skip
 
 

@@ -77,6 +77,8 @@ class EnvState(NamedTuple):
     world: World = {}
     """The values that the reset drew for the active randomisation terms."""
     memory: Memory | None = None
+    ctrl: jax.Array | None = None
+    """Servo targets of the last step [nu], if an action adds to them."""
 
 
 class Env:
@@ -214,6 +216,8 @@ class Env:
         }
         no_action = jnp.zeros(self.action_size, draws.dtype)
         state = EnvState(physics, command, no_action, parameters=parameters, world=world)
+        if self.config.action.base == "target":
+            state = state._replace(ctrl=self.servo_targets(physics, no_action))
         truth = self.kinematics(state)
         state = state._replace(task=self.task.reset(Start(truth, command)))
         if memory_rng is not None:
@@ -281,10 +285,11 @@ class Env:
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
-            return state, Control(self.servo_targets(before.physics, action))
+            targets = self.servo_targets(before.physics, action, last=before.ctrl)
+            return self._with_targets(state, targets), Control(targets)
         # The same noise as in the observation from which the policy chose the action.
         error = sensing.joint_angle_noise(world, memory.counter, self.action_size, action.dtype)
-        targets = self.servo_targets(before.physics, action, error)
+        targets = self.servo_targets(before.physics, action, error, before.ctrl)
         control, queue = actuation.delayed(
             world, memory.actuation, targets, config.control_dt, config.num_substeps
         )
@@ -300,7 +305,13 @@ class Env:
         if "command_interval" in world:
             command, memory = self._next_command(world, command, memory)
         before = before._replace(command=command, memory=memory)
-        return state.replace(pipeline_state=before), control
+        return self._with_targets(state.replace(pipeline_state=before), targets), control
+
+    def _with_targets(self, state: State, targets: jax.Array) -> State:
+        """A state that keeps the servo targets [nu] if the next action adds to them."""
+        if self.config.action.base == "measured":
+            return state
+        return state.replace(pipeline_state=state.pipeline_state._replace(ctrl=targets))
 
     def _next_command(
         self, world: World, command: dict[str, jax.Array], memory: Memory
@@ -318,7 +329,11 @@ class Env:
         return drawn, memory._replace(command_age=jnp.where(now, 0.0, memory.command_age))
 
     def servo_targets(
-        self, physics: PhysicsState, action: jax.Array, error: jax.Array | None = None
+        self,
+        physics: PhysicsState,
+        action: jax.Array,
+        error: jax.Array | None = None,
+        last: jax.Array | None = None,
     ) -> jax.Array:
         """Servo targets ctrl [nu] of a clipped action [n]: the measured joint angles plus the
         scaled action (rad), clipped to the range of each joint that has one, times the gear.
@@ -326,6 +341,8 @@ class Env:
         Args:
           error: error of the measured angles [n], rad, without the offset of the encoders' zeros,
             which the servo shares.
+          last: servo targets of the last step [nu], to which the action adds instead, within
+            `max_lead` of the measured angles.
         """
         model, addresses = self.mj_model, self._addresses
         targets = [jnp.zeros_like(action[0])] * model.nu
@@ -335,11 +352,15 @@ class Env:
             angle = physics.qpos[addresses.arm_qpos[i]]
             if error is not None:
                 angle = angle + error[i]
+            gear = float(model.actuator_gear[actuator, 0])
+            if last is not None:
+                lead = self.config.action.max_lead
+                sent = last[actuator] if gear == 1.0 else last[actuator] / gear
+                angle = jnp.clip(sent, angle - lead, angle + lead)
             target = angle + self.config.action_scale * action[i]
             low, high = (float(limit) for limit in model.jnt_range[addresses.arm_joints[i]])
             if low < high:
                 target = jnp.clip(target, low, high)
-            gear = float(model.actuator_gear[actuator, 0])
             targets[actuator] = target if gear == 1.0 else gear * target
         return jnp.stack(targets)
 

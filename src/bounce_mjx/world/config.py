@@ -58,6 +58,16 @@ class Command(NamedTuple):
         raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
 
 
+class ActionConfig(StrictModel):
+    """What an action adds to."""
+
+    base: Literal["measured", "target"] = "measured"
+    """measured: the measured joint angle. target: the last servo target, with which a joint reaches
+    its full speed despite latency."""
+    max_lead: Positive = 0.15
+    """Largest distance of the last target from the measured angle, rad; for the base target."""
+
+
 class WorldConfig(StrictModel):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
@@ -81,6 +91,8 @@ class WorldConfig(StrictModel):
     """Length of an episode before it is truncated, s."""
     action_scale: Positive = 0.02
     """Change of the servo target for an action of 1, rad."""
+    action: ActionConfig = ActionConfig()
+    """What an action adds to."""
     default_joint_angles: Annotated[tuple[Finite, ...], Field(min_length=1)] = tuple(
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )

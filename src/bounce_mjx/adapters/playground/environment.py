@@ -147,7 +147,9 @@ class PlaygroundBounceBall(MjxEnv):
                 qvel=moved.qvel,
                 act=moved.act,
                 time=data.time + self.task.dt,
-                ctrl=self.task.servo_targets(physics, jnp.clip(action, -1.0, 1.0)),
+                ctrl=self.task.servo_targets(
+                    physics, jnp.clip(action, -1.0, 1.0), last=data.task.ctrl
+                ),
                 task=after.pipeline_state._replace(physics=None),
             ),
             obs=after.obs,
