@@ -26,6 +26,8 @@ class Config(task.WorldConfig):
     """Ball position at a reset, before noise, m."""
     ball_position_noise: float = 0.0
     """Half-width of the uniform noise of each ball coordinate at a reset, m."""
+    joint_angle_noise: float = 0.0
+    """Half-width of the uniform noise of the joint angles at a reset, rad."""
     reward: Rewards = Rewards()
     """The reward terms."""
 
