@@ -373,7 +373,8 @@ def check_report(run: Path) -> str:
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     assert len(re.findall(r">128</td>|>256</td>", page)) == 2
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
-    assert train_config(Bounce).model_validate(yaml.safe_load(config)) == load_config(run / "config.yaml")
+    shown = train_config(Bounce).model_validate(yaml.safe_load(config))
+    assert shown == load_config(run / "config.yaml")
     return page
 
 

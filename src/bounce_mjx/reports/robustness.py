@@ -249,6 +249,7 @@ def _draw_legend(figure: Figure, height: float, letters: dict[str, str], framed:
     figure.colorbar(scale, cax=bar, orientation="horizontal", ticks=(0, 50, 75, 90, 100))
     bar.set_title("episodes until the time limit, %", fontsize=8)
     bar.tick_params(labelsize=8, length=0)
+    first = next(iter(letters.values()))
     missed = literal("   ".join(f"{letter} {name}" for name, letter in letters.items()))
     handles = [
         Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
