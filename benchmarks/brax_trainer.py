@@ -30,7 +30,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import NetworkFunctions, Policy, make_networks
 from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 
 
 class _TrainingEnded(Exception):

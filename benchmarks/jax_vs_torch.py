@@ -47,7 +47,7 @@ from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.setup import compiler_options
 

@@ -17,12 +17,12 @@ from skrl.memories.jax import RandomMemory
 from skrl.models.jax import DeterministicMixin, GaussianMixin, Model
 from skrl.resources.schedulers.jax import KLAdaptiveLR
 
+from bounce_mjx.env import vector
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
-from bounce_mjx.env import vector
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 
 
 class SkrlJaxLearner:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import make_trainer, policy_of
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
 Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]

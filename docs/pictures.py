@@ -332,6 +332,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     """An episode of `pretrained`, which acts on the true state: times, observations and their
     layout, true quantities, metrics."""
     import jax
+    from bounce_mjx.task.observation import OBSERVATION
 
     from bounce_mjx import BounceBall
     from bounce_mjx.learning.policy import act, make_networks
@@ -339,7 +340,6 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.runs.folders import pretrained_checkpoint
     from bounce_mjx.runs.reading import load_policy
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-    from bounce_mjx.task.observation import OBSERVATION
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)

@@ -29,7 +29,8 @@ from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.reading import load_policy, load_training_state
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.tasks.bounce import BounceBall, BounceConfig
+from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.tasks.bounce_ball import BounceBall
 
 OBSERVATION = BounceConfig().layout
 

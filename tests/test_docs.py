@@ -30,8 +30,9 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.task import term_names, weighted_terms
+from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
@@ -175,13 +176,16 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", *cli._flags(ship["ShipCommand"])}
+    flags = {"--help", *cli.flags_of(ship["ShipCommand"])}
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
-                flags |= set(cli._flags(member))
+                has_task = "env" in member.model_fields
+                flags |= set(cli.flags_of(train_config(Bounce, member) if has_task else member))
+    for task in (Bounce, find_task("examples/dribble_task.py:Dribble")):
+        flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
     return flags
 
 
@@ -212,7 +216,10 @@ def leaves(plain: dict, prefix: str = "") -> dict:
 
 
 def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
-    rows, flags = reference_rows(), set(cli._flags(train_command.TrainCommand))
+    rows, flags = (
+        reference_rows(),
+        set(cli.flags_of(train_config(Bounce, train_command.TrainCommand))),
+    )
     defaults = leaves(TrainConfig().model_dump(mode="json"))
     assert rows.keys() == defaults.keys()
     for key, (flag, kind, default, _, _, meaning) in rows.items():
@@ -232,7 +239,7 @@ def refused(key: str, value: object) -> bool:
     for group in reversed(groups):
         plain = {group: plain}
     try:
-        TrainConfig.model_validate(plain)
+        train_config(Bounce).model_validate(plain)
     except pydantic.ValidationError as error:
         return any(name in map(str, e["loc"]) for e in error.errors())
     return False
@@ -374,7 +381,7 @@ def test_files_on_pages_are_configs(page: str) -> None:
     files = examples(page, "yaml")
     assert files
     for file in files:
-        TrainConfig.model_validate(yaml.safe_load(file))
+        train_config(Bounce).model_validate(yaml.safe_load(file))
 
 
 def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.config import TrainConfig, load_config, train_config
+from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training.command import config_of
 from tiny_runs import contents
 
@@ -75,7 +76,7 @@ def assert_valid_run(command: train_command.TrainCommand) -> None:
     """Checks that the command's config passes the validation again and survives a round trip
     through a file."""
     config = config_of(command)
-    again = TrainConfig.model_validate(yaml.safe_load(dump_config(config)))
+    again = train_config(Bounce).model_validate(yaml.safe_load(dump_config(config)))
     assert again == config
 
 

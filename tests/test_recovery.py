@@ -48,7 +48,7 @@ from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training.command import config_of
@@ -517,7 +517,7 @@ import jax
 from bounce_mjx.commands.train import main
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.tasks.bounce_rewards import PaddleHomeReward
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 formula = PaddleHomeReward.value

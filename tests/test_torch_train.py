@@ -28,7 +28,7 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import load_config
 from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint, latest_checkpoint
 from bounce_mjx.runs.reading import load_policy
-from bounce_mjx.tasks.bounce import BounceBall
+from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import command as training_command
 from tiny_runs import arrays
 

@@ -6,8 +6,8 @@ from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
-    from bounce_mjx.tasks.bounce import BounceBall
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
+    from bounce_mjx.tasks.bounce_ball import BounceBall
 
     __version__: str
 
@@ -20,7 +20,7 @@ def __getattr__(name: str) -> Any:
     """Imports the public names on first use (PEP 562): JAX takes two seconds to import, and a
     deployed policy does not need it."""
     if name == "BounceBall":
-        from bounce_mjx.tasks.bounce import BounceBall
+        from bounce_mjx.tasks.bounce_ball import BounceBall
 
         return BounceBall
     if name == "EnvConfig":

@@ -12,7 +12,6 @@ from typing import Annotated, Any, NamedTuple
 import pydantic
 
 from bounce_mjx.config.settings import Finite, NonNegative, Positive
-from bounce_mjx.env.env import Env
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task import (
     Command,
@@ -495,11 +494,3 @@ class Bounce(Task):
         """The paddle's home."""
         reward = self.config.reward
         return reward.target_x, reward.target_y, reward.paddle_home_height
-
-
-class BounceBall(Env):
-    """The environment of the original specification."""
-
-    def __init__(self, config: BounceConfig | None = None, randomize: Any = None):
-        """See `Env`; without a config, the specification's."""
-        super().__init__(config or BounceConfig(), randomize)

@@ -1,0 +1,14 @@
+"""The environment of the task bounce, without its import of JAX for the settings alone."""
+
+from typing import Any
+
+from bounce_mjx.env.env import Env
+from bounce_mjx.tasks.bounce import BounceConfig
+
+
+class BounceBall(Env):
+    """The environment of the original specification."""
+
+    def __init__(self, config: BounceConfig | None = None, randomize: Any = None):
+        """See `Env`; without a config, the specification's."""
+        super().__init__(config or BounceConfig(), randomize)
