@@ -73,31 +73,56 @@ def packages():
     """The package's folders in the order of their imports."""
     folders = {
         "config": "types of\nsettings", "gpu": "kernels", "robot": "MJCF of\nthe arm",
-        "physics": "fused,\nMJX", "task": "reset, step,\nreward", "learning": "PPO,\nnetworks",
-        "evaluation": "the five\nresults", "runs": "folders,\ncheckpoints",
+        "physics": "fused,\nMJX", "world": "sensors,\nlatencies", "task": "what a task\nis made of",
+        "env": "reset, step,\nbatches", "tasks": "bouncing", "learning": "PPO,\nnetworks",
+        "evaluation": "episodes,\nresults", "runs": "folders,\ncheckpoints",
         "deploy": "ONNX,\nload_policy", "reports": "curves,\nfigures", "training": "the job",
         "viewers": "page,\nvideos", "adapters": "Gymnasium,\nbrax, torch", "commands": "bounce-mjx",
     }  # fmt: skip
-    diagram = Diagram(38)
+    diagram = Diagram(39)
     for i, (name, text) in enumerate(folders.items()):
-        row, column = divmod(i, 7)
+        row, column = divmod(i, 9)
         colour = (GREEN if i < 3 else BLUE) if row == 0 else ORANGE
-        x, y = 1 + column * 14.1, 2 + row * 19
-        diagram.box(x, y, 12.4, 14, name, text, colour)
+        x, y = 0.5 + column * 11.1, 2 + row * 20
+        diagram.box(x, y, 10.2, 14, name, text, colour)
         if column:
-            diagram.arrow((x, y + 7), (x - 1.7, y + 7))
+            diagram.arrow((x, y + 7), (x - 0.9, y + 7))
     diagram.text(
-        50, 18.5, "A package may import from all packages before it, in reading order.", size=9
+        50, 19, "A package may import from all packages before it, in reading order.", size=9
     )
+    return diagram.figure
+
+
+def task():
+    """What a task gives to the world, and who asks it for what."""
+    diagram = Diagram(46)
+    diagram.box(
+        1, 3, 30, 39, "the world", "arm, ball, physics,\nsensors, latency,\nrandomisation", GREEN
+    )
+    diagram.box(36, 3, 30, 39, "", "", BLUE)
+    diagram.text(51, 8, "your task", weight="bold")
+    rows = (
+        ("Config, commands", "settings, flags,\nsliders, options"),
+        ("reset, step", "training: reward,\nend, metrics"),
+        ("tally, results", "eval, robustness,\nreport"),
+        ("markers, readings, plots", "viewers, report"),
+        ("next_quantities", "observation,\nONNX graph"),
+    )
+    for i, (method, user) in enumerate(rows):
+        y = 14 + 6 * i
+        diagram.text(51, y, method, size=9, family="monospace")
+        diagram.text(84, y, user, size=9)
+        diagram.arrow((66, y), (74, y))
+    diagram.arrow((31, 20), (36, 20), both=True)
     return diagram.figure
 
 
 def algorithms():
     """The interfaces of the environment, and the training job around a trainer."""
     diagram = Diagram(60)
-    diagram.box(33, 1, 34, 10, "BounceBall", "pure reset and step", GREEN)
+    diagram.box(33, 1, 34, 10, "Env", "pure reset and step", GREEN)
     interfaces = (
-        ("task.vector", "your own loop in JAX,\nPPO of this project", BLUE),
+        ("env.vector", "your own loop in JAX,\nPPO of this project", BLUE),
         ("brax, gymnax", "Playground, PureJaxRL,\nEvosax", BLUE),
         ("Gymnasium, SB3", "SBX, TorchRL,\nCleanRL, skrl", ORANGE),
         ("TorchVectorEnv", "rsl_rl, skrl", ORANGE),
@@ -332,7 +357,6 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     """An episode of `pretrained`, which acts on the true state: times, observations and their
     layout, true quantities, metrics."""
     import jax
-    from bounce_mjx.task.observation import OBSERVATION
 
     from bounce_mjx import BounceBall
     from bounce_mjx.learning.policy import act, make_networks
@@ -343,7 +367,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    networks = make_networks(config.ppo, OBSERVATION.size, 6)
+    networks = make_networks(config.ppo, env.layout.size, 6)
     policy = load_policy(checkpoint, config)
     changes = {"observation": observation or {}, "randomization": randomization or {}}
     env = BounceBall(EnvConfig(target_height_range=(target, target), **changes))
@@ -351,7 +375,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     def step(state, _):
         truth = env.kinematics(state.pipeline_state)
         values = truth._asdict() | {"target_height": state.pipeline_state.task.target_height[None]}
-        state = env.step(state, act(networks, policy, OBSERVATION.pack(values)))
+        state = env.step(state, act(networks, policy, env.layout.pack(values)))
         return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
 
     run = jax.jit(lambda key: jax.lax.scan(step, env.reset(key), None, round(seconds / env.dt))[1])
@@ -608,7 +632,7 @@ def page():
 
 
 PICTURES = (
-    packages, algorithms, libraries, settings, checkpoints, scaling, control_step, troubleshooting,
+    packages, task, algorithms, libraries, settings, checkpoints, scaling, control_step, troubleshooting,
     start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""

@@ -75,7 +75,7 @@ class Config(task.WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        return {"apex": task.Command(*self.apex_range, "m", least=0.01, span=(0.05, 0.1))}
+        return {"apex": task.Command(*self.apex_range, "m", least=0.01, step=0.005)}
 
 
 class Dribble(task.Task):
