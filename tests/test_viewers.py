@@ -1083,6 +1083,15 @@ def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
     assert still.command == {} and "T / G" not in native._help(still.env)
 
 
+def test_a_label_without_readings_is_not_shown(still: Simulation, scripted: Simulation) -> None:
+    """It would be a white stroke."""
+    for simulation, is_shown in ((still, False), (scripted, True)):
+        with open_server("127.0.0.1", 0) as server:
+            scene = Scene(server, simulation.env, 1)
+            scene.update([simulation.frame])
+            assert [label.visible for label in scene._labels] == [is_shown]
+
+
 def test_a_replay_shows_the_commands_of_any_task(
     leaning: Simulation, tmp_path: Path, monkeypatch
 ) -> None:

@@ -122,6 +122,7 @@ class Scene:
                 "",
                 position=place + (0.0, 0.0, _LABEL_HEIGHT),
                 anchor="bottom-center",
+                visible=False,
                 font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.8,
             )
             for i, place in enumerate(self._label_places)
@@ -163,7 +164,8 @@ class Scene:
             for i, label in enumerate(self._labels):
                 text = self._label(frame, i)
                 if label.text != text:
-                    label.text = text
+                    # An empty label would be a white stroke.
+                    label.text, label.visible = text, bool(text)
                 height = max(_LABEL_HEIGHT, tops[i] + _LABEL_DISTANCE)
                 position = self._label_places[i] + (0.0, 0.0, height)
                 if not np.array_equal(label.position, position):
@@ -192,7 +194,8 @@ class Scene:
         readings = frame_readings(self._env, frame, index)
         if short:
             return name + next(iter(readings.values()), "")
-        return name + "   ".join(f"{word} {value}" for word, value in readings.items())
+        text = name + "   ".join(f"{word} {value}" for word, value in readings.items())
+        return text.strip()
 
     def _trails(self, frames: Sequence[EnvFrame]) -> tuple[np.ndarray, np.ndarray]:
         """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
