@@ -367,15 +367,16 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    networks = make_networks(config.ppo, env.layout.size, 6)
+    layout = EnvConfig().layout
+    networks = make_networks(config.ppo, layout.size, 6)
     policy = load_policy(checkpoint, config)
     changes = {"observation": observation or {}, "randomization": randomization or {}}
     env = BounceBall(EnvConfig(target_height_range=(target, target), **changes))
 
     def step(state, _):
         truth = env.kinematics(state.pipeline_state)
-        values = truth._asdict() | {"target_height": state.pipeline_state.task.target_height[None]}
-        state = env.step(state, act(networks, policy, env.layout.pack(values)))
+        values = truth._asdict() | {"target_height": state.pipeline_state.command["target_height"][None]}
+        state = env.step(state, act(networks, policy, layout.pack(values)))
         return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
 
     run = jax.jit(lambda key: jax.lax.scan(step, env.reset(key), None, round(seconds / env.dt))[1])
@@ -632,8 +633,8 @@ def page():
 
 
 PICTURES = (
-    packages, task, algorithms, libraries, settings, checkpoints, scaling, control_step, troubleshooting,
-    start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
+    packages, task, algorithms, libraries, settings, checkpoints, scaling, control_step,
+    troubleshooting, start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""
 
