@@ -79,16 +79,16 @@ def packages():
         "deploy": "ONNX,\nload_policy", "reports": "curves,\nfigures", "training": "the job",
         "viewers": "page,\nvideos", "adapters": "Gymnasium,\nbrax, torch", "commands": "bounce-mjx",
     }  # fmt: skip
-    diagram = Diagram(39)
+    diagram = Diagram(54)
     for i, (name, text) in enumerate(folders.items()):
-        row, column = divmod(i, 9)
-        colour = (GREEN if i < 3 else BLUE) if row == 0 else ORANGE
-        x, y = 0.5 + column * 11.1, 2 + row * 20
-        diagram.box(x, y, 10.2, 14, name, text, colour)
+        row, column = divmod(i, 6)
+        colour = (GREEN, BLUE, ORANGE)[(i > 3) + (i > 7)]
+        x, y = 1 + column * 16.4, 1 + row * 16
+        diagram.box(x, y, 14.4, 14, name, text, colour)
         if column:
-            diagram.arrow((x, y + 7), (x - 0.9, y + 7))
+            diagram.arrow((x, y + 7), (x - 2, y + 7))
     diagram.text(
-        50, 19, "A package may import from all packages before it, in reading order.", size=9
+        50, 51, "A package may import from all packages before it, in reading order.", size=9
     )
     return diagram.figure
 
@@ -375,7 +375,8 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
 
     def step(state, _):
         truth = env.kinematics(state.pipeline_state)
-        values = truth._asdict() | {"target_height": state.pipeline_state.command["target_height"][None]}
+        height = state.pipeline_state.command["target_height"]
+        values = truth._asdict() | {"target_height": height[None]}
         state = env.step(state, act(networks, policy, layout.pack(values)))
         return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
 
@@ -634,7 +635,8 @@ def page():
 
 PICTURES = (
     packages, task, algorithms, libraries, settings, checkpoints, scaling, control_step,
-    troubleshooting, start_times, episode, reward_terms, sensors, two_policies, gradient, arms, page, parity,
+    troubleshooting, start_times, episode, reward_terms, sensors, two_policies, gradient, arms,
+    page, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""
 
