@@ -218,8 +218,8 @@ BAD_EVAL_FLAGS = {
     "near miss": ("--target-hight 0.5", "did you mean --target-height?"),
     "near miss of a renamed flag": ("--jsn a", "did you mean --json?"),
     "no episodes": ("--episodes 0", "--episodes is 0", "equal to 1"),
-    "target below the floor": ("--target-height -1", "--target-height is -1.0", "greater than 0"),
-    "target nan": ("--target-height nan", "--target-height is nan", "finite"),
+    "target below the floor": ("--target-height -1", "--target-height is '-1'", ">= 0.001"),
+    "target nan": ("--target-height nan", "--target-height is 'nan'", "finite"),
     "unknown engine": ("--physics warp", "--physics", "{config,fused,mjx,mujoco}", "warp"),
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
@@ -499,7 +499,7 @@ def test_eval_repeats_itself_for_a_seed(trained: Path, tmp_path: Path) -> None:
 
 def test_eval_takes_a_fixed_target(trained: Path, tmp_path: Path) -> None:
     report = evaluate([trained, "--target-height", "0.8"], tmp_path / "a.json")
-    assert report["target_height"] == 0.8
+    assert report["commands"] == {"target_height": 0.8}
     speed = report["results"][RESULT_NAMES.index("upward speed")]
     assert speed["passed"] is None
 

@@ -525,7 +525,7 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
     robot = env.config.robot
     speed = env.config.action_scale * np.divide(robot.servo_stiffness, robot.servo_damping)
     np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
-    with pytest.raises(UserError, match="the package's own arm only"):
+    with pytest.raises(UserError, match="the task has no scripted controller for this robot"):
         make_scripted_controller(env)
 
 

@@ -27,7 +27,13 @@ from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
-from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config, read_preset
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    load_config,
+    load_run_config,
+    read_preset,
+    train_config,
+)
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
     Checkpoint,
@@ -45,6 +51,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training import job
 from tiny_runs import contents
 
@@ -372,7 +379,7 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
 def test_a_config_of_an_older_version_may_name_its_network(tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text("ppo: {network: mlp, gru_size: 64, num_envs: 8}")
-    assert load_config(file) == TrainConfig(ppo={"num_envs": 8})
+    assert load_config(file) == train_config(Bounce)(ppo={"num_envs": 8})
     file.write_text("ppo: {network: gru, gru_size: 64}")
     with pytest.raises(UserError, match="network is gru, .* no recurrent policies; train a policy"):
         load_config(file)

@@ -9,7 +9,7 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
 from bounce_mjx.training.command import early_flag
 from bounce_mjx.world.config import WorldConfig
 
@@ -57,11 +57,16 @@ def parse_with_commands(
             given[name] = value if equals else next(rest, "")
         else:
             words.append(word)
-    task = early_flag(words, "--task") or DEFAULT
-    commands = find_task(task).Config().commands
+    task = early_flag(words, "--task")
+    commands = find_task(task or DEFAULT).Config().commands
     if commands:
         flags = ", ".join(f"{_flag(name)} {c.unit.upper()}" for name, c in commands.items())
-        description += f" The commands of the task {task} are flags too: {flags}."
+        description += f" The commands of the task {task or DEFAULT} are flags too: {flags}."
+    # Without --task, the run may be of any registered task.
+    tasks = [task] if task else registered_tasks() if given else []
+    possible = {_flag(name) for task in tasks for name in find_task(task).Config().commands}
+    for flag in given.keys() - possible:
+        raise _unknown(flag, [*known, *possible], prog)
     command = parse(command_class, words, prog=prog, description=description)
     return command, CommandFlags(given, sorted(known), prog)
 
@@ -83,12 +88,16 @@ class CommandFlags:
         values = {}
         for flag, text in self._given.items():
             if flag not in commands:
-                near = difflib.get_close_matches(flag, [*self._known, *commands], n=1)
-                advice = f"; did you mean {near[0]}?" if near else ""
-                raise UserError(f"unknown argument {flag}{advice} (see {self._prog} --help)")
+                raise _unknown(flag, [*self._known, *commands], self._prog)
             name, command = commands[flag]
             values[name] = command.checked(text, flag)
         return values
+
+
+def _unknown(flag: str, known: Sequence[str], prog: str) -> UserError:
+    near = difflib.get_close_matches(flag, known, n=1)
+    advice = f"; did you mean {near[0]}?" if near else ""
+    return UserError(f"unknown argument {flag}{advice} (see {prog} --help)")
 
 
 def _flag(name: str) -> str:

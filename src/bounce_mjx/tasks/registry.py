@@ -116,6 +116,11 @@ def _content(name: str) -> tuple[str, str]:
     return hashlib.sha256(read_source(name)).hexdigest(), name.rpartition(":")[2]
 
 
+def registered_tasks() -> tuple[str, ...]:
+    """Names of the tasks of the package and of installed packages."""
+    return tuple(sorted(_registered()))
+
+
 def _registered() -> dict[str, str]:
     """MODULE:CLASS by name."""
     entries = importlib.metadata.entry_points(group=GROUP)
