@@ -93,7 +93,8 @@ class TrainConfig(StrictModel):
         if "task" not in values and isinstance(env, WorldConfig) and env.task is not None:
             values = values | {"task": task_name(env.task)}
         task = env.task if isinstance(env, WorldConfig) else find_task(values.get("task", DEFAULT))
-        return {"env": task.Config(), "log_dir": runs_folder(task)} | values
+        values = {"env": {}, "log_dir": runs_folder(task)} | values
+        return values | {"env": task.Config.model_validate(values["env"])}
 
 
 @functools.cache
