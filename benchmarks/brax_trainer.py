@@ -59,8 +59,10 @@ class CriticObservation(Wrapper):
 
 def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBlock) -> None:
     """brax's PPO with its own wrappers."""
-    ppo = config.ppo
     env = BounceBall(config.env.model_copy(update={"physics": physics}))
+    ppo = config.ppo
+    if ppo.critic_metrics is None:
+        ppo = ppo.model_copy(update={"critic_metrics": env.task.critic_metrics})
     steps_per_epoch = block_iterations(config) * ppo.batch_steps
     epochs = -(-config.total_steps // steps_per_epoch)
     settings = ppo_settings(config) | {"num_timesteps": epochs * steps_per_epoch}

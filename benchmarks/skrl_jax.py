@@ -31,6 +31,8 @@ class SkrlJaxLearner:
 
     def __init__(self, config: PPOConfig, env: BounceBall, seed: int):
         skrl.config.jax.key = seed
+        if config.critic_metrics is None:
+            config = config.model_copy(update={"critic_metrics": env.task.critic_metrics})
         self.config = config
         self._observation_size = env.observation_size
         num_states = env.observation_size + len(config.critic_metrics)

@@ -270,12 +270,13 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
 
 def test_nothing_is_read_that_could_run(run: Path) -> None:
     """No reader of runs, configs and models can execute its input, and no file of a run has a
-    format that could hold code."""
+    format that could hold code. Only the registry runs code: the file of a task that the user
+    names."""
     banned = (
         r"\b(c?pickle|cloudpickle|dill|joblib|marshal|shelve)\b|\beval\(|\bexec\(|__import__"
         r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)?load\b|yaml\.Loader|Unsafe|FullLoader"
     )
-    for path in SOURCES.rglob("*.py"):
+    for path in set(SOURCES.rglob("*.py")) - {SOURCES / "tasks/registry.py"}:
         for number, line in enumerate(path.read_text().splitlines(), 1):
             assert not re.search(banned, line), f"{path}:{number}: {line}"
     for path in step_of(run).rglob("*"):

@@ -266,7 +266,10 @@ def test_config_reference_has_the_true_ranges() -> None:
 def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
     page = content("libraries.md")
     rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \| (`.+`) \|$", page, re.MULTILINE)
-    examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {"deploy.py", "dribble_task.py"}
+    examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {
+        "deploy.py",
+        "dribble_task.py",
+    }
     assert set(re.findall(r"examples/([\w.]+)", "".join(row[0] for row in rows))) == examples
     for _, tests in rows:
         for test in re.findall(r"`(.+?)`", tests):

@@ -98,6 +98,7 @@ def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeyp
 
 
 def test_examples_are_short():
-    """Except a robot's control loop, which belongs to no library."""
+    """Except a robot's control loop and a task, which belong to no library."""
     for path in set(EXAMPLES.glob("*.py")) - {EXAMPLES / "deploy.py"}:
-        assert 15 <= len(path.read_text().splitlines()) <= 60, path.name
+        longest = 120 if path.name == "dribble_task.py" else 60
+        assert 15 <= len(path.read_text().splitlines()) <= longest, path.name

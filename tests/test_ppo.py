@@ -16,6 +16,7 @@ from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.task import Task
+from bounce_mjx.tasks.bounce import Bounce
 
 OBSERVATION = EnvConfig().layout
 
@@ -381,7 +382,7 @@ def test_counters(tiny, init, after_two):
 
 def test_policy_sees_only_the_observation(tiny, after_two):
     state, _ = after_two
-    assert state.statistics.mean.shape == (29 + len(tiny.critic_metrics),)
+    assert state.statistics.mean.shape == (29 + len(Bounce.critic_metrics),)
     acting = ppo.policy_of(state, OBSERVATION.size)
     np.testing.assert_array_equal(acting.normalizer.mean, state.statistics.mean[:29])
     networks = policy.make_networks(tiny, 29, 6)

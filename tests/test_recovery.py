@@ -518,17 +518,17 @@ import jax
 from bounce_mjx.commands.train import main
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.tasks.bounce_rewards import PaddleHomeReward
-from bounce_mjx.tasks.bounce_ball import BounceBall
+from bounce_mjx.env.env import Env
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 formula = PaddleHomeReward.value
 def from_file(*args):
     return formula(*args) * float(Path(__file__).with_name("factor").read_text())
 PaddleHomeReward.value = from_file
-step = BounceBall.step
+step = Env.step
 def from_variable(self, state, action, *args):
     return step(self, state, action * float(os.environ["FACTOR"]), *args)
-BounceBall.step = from_variable
+Env.step = from_variable
 entropy = Gaussian.entropy
 Gaussian.entropy = lambda self: LOSS * entropy(self)
 main()
@@ -580,8 +580,11 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     (expected,) = whole.final(policy)
     (report,) = chunked.final(policy)
     assert report.details == pytest.approx(expected.details)
-    for ours, theirs in zip(report.recording, expected.recording, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    jax.tree.map(
+        lambda ours, theirs: np.testing.assert_allclose(ours, theirs, atol=1e-5),
+        report.recording,
+        expected.recording,
+    )
 
     (screening,) = chunked.select(policy)
     _, key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed)))

@@ -154,7 +154,7 @@ print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
         text=True,
     )
     assert done.stdout == "(6,)\n", done.stderr
-    assert "there is no task 'bounce'" in command("train", code=2)
+    assert "error: the task bounce cannot be imported" in command("train", code=2)
 
 
 # A task in a file

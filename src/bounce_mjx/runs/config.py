@@ -77,6 +77,10 @@ class TrainConfig(StrictModel):
     log_dir: PlainPath
     """Folder in which the run makes its own, named by the time."""
 
+    def __eq__(self, other: object) -> bool:
+        """Equal settings are equal, whichever class of `train_config` has them."""
+        return isinstance(other, TrainConfig) and dict(self) == dict(other)
+
     @pydantic.field_validator("task")
     @classmethod
     def _make_absolute(cls, name: str) -> str:

@@ -139,16 +139,15 @@ class BounceConfig(WorldConfig):
         moved = {} if heights is None else {"target_height_range": heights}
         return values | {"randomization": terms} | moved
 
-    @pydantic.field_validator("target_height_range")
-    @classmethod
-    def _check_heights(cls, heights: tuple[float, float]) -> tuple[float, float]:
-        low, high = heights
+    @pydantic.model_validator(mode="after")
+    def _check_heights(self):
+        low, high = self.target_height_range
         if not 0.0 < low <= high < math.inf:
             raise ValueError(
-                f"target_height_range {heights} is not 0 < low <= high; give two heights in "
-                "metres, the lower first"
+                f"target_height_range {self.target_height_range} is not 0 < low <= high; give two "
+                "heights in metres, the lower first"
             )
-        return heights
+        return self
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
