@@ -19,12 +19,13 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.runs.config import TrainConfig, load_config, train_config
+from bounce_mjx.runs.config import load_config, train_config
 from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training.command import config_of
 from tiny_runs import contents
 
-FLAGS = sorted(flags_of(train_command.TrainCommand))
+CONFIG = train_config(Bounce)
+FLAGS = sorted(flags_of(train_config(Bounce, train_command.TrainCommand)))
 EVAL_FLAGS = sorted(flags_of(eval_command.EvalCommand))
 
 
@@ -33,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
     """The working directory of all cases: a preset, a run without a checkpoint, and a file."""
     folder = tmp_path_factory.mktemp("fuzz")
     (folder / "run").mkdir()
-    (folder / "run/config.yaml").write_text(dump_config(TrainConfig()))
+    (folder / "run/config.yaml").write_text(dump_config(CONFIG()))
     (folder / "preset.yaml").write_text("seed: 3\n")
     (folder / "fuzzed.yaml").write_bytes(b"")
     with contextlib.chdir(folder):
@@ -76,7 +77,7 @@ def assert_valid_run(command: train_command.TrainCommand) -> None:
     """Checks that the command's config passes the validation again and survives a round trip
     through a file."""
     config = config_of(command)
-    again = train_config(Bounce).model_validate(yaml.safe_load(dump_config(config)))
+    again = CONFIG.model_validate(yaml.safe_load(dump_config(config)))
     assert again == config
 
 
@@ -171,7 +172,7 @@ def read_config(folder: Path, data: bytes) -> None:
 
 @pytest.mark.slow
 @cases(250)
-@given(tree=TREES | groups(TrainConfig), style=st.booleans(), unicode=st.booleans())
+@given(tree=TREES | groups(CONFIG), style=st.booleans(), unicode=st.booleans())
 def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: bool) -> None:
     text = yaml.safe_dump(tree, default_flow_style=style, allow_unicode=unicode)
     read_config(folder, text.encode("utf-8", "surrogatepass"))
@@ -179,7 +180,7 @@ def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: 
 
 @pytest.mark.slow
 @cases(250)
-@given(tree=groups(TrainConfig))
+@given(tree=groups(CONFIG))
 def test_config_file_of_known_keys(folder: Path, tree: dict) -> None:
     read_config(folder, yaml.safe_dump(tree).encode("utf-8", "surrogatepass"))
 
