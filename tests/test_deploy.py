@@ -449,6 +449,28 @@ def test_servo_targets_are_those_of_the_environment() -> None:
         np.testing.assert_allclose(policy.servo_targets(action), expected, atol=1e-6)
 
 
+def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
+    """The policy's actions add to its last targets; a step that is repeated changes nothing."""
+    env = BounceBall(EnvConfig(action={"base": "target", "max_lead": 0.03}))
+    policy = load_policy("pretrained")
+    policy.metadata = policy.metadata._replace(max_lead=0.03)
+    policy.reset()
+    rng = np.random.default_rng(0)
+    state = env.reset(jax.random.PRNGKey(0))
+    for step in range(12):
+        pipeline = state.pipeline_state
+        angles = np.asarray(pipeline.physics.qpos[:6]) + 0.004 * step
+        physics = pipeline.physics._replace(qpos=pipeline.physics.qpos.at[:6].set(angles))
+        state = state.replace(pipeline_state=pipeline._replace(physics=physics))
+        for _ in range(2):
+            policy.step(measured_once() | {"joint_angles": angles, "time": 0.01 * step})
+        action = rng.uniform(0.0, 1.0, 6)
+        state, control = env.begin_step(state, jnp.asarray(action, jnp.float32))
+        targets = policy.servo_targets(action)
+        np.testing.assert_allclose(targets, control.ctrl, atol=1e-6)
+    assert np.abs(targets - angles).max() > 0.025
+
+
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 
 

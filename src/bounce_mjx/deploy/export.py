@@ -41,8 +41,9 @@ _OPSET, _IR_VERSION = 17, 8
 _INPUT_NAMES = {"action": "past_actions"}
 
 _ACTION = (
-    "servo target of joint i in rad = clip(joint_angles[i] + action_scale * action[i], "
-    "joint_ranges[i]), from the joint angles of the same observation"
+    "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
+    "where base is the joint angles of the same observation; with max_lead, it is the last servo "
+    "target within max_lead of them"
 )
 
 
@@ -140,6 +141,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         control_dt=env.control_dt,
         action=_ACTION,
         action_scale=env.action_scale,
+        max_lead=env.action.max_lead if env.action.base == "target" else None,
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()

@@ -93,6 +93,9 @@ class Metadata(NamedTuple):
     """Meaning of the output [N, J], in words."""
     action_scale: Annotated[float, (0.0, 1e3)]
     """Change of the servo target at the action 1, rad."""
+    max_lead: Annotated[float, (0.0, 1e3)] | None
+    """Largest distance from the measured angle to the last servo target, to which an action adds,
+    rad; None if it adds to the measured angle."""
     joint_ranges: tuple[tuple[float, float] | None, ...]
     """Range of each servo target, rad; None for a joint without one."""
     servo_stiffness: tuple[float, ...]
@@ -137,6 +140,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
             raise ValueError(f"its format is {given}, not {FORMAT}")
         command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
         entries = entries | {"commands": json.dumps({"target_height": command})}
+    # The actions of older files add to the measured angle.
+    entries = {"max_lead": "null"} | entries
     missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):

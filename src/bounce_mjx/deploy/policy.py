@@ -64,6 +64,9 @@ class DeployedPolicy:
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
+        # The last servo targets, and what an action adds to, if that is not the measured angles.
+        self._targets: np.ndarray | None = None
+        self._base: np.ndarray | None = None
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -111,11 +114,18 @@ class DeployedPolicy:
             self._histories.add(measured, self._action)
         action = self._network.step(self._histories.values, self._histories.newest)
         self._measured, self._time, self._action = measured, time, action
+        if self.metadata.max_lead is not None and "joint_angles" in measured:
+            lead, angles = self.metadata.max_lead, measured["joint_angles"]
+            last = angles if self._targets is None else self._targets
+            self._base = np.clip(last, angles - lead, angles + lead)
+            self._targets = self._targets_of(action)
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
         """Servo targets [J] (rad) for the last step's action [J]: the joint angles measured in that
-        step plus the scaled action, clipped to the joint ranges.
+        step plus the scaled action, clipped to the joint ranges. With `metadata.max_lead`, the
+        action adds to the last targets, within that distance of the measured angles; another
+        action than the policy's then counts as sent.
 
         Raises:
           UserError: there was no step since the reset, or it had no measured joint angles; or the
@@ -128,10 +138,18 @@ class DeployedPolicy:
             )
         ranges = self.metadata.joint_ranges
         action = _array("the action", action, (len(ranges),), "from -1 to 1", 1.0)
+        targets = self._targets_of(action)
+        if self.metadata.max_lead is not None:
+            self._targets = targets
+        return targets.copy()
+
+    def _targets_of(self, action: np.ndarray) -> np.ndarray:
+        """Servo targets [J] (rad) of an action [J] in the last step."""
+        ranges = self.metadata.joint_ranges
         low = [-np.inf if limits is None else limits[0] for limits in ranges]
         high = [np.inf if limits is None else limits[1] for limits in ranges]
-        targets = self._measured["joint_angles"] + self.metadata.action_scale * action
-        return np.clip(targets, low, high)
+        base = self._measured["joint_angles"] if self._base is None else self._base
+        return np.clip(base + self.metadata.action_scale * action, low, high)
 
     @property
     def observation(self) -> np.ndarray:
