@@ -11,6 +11,7 @@ than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`. It also compiles derivatives
 
 import functools
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -86,7 +87,8 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
 
         try:
             scalar_function = as_scalars(flat_function, shapes)
-        except UnsupportedOperation:
+        except UnsupportedOperation as error:
+            _say_once(str(error))
             return function(*args)
         if not set(scalar_function.dtypes) <= KERNEL_TYPES:
             return function(*args)
@@ -121,6 +123,16 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
         return result_tree[-1].unflatten(results)
 
     return wrapped
+
+
+@functools.cache
+def _say_once(operation: str) -> None:
+    """Says that a function is not compiled as one kernel."""
+    print(
+        f"warning: the kernel of a control step cannot have the operation {operation}, so XLA "
+        "compiles all of the step but the physics, and the training is slower (docs/physics.md)",
+        file=sys.stderr,
+    )
 
 
 class Layout(NamedTuple):

@@ -10,6 +10,7 @@ scalars alone.
 import functools
 import hashlib
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -188,7 +189,7 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
     name, params = equation.primitive.name, equation.params
     if name in _ELEMENTWISE:
         bind = functools.partial(equation.primitive.bind, **params)
-        return [_each(bind, *_same_rank(args))]
+        return [_each(_folding(bind), *_same_rank(args))]
     if name in _REWRITTEN:
         return [_each(_REWRITTEN[name], *_same_rank(args))]
     if name in _REDUCTIONS:
@@ -199,6 +200,12 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
         return [entries[i : i + 1].reshape(entries.shape[1:]) for i in range(len(entries))]
     if name in _SHAPES:
         return [_SHAPES[name](*args, **params)]
+    if name in _INDEXED:
+        return [_INDEXED[name](equation, *args)]
+    if name == "sort":
+        return _sort(args, **params)
+    if name == "cond":
+        return _cond(args, **params)
     if name in _CALLS and _CALLS[name] in params:
         inner = params[_CALLS[name]]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
@@ -206,6 +213,18 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
     if name == "scan":
         return _scan(equation, args)
     raise UnsupportedOperation(name)
+
+
+def _folding(operation: Callable[..., Scalar]) -> Callable[..., Scalar]:
+    """An operation that is carried out at once on constant whole numbers: they may be indices."""
+
+    def folded(*args: Scalar) -> Scalar:
+        if not all(isinstance(x, np.integer | np.bool_) for x in args):
+            return operation(*args)
+        with jax.ensure_compile_time_eval():
+            return np.asarray(operation(*args))[()]
+
+    return folded
 
 
 def _same_rank(args: list[Scalars]) -> list[Scalars]:
@@ -220,6 +239,127 @@ def _reduce(operation: Callable[..., Scalar], array: Scalars, axes: Sequence[int
     result = np.empty(rows.shape[:-1], object)
     for index in np.ndindex(*result.shape):
         result[index] = functools.reduce(operation, rows[index])
+    return result
+
+
+def _dot(a: Scalars, b: Scalars, *, dimension_numbers, **_) -> Scalars:
+    (contracted_a, contracted_b), (batch_a, batch_b) = dimension_numbers
+    letters_a, letters_b = list(range(a.ndim)), list(range(a.ndim, a.ndim + b.ndim))
+    for i, j in zip((*contracted_a, *batch_a), (*contracted_b, *batch_b), strict=True):
+        letters_b[j] = letters_a[i]
+    batch = [letters_a[i] for i in batch_a]
+    free = [x for x in letters_a if x not in letters_b]
+    free += [x for x in letters_b if x not in letters_a]
+    result = np.einsum(a, letters_a, b, letters_b, batch + free)
+    return result if isinstance(result, np.ndarray) else _filled((), iter([result]))
+
+
+def _cumulative(operation: Callable[..., Scalar]) -> Callable[..., Scalars]:
+    def accumulate(x: Scalars, *, axis: int, reverse: bool) -> Scalars:
+        rows = np.moveaxis(x, axis, 0)
+        rows = rows[::-1] if reverse else rows
+        result = rows.copy()
+        for place in np.ndindex(*rows.shape):
+            if place[0]:
+                before = (place[0] - 1, *place[1:])
+                result[place] = operation(result[before], rows[place])
+        return np.moveaxis(result[::-1] if reverse else result, 0, axis)
+
+    return accumulate
+
+
+def _arg_extreme(is_better: Callable[..., Scalar]) -> Callable[..., Scalars]:
+    def index_of_extreme(x: Scalars, *, axes, index_dtype) -> Scalars:
+        (axis,) = axes
+
+        def first(row: Scalars) -> Scalar:
+            best, index = row[0], index_dtype.type(0)
+            for i, value in enumerate(row[1:], 1):
+                # The first NaN counts as the extreme.
+                wins = (is_better(value, best) | (value != value)) & (best == best)
+                best = jnp.where(wins, value, best)
+                index = jnp.where(wins, index_dtype.type(i), index)
+            return index
+
+        rows = np.moveaxis(x, axis, -1)
+        result = np.empty(rows.shape[:-1], object)
+        for place in np.ndindex(*result.shape):
+            result[place] = first(rows[place])
+        return result
+
+    return index_of_extreme
+
+
+def _sort(args: list[Scalars], *, dimension: int, is_stable: bool, num_keys: int) -> list[Scalars]:
+    """Odd-even transposition, which is stable and has no branches."""
+    del is_stable
+    if num_keys != 1:
+        raise UnsupportedOperation("sort by several keys")
+    columns = [np.moveaxis(a, dimension, 0).copy() for a in args]
+    length = len(columns[0])
+    for step in range(length):
+        for i in range(step % 2, length - 1, 2):
+            for place in np.ndindex(*columns[0].shape[1:]):
+                low, high = (i, *place), (i + 1, *place)
+                a, b = columns[0][low], columns[0][high]
+                # NaN comes last.
+                swap = (a > b) | ((a != a) & (b == b))
+                for column in columns:
+                    a, b = column[low], column[high]
+                    column[low], column[high] = jnp.where(swap, b, a), jnp.where(swap, a, b)
+    return [np.moveaxis(column, 0, dimension) for column in columns]
+
+
+def _cond(args: list[Scalars], *, branches: Sequence[ClosedJaxpr], **_) -> list[Scalars]:
+    """All branches, of which the results are selected."""
+    index, *operands = args
+    chosen = jnp.clip(lax.convert_element_type(index[()], jnp.int32), 0, len(branches) - 1)
+    outs = [_evaluate(b.jaxpr, [_constant(c) for c in b.consts], operands) for b in branches]
+    result = outs[0]
+    for i, others in enumerate(outs[1:], 1):
+        select = functools.partial(jnp.where, chosen >= i)
+        result = [_each(select, new, old) for new, old in zip(others, result, strict=True)]
+    return result
+
+
+def _with_constants(equation, indices: Sequence[Scalars], *arrays: np.ndarray) -> np.ndarray:
+    """An indexing operation on arrays of numbers, at indices that are constants."""
+    name = equation.primitive.name
+    if not all(isinstance(i, np.generic) for array in indices for i in array.flat):
+        raise UnsupportedOperation(f"{name} at an index that is computed")
+    plain = [np.array(array.tolist(), np.int32).reshape(array.shape) for array in indices]
+    first, *others = arrays
+    after = name == "dynamic_update_slice"
+    given = (first, *others, *plain) if after else (first, *plain, *others)
+    with jax.ensure_compile_time_eval():
+        return np.asarray(equation.primitive.bind(*map(jnp.asarray, given), **equation.params))
+
+
+def _moved(equation, indices: Sequence[Scalars], *arrays: Scalars) -> Scalars:
+    """An indexing operation that moves entries of arrays: it is applied to their places."""
+    entries = np.concatenate([a.reshape(-1) for a in arrays])
+    ends = np.cumsum([0, *(a.size for a in arrays)])
+    places = [
+        np.arange(start, start + a.size, dtype=np.int32).reshape(a.shape)
+        for start, a in zip(ends[:-1], arrays, strict=True)
+    ]
+    found = _with_constants(equation, indices, *places)
+    if np.any((found < 0) | (found >= len(entries))):
+        raise UnsupportedOperation(f"{equation.primitive.name} outside of its array")
+    return entries[found]
+
+
+def _scatter_add(equation, x: Scalars, indices: Scalars, updates: Scalars) -> Scalars:
+    result = x.copy()
+    zeros = np.zeros(x.shape, np.float32)
+    for index in np.ndindex(*updates.shape):
+        # Which entry this update alone would change.
+        alone = np.zeros(updates.shape, np.float32)
+        alone[index] = 1.0
+        for place in zip(
+            *np.nonzero(_with_constants(equation, [indices], zeros, alone)), strict=True
+        ):
+            result[place] = result[place] + updates[index]
     return result
 
 
@@ -278,17 +418,65 @@ def _pow(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(odd & is_negative, -power, power)
 
 
+def _expm1(x: Scalar) -> Scalar:
+    series = x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
+    return jnp.where(jnp.abs(x) < 0.03, series, jnp.exp(x) - 1.0)
+
+
+def _atan(x: Scalar) -> Scalar:
+    """The arc tangent to the last digits of float32 (Moshier's Cephes library, `atanf`)."""
+    size = jnp.abs(x)
+    far, middle = size > 2.414213562373095, size > 0.4142135623730950
+    reduced = jnp.where(
+        far,
+        -1.0 / jnp.where(far, size, 1.0),
+        jnp.where(middle, (size - 1.0) / (size + 1.0), size),
+    )
+    start = jnp.where(far, math.pi / 2, jnp.where(middle, math.pi / 4, 0.0))
+    z = reduced * reduced
+    series = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z
+    angle = start + ((series - 3.33329491539e-1) * z * reduced + reduced)
+    angle = jnp.where(size == jnp.inf, math.pi / 2, angle)
+    return jnp.where((x < 0.0) | (1.0 / x < 0.0), -angle, angle)
+
+
+def _atan2(y: Scalar, x: Scalar) -> Scalar:
+    both = (jnp.abs(x) == jnp.inf) & (jnp.abs(y) == jnp.inf)
+    ratio = jnp.where(both, 1.0, jnp.abs(y) / jnp.where(x == 0.0, 1.0, jnp.abs(x)))
+    angle = jnp.where(x == 0.0, jnp.where(y == 0.0, 0.0, math.pi / 2), _atan(ratio))
+    angle = jnp.where((x < 0.0) | (1.0 / x < 0.0), math.pi - angle, angle)
+    angle = jnp.where((y < 0.0) | (1.0 / y < 0.0), -angle, angle)
+    return jnp.where((x != x) | (y != y), jnp.nan, angle)
+
+
+def _asin(x: Scalar) -> Scalar:
+    return _atan2(x, _sqrt((1.0 - x) * (1.0 + x)))
+
+
+def _acos(x: Scalar) -> Scalar:
+    return _atan2(_sqrt((1.0 - x) * (1.0 + x)), x)
+
+
 # Operations that Mosaic GPU does not compile, expressed with operations that it does.
 _REWRITTEN: dict[str, Callable[..., Scalar]] = {
+    "acos": _acos,
+    "asin": _asin,
+    "atan": _atan,
+    "atan2": _atan2,
+    "ceil": lambda x: -_floor(-x),
     "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
     "copy": lambda x: x,
+    "cosh": lambda x: 0.5 * (jnp.exp(x) + jnp.exp(-x)),
+    "expm1": _expm1,
     "floor": _floor,
     "is_finite": lambda x: jnp.abs(x) < jnp.inf,
     "log1p": _log1p,
     "logistic": _logistic,
     "pow": _pow,
+    "sinh": lambda x: 0.5 * (_expm1(x) - _expm1(-x)),
     "sqrt": _sqrt,
     "stop_gradient": lambda x: x,
+    "tan": lambda x: jnp.sin(x) / jnp.cos(x),
 }
 
 
@@ -303,8 +491,23 @@ def _slice(x: Scalars, *, start_indices, limit_indices, strides, **_) -> Scalars
     return x[tuple(map(slice, start_indices, limit_indices, strides))]
 
 
+_INDEXED: dict[str, Callable[..., Scalars]] = {
+    "dynamic_slice": lambda equation, x, *indices: _moved(equation, indices, x),
+    "dynamic_update_slice": lambda equation, x, new, *indices: _moved(equation, indices, x, new),
+    "gather": lambda equation, x, indices: _moved(equation, [indices], x),
+    "scatter": lambda equation, x, indices, new: _moved(equation, [indices], x, new),
+    "scatter-add": _scatter_add,
+}
+
 _SHAPES: dict[str, Callable[..., Scalars]] = {
+    "argmax": _arg_extreme(operator.gt),
+    "argmin": _arg_extreme(operator.lt),
     "broadcast_in_dim": _broadcast,
+    "cummax": _cumulative(lax.max),
+    "cummin": _cumulative(lax.min),
+    "cumprod": _cumulative(lax.mul),
+    "cumsum": _cumulative(lax.add),
+    "dot_general": _dot,
     "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
     "expand_dims": lambda x, *, dimensions, **_: np.expand_dims(x, dimensions),
     "iota": lambda *, dtype, shape, dimension, **_: _constant(
