@@ -142,12 +142,15 @@ def test_a_task_without_events_goes_through_every_command(
     script = """
 import numpy as np
 from bounce_mjx import load_policy
-policy = load_policy("rest.onnx")
+from pathlib import Path
+(run,) = Path("runs/rest").iterdir()
+policy, again = load_policy("rest.onnx"), load_policy(run, task=TASK)
+assert again.metadata == policy.metadata
 sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
 print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
 """
     done = subprocess.run(
-        [sys.executable, "-c", script],
+        [sys.executable, "-c", script.replace("TASK", repr(REST))],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(without_bouncing)},
         capture_output=True,

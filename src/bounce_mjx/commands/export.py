@@ -27,7 +27,7 @@ class ExportCommand(StrictModel):
     onnx: Path | None = None
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
     jax: Path | None = None
-    """File for the same function by jax.export, for the CPU and CUDA."""
+    """File for the network alone by jax.export, for the CPU and CUDA: histories in, actions out."""
     of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
 
 

@@ -11,13 +11,14 @@ NAMES = {"robust": "pretrained/robust", "pretrained": "pretrained"}
 """Policies that come with the package, and their folders; each folder holds `<name>.onnx`."""
 
 
-def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
+def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
     Args:
       policy: "robust" or "pretrained", the policies that come with the package; a `.onnx` file
         from `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported
         with JAX.
+      task: FILE.py:CLASS, for a run of a task in a file, which is code.
 
     Raises:
       UserError: there is no such policy, or the file is damaged.
@@ -32,7 +33,7 @@ def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
         return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
     path = Path(policy)
     if os.path.isdir(path):
-        return DeployedPolicy(_exported(path), str(path))
+        return DeployedPolicy(_exported(path, task), str(path))
     try:
         return DeployedPolicy(path.read_bytes(), str(path))
     except OSError as error:
@@ -42,14 +43,17 @@ def load_policy(policy: str | os.PathLike) -> DeployedPolicy:
         ) from error
 
 
-def _exported(run: Path) -> bytes:
+def _exported(run: Path, task: str | None) -> bytes:
     """The ONNX file of a run's policy."""
     try:
         from bounce_mjx.deploy.export import export_onnx
+        from bounce_mjx.runs.config import load_run_config
         from bounce_mjx.runs.folders import find_checkpoint
     except ImportError as error:
         raise UserError(
             f"the run {run} must be exported, for which {error.name} is missing; use bounce-mjx "
             "export on the machine of the training, and give the .onnx file"
         ) from error
-    return export_onnx(find_checkpoint(run))
+    checkpoint = find_checkpoint(run)
+    load_run_config(checkpoint.run, task)
+    return export_onnx(checkpoint)
