@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -158,6 +159,60 @@ print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
     )
     assert done.stdout == "(6,)\n", done.stderr
     assert "error: the task bounce cannot be imported" in command("train", code=2)
+
+
+def adapters() -> dict[str, Callable[[], tuple[int, ...]]]:
+    """For each library, the shape of the first observations of two or more environments, or one."""
+
+    def gym() -> tuple[int, ...]:
+        gymnasium = pytest.importorskip("gymnasium")
+        env = gymnasium.make_vec("bounce_mjx/Task-v0", 2, task=DRIBBLE)
+        observation, _ = env.reset(seed=0, options={"apex": 0.07})
+        np.testing.assert_array_equal(observation[:, -1], np.float32(0.07))
+        return observation.shape
+
+    def sb3() -> tuple[int, ...]:
+        pytest.importorskip("stable_baselines3")
+        from bounce_mjx.adapters.sb3 import Sb3VecEnv
+
+        return Sb3VecEnv(2, task=DRIBBLE).reset().shape
+
+    def brax() -> tuple[int, ...]:
+        pytest.importorskip("brax")
+        import brax.envs
+
+        import bounce_mjx.adapters.brax  # noqa: F401
+
+        env = brax.envs.get_environment("bounce_ball", task=DRIBBLE)
+        return jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs.shape
+
+    def playground() -> tuple[int, ...]:
+        pytest.importorskip("mujoco_playground")
+        from bounce_mjx.adapters.playground import PlaygroundBounceBall
+
+        env = PlaygroundBounceBall(task=DRIBBLE)
+        return jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs.shape
+
+    def gymnax() -> tuple[int, ...]:
+        from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall
+
+        env = GymnaxBounceBall(task=DRIBBLE)
+        return jax.eval_shape(env.reset, jax.random.PRNGKey(0), env.default_params)[0].shape
+
+    def torch() -> tuple[int, ...]:
+        pytest.importorskip("torch")
+        from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
+
+        env = TorchVectorEnv(Env(find_task(DRIBBLE).Config()), 2)
+        assert env.critic_metrics == ()
+        return tuple(env.reset()[0].shape)
+
+    return {f.__name__: f for f in (gym, sb3, brax, playground, gymnax, torch)}
+
+
+@pytest.mark.parametrize("library", adapters())
+def test_every_library_takes_another_task(library: str) -> None:
+    assert adapters()[library]()[-1] == find_task(DRIBBLE).Config().layout.size
 
 
 # A task in a file
