@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -121,6 +122,8 @@ def test_a_task_without_events_goes_through_every_command(
     task = ("--task", REST)
     said = command("train", *task, *TINY, "--total-steps", "128")
     assert re.search(RESULT, said) and "report:" in said
+    (line,) = re.findall(r"measure it: bounce-mjx (eval .+)", said)
+    assert shlex.split(line)[2:] == list(task)
     (folder,) = (tmp_path / "runs" / "rest").iterdir()
     assert "rests" in (folder / "report.html").read_text(encoding="utf-8")
     command("train", *task, "--resume", str(folder), "--total-steps", "256", "--no-report")

@@ -223,7 +223,8 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     axes.plot(time, recording.ball[:steps, 2, 0], color=_COLOURS[0], label="ball")
     axes.plot(time, recording.paddle[:steps, 2, 0], color=_COLOURS[1], label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
-    axes.set_ylim(bottom=0.0)
+    if axes.dataLim.y0 >= 0.0:
+        axes.set_ylim(bottom=0.0)
     axes.set_title("height over the first recorded episode, m", loc="left")
     axes.set_xlabel("time, s")
     axes.legend(

@@ -24,7 +24,7 @@ from bounce_mjx.runs.config import (
     train_config,
 )
 from bounce_mjx.runs.task import is_same_task
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
@@ -156,8 +156,10 @@ def run_command(
             "--wandb needs the package wandb; install it with: pip install 'bounce_mjx[wandb]'"
         )
     console = Console(quiet=not hosts.is_leader())
+    # A later command has to name the task's file again.
+    task = f" --task {shlex.quote(command.task)}" if is_file(command.task) else ""
     try:
-        options = Options(prog, command.resume, command.report, command.wandb, watcher)
+        options = Options(prog + task, command.resume, command.report, command.wandb, watcher)
         outcomes = train(config_of(command), console, make_trainer, options)
     except TrainingStopped as stop:
         say(console, str(stop))
@@ -167,10 +169,10 @@ def run_command(
         leave(0)
     best = show(outcomes, console)
     if command.report and hosts.is_leader():
-        run_interruptible(leave_report, best, console)
+        run_interruptible(leave_report, best, console, task)
     run = shlex.quote(str(best.run))
-    say(console, f"measure it: bounce-mjx eval {run}")
-    say(console, f"watch it: bounce-mjx play {run}")
+    say(console, f"measure it: bounce-mjx eval {run}{task}")
+    say(console, f"watch it: bounce-mjx play {run}{task}")
     return outcomes
 
 
@@ -192,8 +194,12 @@ def show(outcomes: "Sequence[Outcome]", console: Console) -> "Outcome":
     return best
 
 
-def leave_report(outcome: "Outcome", console: Console) -> None:
-    """Draws the report. The training is already saved, so a failure only prints one line."""
+def leave_report(outcome: "Outcome", console: Console, task: str = "") -> None:
+    """Draws the report. The training is already saved, so a failure only prints one line.
+
+    Args:
+      task: the flag that names the task's file, if it has one.
+    """
     from bounce_mjx.training.console import say
 
     started = time.perf_counter()
@@ -203,7 +209,7 @@ def leave_report(outcome: "Outcome", console: Console) -> None:
         page = report_training(outcome.run, outcome.report, outcome.best_steps)
     except Exception as error:
         reason = reason_of(error)
-        again = f"bounce-mjx report {shlex.quote(str(outcome.run))}"
+        again = f"bounce-mjx report {shlex.quote(str(outcome.run))}{task}"
         say(console, f"report: not drawn ({reason}); draw it with: {again}")
     else:
         say(console, f"report: {page}  ({time.perf_counter() - started:.1f} s)")
