@@ -285,6 +285,16 @@ def test_another_file_than_the_runs_is_told(
     assert read_command(TrainingCommand, flags, prog="train", description="").env == config.env
 
 
+def test_another_class_of_the_same_file_is_another_task(
+    mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with mine.open("a") as file:
+        file.write("\n\nclass Other(Dribble):\n    pass\n")
+    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    load_run_config(create_run(config), f"{mine}:Other")
+    assert "Other differs from the task that" in capsys.readouterr().err
+
+
 def test_an_edited_copy_of_a_task_is_refused(mine: Path, tmp_path: Path) -> None:
     name = f"{mine}:Dribble"
     config = read_preset(None, task=name).model_copy(update={"log_dir": tmp_path})

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from bounce_mjx.config.command_line import flags_of, parse
+from bounce_mjx.config.command_line import flag_of, flags_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
@@ -60,11 +60,11 @@ def parse_with_commands(
     task = early_flag(words, "--task")
     commands = find_task(task or DEFAULT).Config().commands
     if commands:
-        flags = ", ".join(f"{_flag(name)} {c.unit.upper()}" for name, c in commands.items())
+        flags = ", ".join(f"{flag_of(name)} {c.unit.upper()}" for name, c in commands.items())
         description += f" The commands of the task {task or DEFAULT} are flags too: {flags}."
     # Without --task, the run may be of any registered task.
     tasks = [task] if task else registered_tasks() if given else []
-    possible = {_flag(name) for task in tasks for name in find_task(task).Config().commands}
+    possible = {flag_of(name) for task in tasks for name in find_task(task).Config().commands}
     for flag in given.keys() - possible:
         raise _unknown(flag, [*known, *possible], prog)
     command = parse(command_class, words, prog=prog, description=description)
@@ -84,7 +84,7 @@ class CommandFlags:
           UserError: a flag is not one of the command's or of the task's, or its value is outside of
             its limits.
         """
-        commands = {_flag(name): (name, command) for name, command in env.commands.items()}
+        commands = {flag_of(name): (name, command) for name, command in env.commands.items()}
         values = {}
         for flag, text in self._given.items():
             if flag not in commands:
@@ -98,7 +98,3 @@ def _unknown(flag: str, known: Sequence[str], prog: str) -> UserError:
     near = difflib.get_close_matches(flag, known, n=1)
     advice = f"; did you mean {near[0]}?" if near else ""
     return UserError(f"unknown argument {flag}{advice} (see {prog} --help)")
-
-
-def _flag(name: str) -> str:
-    return f"--{name}".replace("_", "-")

@@ -123,7 +123,7 @@ def _mistake(
 def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:
     """The first mistake of a validation error, named by its flag."""
     prefixes = {group.__name__: prefix for group, prefix in _groups(command_class)}
-    return describe(error, command_class, lambda name: _flag(prefixes[error.title] + name))
+    return describe(error, command_class, lambda name: flag_of(prefixes[error.title] + name))
 
 
 def _validation_error() -> pydantic.ValidationError | None:
@@ -152,7 +152,7 @@ def flags_of(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | N
         for name, field in group.model_fields.items():
             if tyro.conf.Positional in field.metadata or _is_group(field):
                 continue
-            flag = _flag(prefix + _argument_name(name, field))
+            flag = flag_of(prefix + _argument_name(name, field))
             flags[flag] = field
             if field.annotation is bool:
                 flags[_negated(flag)] = None
@@ -181,5 +181,6 @@ def _argument_name(name: str, field: FieldInfo) -> str:
     return next((new for new in given if isinstance(new, str)), name)
 
 
-def _flag(name: str) -> str:
+def flag_of(name: str) -> str:
+    """The flag of a setting: --num-envs of num_envs."""
     return f"--{name}".replace("_", "-")

@@ -18,7 +18,8 @@ from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.robot import check_robot
+from bounce_mjx.runs.files import check_copy
+from bounce_mjx.runs.robot import ROBOT
 from bounce_mjx.runs.task import task_of_run
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import (
@@ -147,7 +148,7 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
     name = _task_of(values, path)
     config = validate(train_config(task_of_run(name, run, task)), values, str(path))
     if config.env.mjcf is not None:
-        check_robot(config.env.mjcf, run)
+        check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
     return config
 
 

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import pydantic
 from pydantic_core import to_jsonable_python
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.files import new_file, read_regular
 
 PARTIAL = ".partial"
@@ -92,6 +93,27 @@ def check_integrity(folder: Path) -> None:
             raise ValueError(f"{name} is missing")
         if found[name] != expected.get(name):
             raise ValueError(f"{name} is not as it was written")
+
+
+def check_copy(path: Path, folder: Path, flag: str) -> None:
+    """Checks that a file is in a run's sealed folder, such as robot, which is as it was written.
+
+    Args:
+      flag: the flag that gives another one to a new run, for the error.
+
+    Raises:
+      UserError: it is another file, or one of the copied files is missing or was edited.
+    """
+    try:
+        if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder)):
+            raise ValueError(f"{path} is outside of it")
+        check_integrity(folder)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{folder} is not the {folder.name} that {folder.parent} was trained with ({reason}); "
+            f"restore that folder, or train a new run with {flag}"
+        ) from error
 
 
 def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:

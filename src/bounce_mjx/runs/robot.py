@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import mujoco
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal
+from bounce_mjx.runs.files import MANIFEST_FILE, seal
 
 ROBOT = "robot"
 
@@ -57,25 +57,6 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
 def _files_of(mjcf: Path) -> list[Path]:
     """An MJCF file and every file that it names."""
     return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
-
-
-def check_robot(mjcf: Path, run: Path) -> None:
-    """Checks that a run's MJCF file is its own copy, as it was written.
-
-    Raises:
-      UserError: it is another file, or one of the copied files is missing or was edited.
-    """
-    folder = run / ROBOT
-    try:
-        if not Path(os.path.abspath(mjcf)).is_relative_to(os.path.abspath(folder)):
-            raise ValueError(f"{mjcf} is outside of it")
-        check_integrity(folder)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{folder} is not the robot that {run} was trained with ({reason}); restore that "
-            "folder, or train a new run with --mjcf"
-        ) from error
 
 
 def identify_robot(mjcf: Path, run: Path) -> str:

@@ -7,16 +7,16 @@
 A run of a task of the package, or of an installed one, has no copy.
 """
 
-import hashlib
 import shlex
 import sys
 from pathlib import Path
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.files import check_integrity, seal, write_atomically
+from bounce_mjx.runs.files import check_copy, seal, write_atomically
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import (
     admit,
+    content_of,
     find_task,
     is_file,
     known_task,
@@ -66,7 +66,7 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
                 "out"
             )
         return task
-    _check_copy(name, run)
+    check_copy(source_file(name), run / TASK, "--task")
     if given is not None:
         task = find_task(given)
         if not is_same_task(name, given):
@@ -88,7 +88,7 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
 def is_same_task(name: str, given: str) -> bool:
     """Whether two names stand for equal code."""
     if is_file(name) and is_file(given):
-        return read_source(name) == read_source(given)
+        return content_of(name) == content_of(given)
     return find_task(name) is find_task(given)
 
 
@@ -96,19 +96,5 @@ def identify_task(name: str) -> str:
     """A task's name; for FILE.py:CLASS without the folder, and with eight digits of the hash."""
     if not is_file(name):
         return name
-    digest = hashlib.sha256(read_source(name)).hexdigest()
-    return f"{source_file(name).name}:{name.rpartition(':')[2]} {digest[:8]}"
-
-
-def _check_copy(name: str, run: Path) -> None:
-    folder = run / TASK
-    try:
-        if not source_file(name).resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{source_file(name)} is outside of it")
-        check_integrity(folder)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{folder} is not the task that {run} was trained with ({reason}); restore that "
-            "folder, or train a new run"
-        ) from error
+    digest, attribute = content_of(name)
+    return f"{source_file(name).name}:{attribute} {digest[:8]}"
