@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
 from bounce_mjx.errors import UserError, needed
+from bounce_mjx.gpu.places import INDICES, evaluated, source_places
 
 EXTRA = "'bounce_mjx[export]'"
 """What pip installs for an export."""
@@ -22,14 +23,11 @@ Value = str | np.ndarray
 
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
 _INLINED |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
-# Operations that only move numbers, and which of their operands are indices.
-_MOVES = dict.fromkeys(
-    "broadcast_in_dim concatenate copy pad reshape rev slice split squeeze stack stop_gradient "
-    "tile transpose".split(),
-    (),
+# Operations that only move numbers.
+_MOVES = frozenset(
+    "broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather pad reshape rev "
+    "scatter slice split squeeze stack stop_gradient tile transpose".split()
 )
-_MOVES |= {"dynamic_slice": range(1, 9), "dynamic_update_slice": range(2, 9)}
-_MOVES |= {"gather": (1,), "scatter": (1,)}
 _TYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 # Operations, the types of operands for which they have a counterpart, and this counterpart: a node,
 # or a function (graph, equation, operands).
@@ -106,11 +104,6 @@ def _equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
     return equations[::-1]
 
 
-def _evaluated(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
-    results = equation.primitive.bind(*operands, **equation.params)
-    return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
-
-
 def _axes(equation: JaxprEqn) -> list[int]:
     """Axes of a reduction, in all rows."""
     return [axis + 1 for axis in equation.params["axes"]]
@@ -144,7 +137,7 @@ class _Graph:
             inner = equation.params[_INLINED[name]]
             return self.run(inner.jaxpr, inner.consts, operands)
         if not any(isinstance(value, str) for value in operands):
-            return _evaluated(equation, operands)
+            return evaluated(equation, operands)
         if name in _MOVES:
             return self._moved(equation, operands)
         types, counterpart = _OPERATIONS.get(name, ("", ""))
@@ -170,20 +163,20 @@ class _Graph:
         return self.node("Reshape", value, np.array([-1] + [1] * ndim))
 
     def _moved(self, equation: JaxprEqn, operands: list[Value]) -> list[Value]:
-        """Results that hold the operands' numbers at other places. The operation itself, on the
-        numbers' positions in the operands, tells from where each one comes."""
-        places, numbers, count = list(operands), [], 0
+        """Results that hold the operands' numbers at other places."""
+        indices, numbers = {}, []
         for i, (value, atom) in enumerate(zip(operands, equation.invars, strict=True)):
-            if i not in _MOVES[equation.primitive.name]:
+            if i not in INDICES.get(equation.primitive.name, ()):
                 size = math.prod(atom.aval.shape)
-                places[i] = np.arange(count, count + size, dtype=np.int32).reshape(atom.aval.shape)
                 numbers += [self._flat(value, size, operands)] if size else []
-                count += size
             elif isinstance(value, str):
                 self._refuse(equation)
+            else:
+                indices[i] = value
         joined = self.node("Concat", *numbers, axis=1) if len(numbers) > 1 else numbers[0]
+        sources, count = source_places(equation, indices)
         results: list[Value] = []
-        for source, atom in zip(_evaluated(equation, places), equation.outvars, strict=True):
+        for source, atom in zip(sources, equation.outvars, strict=True):
             if not source.size:
                 results.append(np.zeros(source.shape, atom.aval.dtype))
             elif source.min() < 0 or source.max() >= count:

@@ -20,6 +20,8 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
+from bounce_mjx.gpu.places import INDICES, evaluated, source_places
+
 Scalar = jax.Array | np.generic
 # An array of scalars, of dtype object.
 Scalars = np.ndarray
@@ -200,8 +202,8 @@ def _apply(equation, args: list[Scalars]) -> list[Scalars]:
         return [entries[i : i + 1].reshape(entries.shape[1:]) for i in range(len(entries))]
     if name in _SHAPES:
         return [_SHAPES[name](*args, **params)]
-    if name in _INDEXED:
-        return [_INDEXED[name](equation, *args)]
+    if name in INDICES:
+        return [(_scatter_add if name == "scatter-add" else _moved)(equation, args)]
     if name == "sort":
         return _sort(args, **params)
     if name == "cond":
@@ -322,43 +324,37 @@ def _cond(args: list[Scalars], *, branches: Sequence[ClosedJaxpr], **_) -> list[
     return result
 
 
-def _with_constants(equation, indices: Sequence[Scalars], *arrays: np.ndarray) -> np.ndarray:
-    """An indexing operation on arrays of numbers, at indices that are constants."""
-    name = equation.primitive.name
-    if not all(isinstance(i, np.generic) for array in indices for i in array.flat):
-        raise UnsupportedOperation(f"{name} at an index that is computed")
-    plain = [np.array(array.tolist(), np.int32).reshape(array.shape) for array in indices]
-    first, *others = arrays
-    after = name == "dynamic_update_slice"
-    given = (first, *others, *plain) if after else (first, *plain, *others)
-    with jax.ensure_compile_time_eval():
-        return np.asarray(equation.primitive.bind(*map(jnp.asarray, given), **equation.params))
+def _constant_indices(equation, args: list[Scalars]) -> dict[int, np.ndarray]:
+    """The operands that are indices, by their number."""
+    name, found = equation.primitive.name, {}
+    for i in INDICES[name]:
+        if i < len(args):
+            if not all(isinstance(x, np.generic) for x in args[i].flat):
+                raise UnsupportedOperation(f"{name} at an index that is computed")
+            found[i] = np.array(args[i].tolist(), np.int32).reshape(args[i].shape)
+    return found
 
 
-def _moved(equation, indices: Sequence[Scalars], *arrays: Scalars) -> Scalars:
-    """An indexing operation that moves entries of arrays: it is applied to their places."""
-    entries = np.concatenate([a.reshape(-1) for a in arrays])
-    ends = np.cumsum([0, *(a.size for a in arrays)])
-    places = [
-        np.arange(start, start + a.size, dtype=np.int32).reshape(a.shape)
-        for start, a in zip(ends[:-1], arrays, strict=True)
-    ]
-    found = _with_constants(equation, indices, *places)
-    if np.any((found < 0) | (found >= len(entries))):
+def _moved(equation, args: list[Scalars]) -> Scalars:
+    """An operation that moves entries of arrays."""
+    indices = _constant_indices(equation, args)
+    (places,), count = source_places(equation, indices)
+    if np.any((places < 0) | (places >= count)):
         raise UnsupportedOperation(f"{equation.primitive.name} outside of its array")
-    return entries[found]
+    arrays = [a.reshape(-1) for i, a in enumerate(args) if i not in indices]
+    return np.concatenate(arrays)[places]
 
 
-def _scatter_add(equation, x: Scalars, indices: Scalars, updates: Scalars) -> Scalars:
-    result = x.copy()
-    zeros = np.zeros(x.shape, np.float32)
+def _scatter_add(equation, args: list[Scalars]) -> Scalars:
+    indices = _constant_indices(equation, args)
+    x, _, updates = args
+    result, zeros = x.copy(), np.zeros(x.shape, np.float32)
     for index in np.ndindex(*updates.shape):
         # Which entry this update alone would change.
         alone = np.zeros(updates.shape, np.float32)
         alone[index] = 1.0
-        for place in zip(
-            *np.nonzero(_with_constants(equation, [indices], zeros, alone)), strict=True
-        ):
+        (changed,) = evaluated(equation, [zeros, indices[1], alone])
+        for place in zip(*np.nonzero(changed), strict=True):
             result[place] = result[place] + updates[index]
     return result
 
@@ -490,14 +486,6 @@ def _slice(x: Scalars, *, start_indices, limit_indices, strides, **_) -> Scalars
     strides = strides or (1,) * x.ndim
     return x[tuple(map(slice, start_indices, limit_indices, strides))]
 
-
-_INDEXED: dict[str, Callable[..., Scalars]] = {
-    "dynamic_slice": lambda equation, x, *indices: _moved(equation, indices, x),
-    "dynamic_update_slice": lambda equation, x, new, *indices: _moved(equation, indices, x, new),
-    "gather": lambda equation, x, indices: _moved(equation, [indices], x),
-    "scatter": lambda equation, x, indices, new: _moved(equation, [indices], x, new),
-    "scatter-add": _scatter_add,
-}
 
 _SHAPES: dict[str, Callable[..., Scalars]] = {
     "argmax": _arg_extreme(operator.gt),
