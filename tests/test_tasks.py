@@ -11,9 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rest_task
+from bounce_mjx import task
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -362,3 +365,36 @@ def test_a_robot_serves_another_task() -> None:
     truth = env.kinematics(jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state)
     above = np.asarray(truth.ball_position - truth.paddle_position)
     np.testing.assert_allclose(above, [0.0, 0.0, 0.2], atol=0.08)
+
+
+class _Thrown(rest_task.Rest):
+    """The ball is thrown, and the commanded height rises."""
+
+    num_draws = 2
+
+    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.stack([draws[0], 0.0 * draws[0], 1.0 + draws[1]]), jnp.array([1.0, 2.0, 3.0])
+
+    def reset(self, start: task.Start) -> jax.Array:
+        return start.draws
+
+    def step(self, state: jax.Array, step: task.Step) -> task.TaskStep:
+        return super().step((), step)._replace(state=state)
+
+    def next_command(self, state: jax.Array, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return {"height": command["height"] + 0.01}
+
+
+def test_a_task_throws_the_ball_and_moves_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = {"height": task.Command(0.4, 0.4)}
+    monkeypatch.setattr(_Thrown.Config, "commands", commands, raising=False)
+    env = Env(_Thrown.Config(ball_position_noise=0.0))
+    start = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 64)).pipeline_state
+    throws = np.asarray(start.physics.qpos[:, 6:9])
+    np.testing.assert_allclose(throws[:, [0, 2]] - [0, 1], start.task, atol=1e-6)
+    assert 0 < start.task.min() < 0.1 and 0.9 < start.task.max() < 1
+    np.testing.assert_allclose(start.physics.qvel[0, 6:9], [1, 2, 3])
+    state = env.reset(jax.random.PRNGKey(0))
+    for count in range(3):
+        np.testing.assert_allclose(state.pipeline_state.command["height"], 0.41 + 0.01 * count)
+        state = env.step(state, jnp.zeros(6))

@@ -208,8 +208,10 @@ class Env:
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
         size = 2 * self.action_size + 3
-        draws = jax.random.uniform(rng, (size + len(commands),), minval=-1.0, maxval=1.0)
-        physics = self._first_physics(draws[:size], world)
+        count = size + len(commands) + self.task.num_draws
+        draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
+        own = 0.5 * (draws[size + len(commands) :] + 1.0)
+        physics = self._first_physics(draws[:size], world, self.task.throw(own))
         command = {
             name: low + (high - low) * 0.5 * (draws[size + i] + 1.0)
             for i, (name, (low, high)) in enumerate(ends.items())
@@ -219,7 +221,9 @@ class Env:
         if self.config.action.base == "target":
             state = state._replace(ctrl=self.servo_targets(physics, no_action))
         truth = self.kinematics(state)
-        state = state._replace(task=self.task.reset(Start(truth, command)))
+        task = self.task.reset(Start(truth, command, own))
+        command = self.task.next_command(task, command)
+        state = state._replace(task=task, command=command)
         if memory_rng is not None:
             memory = self._first_memory(state, truth, memory_rng)
             if "command_interval" in world:
@@ -239,21 +243,27 @@ class Env:
             metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
         )
 
-    def _first_physics(self, draws: jax.Array, world: World) -> PhysicsState:
+    def _first_physics(
+        self, draws: jax.Array, world: World, thrown: tuple[jax.Array, jax.Array] | None
+    ) -> PhysicsState:
         """The arm and the ball at a reset.
 
         Args:
           draws: numbers from -1 to 1 for the angle and the velocity of each joint, and for the
             ball's position [2 n + 3].
+          thrown: the task's position and velocity [3] of the ball.
         """
         config, addresses, n = self.config, self._addresses, self.action_size
         dtype = draws.dtype
+        position, velocity = (config.ball_init_pos, ()) if thrown is None else thrown
         qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
         qvel = [jnp.zeros((), dtype)] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
             qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
             qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[n + i]
-        for i, coordinate in enumerate(config.ball_init_pos):
+        for i, component in enumerate(velocity):
+            qvel[addresses.ball_qvel[i]] = component
+        for i, coordinate in enumerate(position):
             qpos[addresses.ball_qpos[i]] = (
                 coordinate + config.ball_position_noise * draws[2 * n + i]
             )
@@ -395,7 +405,12 @@ class Env:
 
         dtype = truth.ball_position.dtype
         metrics = _metrics(done, dtype) | {"non_finite": (~finite).astype(dtype)}
-        after = before._replace(physics=physics, task=done.state, last_action=action)
+        after = before._replace(
+            physics=physics,
+            command=self.task.next_command(done.state, before.command),
+            task=done.state,
+            last_action=action,
+        )
         if before.memory is not None:
             after = after._replace(memory=self._next_memory(after, truth))
         return state.replace(

@@ -25,6 +25,8 @@ class Start(NamedTuple):
     """Positions and velocities after the reset."""
     command: Values
     """Value [] of each command."""
+    draws: jax.Array
+    """Uniform random numbers between 0 and 1 [num_draws]."""
 
 
 class Step(NamedTuple):
@@ -92,6 +94,8 @@ class Task:
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
     """What a training logs and a report draws of the metrics; the first is the progress line's."""
+    num_draws: ClassVar[int] = 0
+    """Random numbers that a reset draws for the task."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
     """Metrics that the value network sees by default, because the reward depends on them and the
     observation does not contain them."""
@@ -108,6 +112,15 @@ class Task:
     def __init__(self, config: WorldConfig):
         self.config = config
 
+    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+        """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
+        terms of the randomisation; None for a ball at rest at `ball_init_pos`.
+
+        Args:
+          draws: uniform random numbers between 0 and 1 [num_draws].
+        """
+        return None
+
     def reset(self, start: Start) -> State:
         """The task's state at the start of an episode."""
         raise NotImplementedError
@@ -119,6 +132,15 @@ class Task:
           state: the task's state before the step.
         """
         raise NotImplementedError
+
+    def next_command(self, state: State, command: Values) -> Values:
+        """The commands from now on, for a task whose commands move within an episode.
+
+        Args:
+          state: the task's state after the step or the reset.
+          command: value [] of each command until now.
+        """
+        return command
 
     def first_quantities(self, measured: Values) -> tuple[State, Values]:
         """What the task remembers of the measurements at a reset, and the first value [size] of
