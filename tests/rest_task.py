@@ -24,10 +24,8 @@ class Config(task.WorldConfig):
 
     ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.075)
     """Ball position at a reset, before noise, m."""
-    ball_position_noise: float = 0.0
-    """Half-width of the uniform noise of each ball coordinate at a reset, m."""
-    joint_angle_noise: float = 0.0
-    """Half-width of the uniform noise of the joint angles at a reset, rad."""
+    reset: task.ResetConfig = task.ResetConfig(ball_position=0.0, joint_angles=0.0)
+    """The noise of a reset."""
     reward: Rewards = Rewards()
     """The reward terms."""
 

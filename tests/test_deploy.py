@@ -61,9 +61,7 @@ STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
 LEVEL = {
     "action_scale": 1e-5,
     "ball_init_pos": (0.58856, 0.01, 1.0),
-    "ball_position_noise": 0.0,
-    "joint_angle_noise": 0.0,
-    "joint_velocity_noise": 0.0,
+    "reset": {"ball_position": 0.0, "joint_angles": 0.0, "joint_velocities": 0.0},
 }
 ENVS = {
     "specification": {},

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.tasks.bounce import Bounce, BounceState
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
@@ -242,11 +243,25 @@ def test_reset_is_a_function_of_its_key(reset):
     assert np.all(np.asarray(first.obs != other.obs)[drawn])
 
 
+NO_NOISE = {"joint_angles": 0, "joint_velocities": 0, "ball_position": 0}
+# Of earlier configs.
+FORMER_NO_NOISE = dict.fromkeys(
+    ("joint_angle_noise", "joint_velocity_noise", "ball_position_noise"), 0
+)
+
+
+def test_a_reset_has_its_noise_in_one_place() -> None:
+    assert EnvConfig(**FORMER_NO_NOISE) == EnvConfig(reset=NO_NOISE)
+    both = EnvConfig(joint_angle_noise=0.5, reset={"ball_position": 0.3}).reset
+    assert (both.joint_angles, both.ball_position) == (0.5, 0.3)
+    with pytest.raises(UserError, match=r"has the setting ball_position_noise, .* give reset: "):
+
+        class Former(EnvConfig):
+            ball_position_noise: float = 0.0
+
+
 def test_noise_free_reset_has_the_paddle_at_home():
-    config = EnvConfig(
-        joint_angle_noise=0, joint_velocity_noise=0, ball_position_noise=0,
-        target_height_range=(0.8, 0.8),
-    )  # fmt: skip
+    config = EnvConfig(reset=NO_NOISE, target_height_range=(0.8, 0.8))
     obs = jax.jit(BounceBall(config).reset)(jax.random.key(0)).obs
     np.testing.assert_allclose(obs[0:6], DEFAULT_ANGLES, atol=1e-7)
     np.testing.assert_allclose(obs[6:9], [0.58856, 0, 0.45], atol=1e-7)

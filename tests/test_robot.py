@@ -441,7 +441,7 @@ def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
         plain = mujoco.MjModel.from_xml_path(str(path))
         low, high = plain.jnt_range[plain.jnt_limited == 1].T
         angles = np.array(pose.angles)[plain.jnt_limited == 1]
-        noise = EnvConfig().joint_angle_noise - 1e-9
+        noise = EnvConfig().reset.joint_angles - 1e-9
         assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
 
 

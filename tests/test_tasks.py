@@ -388,7 +388,7 @@ class _Thrown(rest_task.Rest):
 def test_a_task_throws_the_ball_and_moves_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     commands = {"height": task.Command(0.4, 0.4)}
     monkeypatch.setattr(_Thrown.Config, "commands", commands, raising=False)
-    env = Env(_Thrown.Config(ball_position_noise=0.0))
+    env = Env(_Thrown.Config(reset={"ball_position": 0.0}))
     start = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 64)).pipeline_state
     throws = np.asarray(start.physics.qpos[:, 6:9])
     np.testing.assert_allclose(throws[:, [0, 2]] - [0, 1], start.task, atol=1e-6)

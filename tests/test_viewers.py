@@ -142,7 +142,7 @@ def test_time_runs_until_the_episode_ends(recording: EnvFrame, env: BounceBall) 
     np.testing.assert_allclose(recording.time[steps + 1], env.dt)
     start = np.asarray(env.config.ball_init_pos)
     distance = np.abs(recording.ball[steps + 1] - start)
-    assert np.all(distance < env.config.ball_position_noise + 0.001)
+    assert np.all(distance < env.config.reset.ball_position + 0.001)
     assert np.all(recording.metrics["n_bounces"][steps + 1] == 0)
 
 

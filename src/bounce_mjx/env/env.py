@@ -259,13 +259,13 @@ class Env:
         qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
         qvel = [jnp.zeros((), dtype)] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
-            qpos[addresses.arm_qpos[i]] = angle + config.joint_angle_noise * draws[i]
-            qvel[addresses.arm_qvel[i]] = config.joint_velocity_noise * draws[n + i]
+            qpos[addresses.arm_qpos[i]] = angle + config.reset.joint_angles * draws[i]
+            qvel[addresses.arm_qvel[i]] = config.reset.joint_velocities * draws[n + i]
         for i, component in enumerate(velocity):
             qvel[addresses.ball_qvel[i]] = component
         for i, coordinate in enumerate(position):
             qpos[addresses.ball_qpos[i]] = (
-                coordinate + config.ball_position_noise * draws[2 * n + i]
+                coordinate + config.reset.ball_position * draws[2 * n + i]
             )
         for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
             qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, dtype)

@@ -21,7 +21,7 @@ from bounce_mjx.task.rewards import (
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep
-from bounce_mjx.world.config import Command, WorldConfig
+from bounce_mjx.world.config import Command, ResetConfig, WorldConfig
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
     "ObservationConfig",
     "Quantity",
     "Recording",
+    "ResetConfig",
     "Result",
     "RewardTerm",
     "Start",

@@ -68,6 +68,25 @@ class ActionConfig(StrictModel):
     """Largest distance of the last target from the measured angle, rad; for the base target."""
 
 
+class ResetConfig(StrictModel):
+    """The noise of a reset, to which the terms `joint_start` and `ball_start` of the randomisation
+    add."""
+
+    joint_angles: NonNegative = 0.1
+    """Half-width of the uniform noise of the joint angles, rad."""
+    joint_velocities: NonNegative = 0.01
+    """Half-width of the uniform noise of the joint velocities, rad/s."""
+    ball_position: NonNegative = 0.01
+    """Half-width of the uniform noise of each ball coordinate, m."""
+
+
+_FORMER_RESET_KEYS = {
+    "joint_angle_noise": "joint_angles",
+    "joint_velocity_noise": "joint_velocities",
+    "ball_position_noise": "ball_position",
+}
+
+
 class WorldConfig(StrictModel):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
@@ -97,14 +116,10 @@ class WorldConfig(StrictModel):
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
-    joint_angle_noise: NonNegative = 0.1
-    """Half-width of the uniform noise of the joint angles at a reset, rad."""
-    joint_velocity_noise: NonNegative = 0.01
-    """Half-width of the uniform noise of the joint velocities at a reset, rad/s."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
     """Ball position at a reset, before noise, m."""
-    ball_position_noise: NonNegative = 0.01
-    """Half-width of the uniform noise of each ball coordinate at a reset, m."""
+    reset: ResetConfig = ResetConfig()
+    """The noise of a reset."""
     max_joint_velocity: Positive = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
@@ -113,6 +128,26 @@ class WorldConfig(StrictModel):
     """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **keywords: Any) -> None:
+        super().__pydantic_init_subclass__(**keywords)
+        for former in _FORMER_RESET_KEYS.keys() & cls.__annotations__.keys():
+            raise UserError(
+                f"{cls.__name__} has the setting {former}, which is reset."
+                f"{_FORMER_RESET_KEYS[former]} now; give reset: task.ResetConfig = "
+                f"task.ResetConfig({_FORMER_RESET_KEYS[former]}=...)"
+            )
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _read_former_reset(cls, values: Any) -> Any:
+        """Earlier configs have the noise of a reset beside the other settings."""
+        if not isinstance(values, dict) or not _FORMER_RESET_KEYS.keys() & values.keys():
+            return values
+        moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}
+        kept = {key: value for key, value in values.items() if key not in _FORMER_RESET_KEYS}
+        return kept | {"reset": moved | dict(kept.get("reset", {}))}
 
     @pydantic.model_validator(mode="after")
     def _check_times(self):

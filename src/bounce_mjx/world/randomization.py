@@ -155,9 +155,9 @@ class RandomizationConfig(StrictModel):
     command_interval: Range | None = None
     """Time between two draws of the task's commands within an episode, s."""
     ball_start: Range | None = None
-    """Displacement of each coordinate of the ball at a reset, m."""
+    """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
     joint_start: Range | None = None
-    """Displacement of each joint angle at a reset, rad."""
+    """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
     value. A small share allows wide ranges of single terms, even if no policy can handle all their
