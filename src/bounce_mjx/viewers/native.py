@@ -5,6 +5,7 @@ import queue
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import mujoco
 import mujoco.viewer
@@ -12,15 +13,14 @@ import numpy as np
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.controls import direction, words
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.simulation import Simulation, frame_readings, of_environment
+from bounce_mjx.viewers.trail import Trail
 
 _PICTURE_RATE = 60.0
-_TRAIL_SECONDS = 0.5
 _PUSH = 0.2
 _KEYS = "RTGMNIKJL"
 # Flags that MuJoCo's window toggles with the same keys.
@@ -56,18 +56,6 @@ def check_display() -> None:
         )
 
 
-def run_native(
-    simulation: Simulation, *, speed: float, seconds: float | None, stop: StopRequest
-) -> None:
-    """Shows the first environment until the window is closed, or the simulated `seconds` are
-    over.
-
-    Raises:
-      Interrupted: a stop was requested.
-    """
-    _Window(simulation, speed).run(seconds, stop)
-
-
 def _help(env: Env) -> dict[str, str]:
     """What each key does."""
     moved = [("T / G", words(name)) for name in list(env.config.commands)[:1]]
@@ -80,7 +68,9 @@ def _help(env: Env) -> dict[str, str]:
     }
 
 
-class _Window:
+class Window:
+    """Shows the first environment of a simulation."""
+
     def __init__(self, simulation: Simulation, speed: float):
         self._simulation = simulation
         self._display = Display(simulation.env)
@@ -89,10 +79,16 @@ class _Window:
         # Keys arrive in the window's thread and take effect between two steps.
         self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
 
-    def run(self, seconds: float | None, stop: StopRequest) -> None:
+    def run(self, seconds: float | None, between: Callable[[], None]) -> None:
+        """Shows it until the window is closed, or the simulated `seconds` are over.
+
+        Args:
+          between: called between two pictures.
+        """
         simulation, display = self._simulation, self._display
         dt = simulation.env.dt
-        pace, trail = Pace(dt), [simulation.frame.ball[0]]
+        pace, trail = Pace(dt), Trail(dt)
+        trail.add(simulation.frame)
         steps_left = float("inf") if seconds is None else round(seconds / dt)
         display.pose(simulation.frame.qpos[0], of_environment(simulation.frame.command, 0))
         with mujoco.viewer.launch_passive(
@@ -107,23 +103,19 @@ class _Window:
             self._camera = viewer.cam
             flags = viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS]
             while viewer.is_running() and steps_left > 0:
-                stop.check()
+                between()
                 while not self._keys.empty():
                     self._press(self._keys.get())
                 due = 0 if self._paused else min(pace.due(self._speed), steps_left)
                 steps_left -= due
                 for _ in range(due):
-                    frame = simulation.step()
-                    trail.append(frame.ball[0])
-                    if frame.over[0]:
-                        trail.clear()
-                del trail[: -round(_TRAIL_SECONDS / dt)]
+                    trail.add(simulation.step())
                 frame = simulation.frame
                 with viewer.lock():
                     viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS] = flags
                     display.pose(frame.qpos[0], of_environment(frame.command, 0))
                     viewer.user_scn.ngeom = 0
-                    draw_trail(viewer.user_scn, np.array(trail))
+                    draw_trail(viewer.user_scn, trail.points[:, 0])
                 viewer.set_texts(self._texts())
                 viewer.sync()
                 time.sleep(1.0 / _PICTURE_RATE)

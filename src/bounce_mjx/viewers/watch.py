@@ -23,8 +23,8 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
 from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
 from bounce_mjx.viewers.controllers import make_exchangeable_controller
+from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
-from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.simulation import Simulation
 
 _ROBOTS = 4
@@ -114,7 +114,7 @@ class TrainingPage:
         panel.refresh()
 
     def _say(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.out(line, highlight=False)
 
 
 class _Panel:
