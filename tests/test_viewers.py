@@ -55,7 +55,6 @@ from bounce_mjx.viewers.display import Display, _primitive, body_scenes, marker_
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.options import PageStart, ViewerOptions
-from bounce_mjx.viewers.pace import Pace
 from bounce_mjx.viewers.page import write_page
 from bounce_mjx.viewers.scene import Scene, camera_pose
 from bounce_mjx.viewers.scene import _grid as scene_grid
@@ -440,22 +439,26 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
 # The clock
 
 
-def test_steps_become_due_with_the_clock(monkeypatch) -> None:
-    now = 0.0
+def test_steps_become_due_with_the_clock(scripted: Simulation, monkeypatch) -> None:
+    now, speed = 0.0, 0.5
     monkeypatch.setattr(pace.time, "monotonic", lambda: now)
-    clock = Pace(0.01)
+    monkeypatch.setattr(pace.time, "sleep", lambda _: None)
+    clock = pace.in_real_time(scripted, 0.65, lambda: speed)
+    assert not next(clock)
     steps = []
     for _ in range(60):
         now += 1.0 / 60.0
-        steps.append(clock.due(0.5))
+        steps.append(len(next(clock)))
     assert sum(steps) in (49, 50)
     assert max(steps) == 1
-    now += 100.0  # a machine that slept
-    assert clock.due(1.0) <= 11
-    clock.due(1.0)
+    now, speed = now + 100.0, 0.0
+    assert not next(clock)
+    now, speed = now + 100.0, 1.0  # a machine that slept
+    steps.append(len(next(clock)))
+    assert 9 <= steps[-1] <= 11
     now += 100.0
-    clock.forget()
-    assert clock.due(1.0) == 0
+    steps.append(len(next(clock)))
+    assert sum(steps) == 65 and next(clock, None) is None
 
 
 # The page's server, to which any client may send anything
@@ -592,12 +595,21 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
     for owner, method, record in (
         (Scene, "show", lambda _, number: did["shown"].append(number)),
-        (Pace, "due", lambda _, speed: did["speed"].append(speed)),
         (Simulation, "step", lambda one: did["target"].append(one.command.get("target_height"))),
         (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
     ):
         watch(monkeypatch, owner, method, record)
     scripted.command = {}
+    make_clock = browser.in_real_time
+
+    def clock(simulation, seconds, speed):
+        def watched() -> float:
+            did["speed"].append(speed())
+            return did["speed"][-1]
+
+        return make_clock(simulation, seconds, watched)
+
+    monkeypatch.setattr(browser, "in_real_time", clock)
     with served(scripted, monkeypatch) as client:
         yield client, did
     scripted.command = {}
@@ -898,7 +910,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
 
     watch(monkeypatch, Simulation, "step", step)
     points: list[tuple[float, ...]] = []
-    watch(monkeypatch, _Panel, "refresh", lambda panel: points.extend(panel._points))
+    watch(monkeypatch, _Panel, "draw", lambda panel: points.extend(panel._points))
     printed = io.StringIO()
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
@@ -1063,13 +1075,13 @@ def test_keys_of_the_window_move_the_first_command_within_its_limits(leaning: Si
     window = native.Window(leaning, 1.0)
     for key, end in (("T", 0.3), ("G", -0.3)):
         for _ in range(8):
-            window._press(ord(key))
+            window.press(ord(key))
         assert leaning.command == {"lean_angle": pytest.approx(end)}
     leaning.step()
     (_, _, names, values), (_, _, keys, meanings) = window._texts()
     assert dict(zip(names.split("\n"), values.split("\n"), strict=True))["twice"] == "-0.6"
     help_ = dict(zip(keys.split("\n"), meanings.split("\n"), strict=True))
-    assert help_["T / G"] == "lean angle"
+    assert help_["T"] == "lean angle up"
     leaning.command = {}
 
 
@@ -1082,8 +1094,9 @@ def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
         assert "".join(client.keys) == "spaceRMNIKJL"
         assert client.lines == ["s", "ball", "paddle"]
     window = native.Window(still, 1.0)
-    window._press(ord("T"))
-    assert still.command == {} and "T / G" not in native._help(still.env)
+    window.press(ord("T"))
+    (*_, (_, _, keys, _)) = window._texts()
+    assert still.command == {} and "T" not in keys.split("\n")
 
 
 def test_a_label_without_readings_is_not_shown(still: Simulation, scripted: Simulation) -> None:
@@ -1373,7 +1386,7 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
                 assert viewer.poll() is None, (tmp_path / "xvfb").read_text()
                 if orange.mean() > 0.003:
                     break
-                pace.time.sleep(0.25)
+                time.sleep(0.25)
             assert 0.003 < orange.mean() < 0.2
         finally:
             viewer.kill()
@@ -1459,10 +1472,11 @@ def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
     assert "shows one policy" in sentence and "--viewer browser" in sentence
 
 
-def test_the_windows_own_toggles_of_the_used_keys_are_undone(env: BounceBall) -> None:
+def test_the_windows_own_toggles_of_the_used_keys_are_undone(scripted: Simulation) -> None:
     keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
     keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
-    used = {letter for words in native._help(env) for letter in words if letter.isupper()}
+    (*_, (_, _, names, _)) = native.Window(scripted, 1.0)._texts()
+    used = {*names.split("\n")} - {"space"}
     assert keys == used == set(native._KEYS)
 
 

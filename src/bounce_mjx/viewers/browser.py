@@ -17,14 +17,13 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.controls import Controls, words
 from bounce_mjx.viewers.options import PageStart
-from bounce_mjx.viewers.pace import Pace
+from bounce_mjx.viewers.pace import in_real_time
 from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, of_environment, stacked
 from bounce_mjx.viewers.trail import TRAIL_RGB, TRAIL_SECONDS
 
-# Pictures and plots per second.
-_PICTURE_RATE = 50.0
+# Plots per second.
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
 _SAVED_SECONDS = 10.0
@@ -86,17 +85,12 @@ class LivePage:
           between: called between two pictures.
         """
         simulation, controls, scene = self._simulation, self._controls, self._scene
-        pace = Pace(simulation.env.dt)
-        steps_left = float("inf") if seconds is None else round(seconds / simulation.env.dt)
         next_plot = 0.0
-        while steps_left > 0:
+        for frames in in_real_time(simulation, seconds, controls.pace):
             between()
             controls.apply()
             if controls.num_shown.value != scene.num_envs:
                 scene.show(controls.num_shown.value)
-            due = 0 if controls.paused.value else min(pace.due(controls.speed.value), steps_left)
-            frames = [simulation.step() for _ in range(due)]
-            steps_left -= due
             self._history.extend(frames)
             scene.update(frames or [simulation.frame])
             if frames and time.monotonic() >= next_plot:
@@ -104,9 +98,6 @@ class LivePage:
                 next_plot = time.monotonic() + 1.0 / _PLOT_RATE
             if controls.following.value:
                 scene.follow(simulation.frame)
-            time.sleep(1.0 / _PICTURE_RATE)
-            if controls.paused.value:
-                pace.forget()
         self._server.flush()
 
     def _save(self, event: viser.GuiEvent) -> None:
@@ -192,25 +183,20 @@ def _legend(env: Env, frame: EnvFrame) -> str:
 def reward_bars(terms: Mapping[str, float]) -> str:
     """A bar chart of the weighted reward terms as HTML, and their sum."""
     longest = max(5.0, *map(abs, terms.values()))
-    lines = []
+    rows = []
     for name, value in terms.items():
-        share = value / longest
-        left = 50.0 + 50.0 * min(share, 0.0)
-        color = "#2b8a3e" if value >= 0.0 else "#c92a2a"
-        lines.append(
-            f'<div style="display:flex;align-items:center;height:15px">'
-            f'<span style="width:48%;white-space:nowrap;overflow:hidden;text-overflow:ellipsis">'
-            f"{html.escape(words(name))}</span>"
-            f'<span style="width:16%;text-align:right;padding-right:6px">{_rounded(value)}</span>'
-            f'<span style="width:36%;height:9px;position:relative;background:#eef0f3">'
-            f'<span style="position:absolute;height:9px;left:{left:.1f}%;'
-            f'width:{50.0 * abs(share):.1f}%;background:{color}"></span></span></div>'
+        width = 50.0 * abs(value) / longest
+        left = 50.0 - width * (value < 0.0)
+        colour = "#2b8a3e" if value >= 0.0 else "#c92a2a"
+        rows.append(
+            f"<tr><td>{html.escape(words(name))}</td>"
+            f'<td style="text-align:right">{_rounded(value)}</td>'
+            f'<td style="width:36%"><div style="height:9px;margin-left:{left:.1f}%;'
+            f'width:{width:.1f}%;background:{colour}"></div></td></tr>'
         )
     total = _rounded(sum(terms.values()))
-    return (
-        f'<div style="font:11px sans-serif;padding:0 12px 8px 12px">{"".join(lines)}'
-        f'<div style="padding-top:4px"><b>sum {total}</b> a step</div></div>'
-    )
+    rows.append(f'<tr><td colspan="3"><b>sum {total}</b> a step</td></tr>')
+    return f'<table style="font:11px sans-serif;padding:0 12px;width:100%">{"".join(rows)}</table>'
 
 
 def _rounded(value: float) -> str:

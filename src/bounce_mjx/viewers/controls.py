@@ -3,18 +3,19 @@
 import html
 import queue
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import viser
 
-from bounce_mjx.viewers.options import PageStart
-from bounce_mjx.viewers.pace import SPEED_RANGE
+from bounce_mjx.viewers.options import SPEED_RANGE, PageStart
 from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.world import sliders_for
-from bounce_mjx.world.config import Command
+from bounce_mjx.world.config import Command, WorldConfig
 
 _PUSH_RANGE = (0.05, 1.0)
-_DEFAULT_PUSH = 0.2
+DEFAULT_PUSH = 0.2
+"""Speed of a push, m/s."""
 _DIRECTIONS = ("up", "away", "back", "left", "right")
 _SPEED_STEP = 0.1
 # Steps of a command's slider in a change by a key.
@@ -32,27 +33,29 @@ class Controls:
         # Callbacks run in threads of the server; the simulation's loop obeys their requests.
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         gui.add_html(f'<div style="padding:0 12px"><b>{html.escape(start.title)}</b></div>')
-        self.paused = gui.add_checkbox("pause", False)
-        self.speed = gui.add_slider("speed", *SPEED_RANGE, _SPEED_STEP, start.speed)
+        self._paused = gui.add_checkbox("pause", False)
+        self._speed = gui.add_slider("speed", *SPEED_RANGE, _SPEED_STEP, start.speed)
         most = simulation.num_envs
         self.num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
         )
         self.following = gui.add_checkbox("follow the ball", False)
         reset = gui.add_button("reset", icon=viser.Icon.REFRESH)
-        reset.on_click(self._reset)
+        reset.on_click(self.reset)
         self.save = gui.add_button("save the last 10 s", icon=viser.Icon.DOWNLOAD)
         self._commands = {
             name: self._add_command(gui, name, command)
             for name, command in simulation.env.config.commands.items()
         }
         with gui.add_folder("push the ball"):
-            self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, _DEFAULT_PUSH)
+            self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, DEFAULT_PUSH)
             push = gui.add_button_group("towards", _DIRECTIONS)
-        push.on_click(lambda event: self._push(push.value, event))
+        push.on_click(lambda event: self.push(push.value, event))
         self._sliders = {}
         self._add_world(gui)
-        self._add_keys(gui)
+        # Ctrl-K lists them. The arrows and W, A, S, D, Q and E move viser's camera.
+        for label, key, act in keys(self, simulation.env.config):
+            gui.add_command(label, hotkey=key).on_trigger(act)
 
     def _add_command(
         self, gui: viser.GuiApi, name: str, command: Command
@@ -88,50 +91,39 @@ class Controls:
                 self._sliders[slider] = handle
             gui.add_button("nominal world").on_click(self._make_nominal)
 
-    def _add_keys(self, gui: viser.GuiApi) -> None:
-        """The keys of MuJoCo's window (`native`), which Ctrl-K lists. The arrows and W, A, S, D, Q
-        and E move viser's camera."""
-        keys = [("pause", "space", self._pause), ("reset", "R", self._reset)]
-        for name in list(self._commands)[:1]:
-            keys.append((f"{words(name)} up", "T", lambda _: self._move(1.0)))
-            keys.append((f"{words(name)} down", "G", lambda _: self._move(-1.0)))
-        keys += [
-            ("faster", "M", lambda _: self._hasten(_SPEED_STEP)),
-            ("slower", "N", lambda _: self._hasten(-_SPEED_STEP)),
-            ("push the ball up", "I", lambda event: self._push("up", event)),
-            ("push the ball back", "K", lambda event: self._push("back", event)),
-            ("push the ball left", "J", lambda event: self._push("left", event)),
-            ("push the ball right", "L", lambda event: self._push("right", event)),
-        ]
-        for label, key, act in keys:
-            gui.add_command(label, hotkey=key).on_trigger(act)
+    def pause(self, _: object) -> None:
+        """Stops the time, or lets it go on."""
+        self._paused.value = not self._paused.value
 
-    def _pause(self, _: object) -> None:
-        self.paused.value = not self.paused.value
-
-    def _reset(self, _: object) -> None:
+    def reset(self, _: object) -> None:
+        """Requests a new episode of every robot."""
         self._requests.put(self._simulation.reset)
 
-    def _move(self, steps: float) -> None:
+    def move(self, steps: float) -> None:
         """Moves the first command's slider by a number of the command's steps."""
         name, (drawn, slider) = next(iter(self._commands.items()))
         change = steps * self._simulation.env.config.commands[name].step
         slider.value = float(np.clip(slider.value + change, slider.min, slider.max))
         drawn.value = False
 
-    def _hasten(self, change: float) -> None:
-        self.speed.value = float(np.clip(round(self.speed.value + change, 1), *SPEED_RANGE))
+    def hasten(self, change: float) -> None:
+        """Changes the speed."""
+        self._speed.value = float(np.clip(round(self._speed.value + change, 1), *SPEED_RANGE))
 
-    def _push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
-        """Requests a push in a direction as the event's page sees it."""
+    def push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
+        """Requests a push of the ball in a direction as the event's page sees it."""
         camera = event.client.camera
-        push = self._push_speed.value * direction(towards, camera.look_at - camera.position)
-        self._requests.put(lambda: self._simulation.push(push))
+        velocity = self._push_speed.value * direction(towards, camera.look_at - camera.position)
+        self._requests.put(lambda: self._simulation.push(velocity))
 
     def _make_nominal(self, _: object) -> None:
         for slider, handle in self._sliders.items():
             handle.value = slider.nominal
         self._drawn.value = False
+
+    def pace(self) -> float:
+        """The present speed, as a factor of real time; 0 is a pause."""
+        return 0.0 if self._paused.value else self._speed.value
 
     def apply(self) -> None:
         """Applies the settings and the requests to the simulation."""
@@ -146,6 +138,28 @@ class Controls:
             self._simulation.world = None if self._drawn.value else world
         while not self._requests.empty():
             self._requests.get()()
+
+
+def keys(viewer: Any, config: WorldConfig) -> list[tuple[str, str, Callable[[Any], None]]]:
+    """The keys of the page and of MuJoCo's window: what each one does, the key, and the function of
+    its event.
+
+    Args:
+      viewer: has the methods pause, reset, move, hasten and push.
+    """
+    moved = [words(name) for name in config.commands][:1]
+    return [
+        ("pause", "space", viewer.pause),
+        ("reset", "R", viewer.reset),
+        *((f"{name} up", "T", lambda _: viewer.move(1.0)) for name in moved),
+        *((f"{name} down", "G", lambda _: viewer.move(-1.0)) for name in moved),
+        ("faster", "M", lambda _: viewer.hasten(_SPEED_STEP)),
+        ("slower", "N", lambda _: viewer.hasten(-_SPEED_STEP)),
+        ("push the ball up", "I", lambda event: viewer.push("up", event)),
+        ("push the ball back", "K", lambda event: viewer.push("back", event)),
+        ("push the ball left", "J", lambda event: viewer.push("left", event)),
+        ("push the ball right", "L", lambda event: viewer.push("right", event)),
+    ]
 
 
 def direction(towards: str, view: np.ndarray) -> np.ndarray:

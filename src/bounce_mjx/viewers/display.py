@@ -97,8 +97,10 @@ def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
             rgba = _color(model, geom)
             if mesh is None or rgba[3] == 0.0 or model.geom_group[geom] >= _SHOWN_GROUPS:
                 continue
-            mesh.apply_transform(_transform(model.geom_pos[geom], model.geom_quat[geom]))
             mesh.visual = trimesh.visual.TextureVisuals(material=_material(rgba))
+            pose = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+            pose[:3, 3] = model.geom_pos[geom]
+            mesh.apply_transform(pose)
             scene.add_geometry(mesh)
         if scene.geometry:
             yield body, scene
@@ -151,11 +153,3 @@ def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
         roughnessFactor=0.55,
         alphaMode="OPAQUE" if rgba[3] >= 1.0 else "BLEND",
     )
-
-
-def _transform(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    transform = np.eye(4)
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
-    return transform

@@ -155,7 +155,10 @@ class _Guard:
 
     def _is_name(self, name: str) -> bool:
         """Whether the page may be opened at a name. No website can let an address point here."""
-        return name in self._names or (self._is_everywhere and _is_address(name))
+        if self._is_everywhere and name not in self._names:
+            with contextlib.suppress(ValueError):
+                return bool(ipaddress.ip_address(name))
+        return name in self._names
 
     def _is_own(self, origin: str, host: str) -> bool:
         """Whether a page of an origin may connect to a host: the page from there, and one through a
@@ -203,15 +206,6 @@ class _Connection(ServerConnection):
 
 def _host_name(url: str) -> str:
     """The host of a URL, without its port; empty for anything else."""
-    try:
+    with contextlib.suppress(ValueError):
         return urlsplit(url).hostname or ""
-    except ValueError:
-        return ""
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    return ""

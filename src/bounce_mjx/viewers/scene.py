@@ -70,8 +70,8 @@ class Scene:
         scene.reset()
         scene.set_up_direction("+z")
         scene.configure_environment_map(hdri=None)
-        scene.configure_default_lights(False)
-        _add_lights(scene)
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.add_light_hemisphere("/sky", ground_color=(170, 165, 160), intensity=1.3)
         _add_floor(scene)
         model = self._display.model
         self._bodies = {
@@ -224,18 +224,6 @@ def _grid(number: int) -> np.ndarray:
     row, column = np.divmod(np.arange(number), columns)
     offsets = np.stack([row, column, np.zeros(number)], axis=1) * _SPACING
     return offsets - 0.5 * (offsets.min(axis=0) + offsets.max(axis=0))
-
-
-def _add_lights(scene: viser.SceneApi) -> None:
-    scene.add_light_hemisphere(
-        "/lights/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=1.3
-    )
-    scene.add_light_directional(
-        "/lights/key", intensity=2.0, cast_shadow=True, position=(1.5, -2.0, 3.5)
-    )
-    scene.add_light_directional(
-        "/lights/fill", color=(210, 225, 255), intensity=0.5, position=(1.5, 2.5, 1.5)
-    )
 
 
 def _add_floor(scene: viser.SceneApi) -> None:
