@@ -104,8 +104,16 @@ def run_interruptible(
       Interrupted: Ctrl-C came. The thread cannot be stopped: end the process with `leave`.
       BaseException: the function raised it.
     """
-    future = concurrent.futures.ThreadPoolExecutor(1).submit(function, *args, **kwargs)
+    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
+
+    def run() -> None:
+        try:
+            future.set_result(function(*args, **kwargs))
+        except BaseException as error:  # noqa: BLE001
+            future.set_exception(error)
+
     with StopRequest(signal.SIGINT) as stop:
+        threading.Thread(target=run, daemon=True).start()
         if not stop.wait_for(future):
             raise Interrupted
     return future.result()
