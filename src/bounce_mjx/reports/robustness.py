@@ -114,8 +114,8 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     halves = _halves(report.outcomes)
     lines = max(map(len, halves))
     figure = Figure(figsize=(10.0, _LINE * lines + 1.8), layout="constrained")
-    title = f"{summary(report)}, {literal(_engines_text(report))}"
-    figure.suptitle(title, fontsize=10)
+    title = f"{summary(report)}\n{literal(_engines_text(report))}"
+    figure.suptitle(title, fontsize=10, wrap=True)
     columns = figure.subplots(1, 2, squeeze=False)[0]
     cells = max(8, *(len(outcomes) for half in halves for _, outcomes in half))
     for axes, half in zip(columns, halves, strict=True):
@@ -134,7 +134,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     bar.set_label("episodes until the time limit, %", fontsize=8)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
-    figure.supxlabel(literal(below), fontsize=8)
+    figure.supxlabel(literal(below), fontsize=8, wrap=True)
     return figure
 
 
