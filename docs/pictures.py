@@ -580,7 +580,7 @@ def arms():
 
     from bounce_mjx import BounceBall, EnvConfig
     from bounce_mjx.robot.model import find_addresses
-    from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+    from bounce_mjx.viewers.offscreen import Renderer
 
     names = {"peitian": "AIR4-560", "ur5e": "UR5e", "panda": "Panda", "iiwa": "iiwa"}
     figure, row = plt.subplots(1, 4, figsize=(9.6, 2.9), layout="constrained")
@@ -591,8 +591,8 @@ def arms():
         qpos, addresses = env.mj_model.qpos0.copy(), find_addresses(env.mj_model)
         qpos[addresses.arm_qpos,] = config.default_joint_angles
         qpos[addresses.ball_qpos[:3],] = config.ball_init_pos
-        with Renderer(env, 480, 520, choose_backend()) as renderer:
-            axes.imshow(renderer.render(qpos, np.mean(config.target_height_range)))
+        with Renderer(env, 480, 520) as renderer:
+            axes.imshow(renderer.render(qpos, {"target_height": 0.5}))
         axes.set_title(title)
         axes.axis("off")
     return figure

@@ -23,7 +23,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.loop_fusion import OPTION
-from bounce_mjx.viewers.offscreen import choose_backend
+from bounce_mjx.viewers.offscreen import choose_opengl
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 
@@ -120,7 +120,7 @@ def torch_libraries() -> None:
 def opengl() -> None:
     """A library that can draw without a screen."""
     try:
-        choose_backend()
+        choose_opengl()
     except UserError as error:
         if OPTIONAL:
             pytest.skip(str(error))

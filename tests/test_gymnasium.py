@@ -375,6 +375,7 @@ def test_pictures_show_the_state(single, vectorised):
 def test_rendering_failure_gives_one_sentence(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
+    offscreen.choose_opengl.cache_clear()
     with pytest.raises(UserError, match="neither EGL nor OSMesa works here; .*libosmesa6"):
         gymnasium.make(ENV_ID, render_mode="rgb_array")
 

@@ -34,16 +34,16 @@ from bounce_mjx.commands import play, train, view
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
-from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
-from bounce_mjx.viewers.browser import free_port, reward_bars, run_browser
+from bounce_mjx.viewers.browser import LivePage, reward_bars
 from bounce_mjx.viewers.controllers import (
     make_policy_controller,
     make_random_controller,
@@ -51,11 +51,11 @@ from bounce_mjx.viewers.controllers import (
     make_zero_controller,
 )
 from bounce_mjx.viewers.controls import direction
-from bounce_mjx.viewers.display import Display, _primitive, body_scenes
+from bounce_mjx.viewers.display import Display, _primitive, body_scenes, marker_body
+from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.offscreen import choose_backend
-from bounce_mjx.viewers.options import Address, PageStart, ViewerOptions
-from bounce_mjx.viewers.pace import Pace
-from bounce_mjx.viewers.page import open_server, write_page
+from bounce_mjx.viewers.options import PageStart, ViewerOptions
+from bounce_mjx.viewers.page import write_page
 from bounce_mjx.viewers.scene import Scene, camera_pose
 from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import (
@@ -76,7 +76,6 @@ GRAVITY = 9.81
 HUGE, NAN, INFINITY = 20_000_000, float("nan"), float("inf")
 SECONDS = 3.0
 PATIENCE = 60.0
-HOME_EDGES = tuple(f"paddle_home_edge{i}" for i in range(4))
 
 
 def at_height(target: float) -> dict[str, float]:
@@ -92,6 +91,7 @@ def no_opengl_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo stores the chosen OpenGL library in an environment variable, which a child process
     would inherit."""
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    offscreen.choose_opengl.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,8 @@ def test_a_new_target_is_seen_before_the_next_step(scripted: Simulation) -> None
     scripted.reset()
     scripted.command = at_height(0.77)
     np.testing.assert_allclose(target_of(scripted.frame), 0.77)
-    np.testing.assert_allclose(target_of(scripted.reset()), 0.77)
+    scripted.reset()
+    np.testing.assert_allclose(target_of(scripted.frame), 0.77)
     scripted.command = {}
 
 
@@ -327,26 +328,30 @@ def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
     assert shapes == shown
 
 
-def test_markers_are_at_the_positions_of_the_task(env: BounceBall) -> None:
-    display = Display(env)
+def marker_position(display: Display, name: str) -> np.ndarray:
+    return display.data.body(marker_body(name)).xpos
+
+
+def test_markers_are_at_the_positions_of_the_task() -> None:
+    config = EnvConfig(reward=BounceReward(paddle_home_height=0.15))
+    display = Display(env := BounceBall(config))
     display.pose(env.mj_model.qpos0, at_height(0.61))
-    reward = env.config.reward
-    np.testing.assert_allclose(
-        display.data.site("target_height").xpos, [reward.target_x, reward.target_y, 0.61]
-    )
-    assert display.data.site("paddle_home").xpos[2] == pytest.approx(
-        reward.paddle_home_height, abs=1e-3
-    )
+    x, y = config.reward.target_x, config.reward.target_y
+    np.testing.assert_allclose(marker_position(display, "target_height"), (x, y, 0.61))
+    np.testing.assert_allclose(marker_position(display, "paddle_home"), (x, y, 0.15))
 
 
 def test_the_home_is_an_outline_that_leaves_the_paddle_free(env: BounceBall) -> None:
     model, data = (display := Display(env)).model, display.data
-    display.pose(env.mj_model.qpos0, at_height(0.5))
-    assert model.site("paddle_home").rgba[3] == 0.0
-    home, half = data.site("paddle_home").xpos, model.site("paddle_home").size
-    for name in HOME_EDGES:
-        gap = np.abs(data.site(name).xpos - home) - model.site(name).size
-        assert np.max(gap[:2] - half[:2]) == pytest.approx(0.0, abs=1e-9)
+    qpos = env.mj_model.qpos0.copy()
+    qpos[find_addresses(env.mj_model).arm_qpos,] = env.config.default_joint_angles
+    display.pose(qpos, at_height(0.5))
+    home = model.body(marker_body("paddle_home"))
+    assert home.geomnum == 4
+    paddle, half = data.geom("blocker").xpos, model.geom("blocker").size
+    for edge in home.geomadr + np.arange(4):
+        gap = np.abs(data.geom_xpos[edge] - paddle) - model.geom_size[edge] - half
+        assert np.max(gap[:2]) > 0.0
 
 
 def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
@@ -357,8 +362,9 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     assert env.mj_model.nsite == 0
     display = Display(env)
     display.pose(env.mj_model.qpos0, at_height(0.5))
-    assert display.data.site("target_height").xpos[2] == 0.5
-    assert display.data.site("paddle_home").xpos[2] == env.config.reward.paddle_home_height
+    assert marker_position(display, "target_height")[2] == 0.5
+    home_height = env.config.reward.paddle_home_height
+    assert marker_position(display, "paddle_home")[2] == pytest.approx(home_height)
 
 
 # The camera of the page
@@ -411,7 +417,8 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
         scene = Scene(server, env, number, names)
         scene.update([frame._replace(command=at_height(np.full(number, 0.8)))])
         labels = np.array([label.position for label in scene._labels])
-        targets = scene._markers["target_height"].batched_positions
+        body = scene._display.model.body(marker_body("target_height")).id
+        targets = scene._bodies[body].batched_positions
         texts = [label.text for label in scene._labels]
     np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
     for aspect, on_phone, lowest in PICTURES:
@@ -432,22 +439,26 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
 # The clock
 
 
-def test_steps_become_due_with_the_clock(monkeypatch) -> None:
-    now = 0.0
+def test_steps_become_due_with_the_clock(scripted: Simulation, monkeypatch) -> None:
+    now, speed = 0.0, 0.5
     monkeypatch.setattr(pace.time, "monotonic", lambda: now)
-    clock = Pace(0.01)
+    monkeypatch.setattr(pace.time, "sleep", lambda _: None)
+    clock = pace.in_real_time(scripted, 0.65, lambda: speed)
+    assert not next(clock)
     steps = []
     for _ in range(60):
         now += 1.0 / 60.0
-        steps.append(clock.due(0.5))
+        steps.append(len(next(clock)))
     assert sum(steps) in (49, 50)
     assert max(steps) == 1
-    now += 100.0  # a machine that slept
-    assert clock.due(1.0) <= 11
-    clock.due(1.0)
+    now, speed = now + 100.0, 0.0
+    assert not next(clock)
+    now, speed = now + 100.0, 1.0  # a machine that slept
+    steps.append(len(next(clock)))
+    assert 9 <= steps[-1] <= 11
     now += 100.0
-    clock.forget()
-    assert clock.due(1.0) == 0
+    steps.append(len(next(clock)))
+    assert sum(steps) == 65 and next(clock, None) is None
 
 
 # The page's server, to which any client may send anything
@@ -551,7 +562,7 @@ def watch(
 def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """A client of a simulation's page."""
     failures, printed, ended = [], io.StringIO(), threading.Event()
-    address = Address("127.0.0.1", free_port("127.0.0.1", 8400))
+    options = ViewerOptions(viewer="browser", port=8400)
 
     def step(simulation) -> None:
         if ended.is_set():
@@ -561,10 +572,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
     def serve() -> None:
         try:
-            run_browser(
-                simulation, PageStart("exp[lr] <b>"), address, seconds=None,
-                console=Console(file=printed), stop=StopRequest(),
-            )  # fmt: skip
+            show._page(options, Console(file=printed))(simulation, PageStart("exp[lr] <b>"))
         except BaseException as error:
             failures.append(error)
 
@@ -587,12 +595,21 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
     for owner, method, record in (
         (Scene, "show", lambda _, number: did["shown"].append(number)),
-        (Pace, "due", lambda _, speed: did["speed"].append(speed)),
         (Simulation, "step", lambda one: did["target"].append(one.command.get("target_height"))),
         (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
     ):
         watch(monkeypatch, owner, method, record)
     scripted.command = {}
+    make_clock = browser.in_real_time
+
+    def clock(simulation, seconds, speed):
+        def watched() -> float:
+            did["speed"].append(speed())
+            return did["speed"][-1]
+
+        return make_clock(simulation, seconds, watched)
+
+    monkeypatch.setattr(browser, "in_real_time", clock)
     with served(scripted, monkeypatch) as client:
         yield client, did
     scripted.command = {}
@@ -893,7 +910,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
 
     watch(monkeypatch, Simulation, "step", step)
     points: list[tuple[float, ...]] = []
-    watch(monkeypatch, _Panel, "refresh", lambda panel: points.extend(panel._points))
+    watch(monkeypatch, _Panel, "draw", lambda panel: points.extend(panel._points))
     printed = io.StringIO()
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
@@ -952,12 +969,12 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
     assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
 
 
-def test_the_legend_names_the_keys(page) -> None:
+def test_the_legend_explains_the_markers_and_the_keys_are_those_of_the_window(page) -> None:
     client, _ = page
     client.control("push the ball right")
-    (legend,) = {text for text in client.texts if "green disc" in text}
-    named = "".join(re.findall(r"<b>(\w[ \w]*)</b>", legend)).replace(" ", "")
-    assert named == "spaceRTGMNIKJL" == "".join(client.keys)
+    (legend,) = {text for text in client.texts if "path of the ball" in text}
+    assert "target height" in legend and "paddle home" in legend and "Ctrl-K" in legend
+    assert "".join(client.keys) == "spaceRTGMNIKJL"
 
 
 def test_a_title_is_not_markup(page) -> None:
@@ -1040,8 +1057,8 @@ def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatc
         assert {label: client.sliders[label] for label in sliders} == sliders
         assert client.sliders.keys() == {"speed", "robots", "speed, m/s", *sliders}
         assert client.lines == ["s", "ball", "shelf", "wall", "paddle"]
-        (legend,) = {text for text in client.texts if "orange line" in text}
-        assert "red box</b> high wall<" in legend and "<b>T G</b> lean angle," in legend
+        (legend,) = {text for text in client.texts if "path of the ball" in text}
+        assert 'rgb(230,26,26)">&#9632;</b> high wall<' in legend
         assert any(">calm<" in text for text in client.texts)
         client.press("lean angle up")
         wait_until(lambda: leaning.command == {"lean_angle": 0.1})
@@ -1055,16 +1072,16 @@ def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatc
 
 
 def test_keys_of_the_window_move_the_first_command_within_its_limits(leaning: Simulation) -> None:
-    window = native._Window(leaning, 1.0)
+    window = native.Window(leaning, 1.0)
     for key, end in (("T", 0.3), ("G", -0.3)):
         for _ in range(8):
-            window._press(ord(key))
+            window.press(ord(key))
         assert leaning.command == {"lean_angle": pytest.approx(end)}
     leaning.step()
     (_, _, names, values), (_, _, keys, meanings) = window._texts()
     assert dict(zip(names.split("\n"), values.split("\n"), strict=True))["twice"] == "-0.6"
     help_ = dict(zip(keys.split("\n"), meanings.split("\n"), strict=True))
-    assert help_["T / G"] == "lean angle"
+    assert help_["T"] == "lean angle up"
     leaning.command = {}
 
 
@@ -1076,11 +1093,10 @@ def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
         assert client.sliders.keys() == {"speed", "robots", "speed, m/s"}
         assert "".join(client.keys) == "spaceRMNIKJL"
         assert client.lines == ["s", "ball", "paddle"]
-        (legend,) = {text for text in client.texts if "orange line" in text}
-        assert "T G" not in legend
-    window = native._Window(still, 1.0)
-    window._press(ord("T"))
-    assert still.command == {} and "T / G" not in native._help(still.env)
+    window = native.Window(still, 1.0)
+    window.press(ord("T"))
+    (*_, (_, _, keys, _)) = window._texts()
+    assert still.command == {} and "T" not in keys.split("\n")
 
 
 def test_a_label_without_readings_is_not_shown(still: Simulation, scripted: Simulation) -> None:
@@ -1139,6 +1155,20 @@ def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...])
     simulation.record(1.0)
     simulation.world = world
     return simulation.record(seconds)
+
+
+def test_policies_of_different_worlds_are_shown_as_one(
+    scripted: Simulation, played: Simulation
+) -> None:
+    """They have other metrics, such as those of the world's terms."""
+    both = SideBySide([scripted, played])
+    both.reset()
+    start = both.frame
+    both.push((0.0, 0.0, 0.5))
+    frame = both.step()
+    assert frame.metrics.keys() < played.frame.metrics.keys()
+    assert len(frame.metrics["n_bounces"]) == both.num_envs == 4
+    assert np.all(frame.ball[:, 2] > start.ball[:, 2])
 
 
 WORSE = {
@@ -1356,7 +1386,7 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
                 assert viewer.poll() is None, (tmp_path / "xvfb").read_text()
                 if orange.mean() > 0.003:
                     break
-                pace.time.sleep(0.25)
+                time.sleep(0.25)
             assert 0.003 < orange.mean() < 0.2
         finally:
             viewer.kill()
@@ -1421,11 +1451,8 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
 
     shown = []
     monkeypatch.setattr(show, "Simulation", Named)
-    monkeypatch.setattr(
-        browser,
-        "run_browser",
-        lambda simulation, start, *_, **given: shown.append((simulation, start)),
-    )
+    monkeypatch.setattr(LivePage, "__init__", lambda _, server, *given: shown.append(given))
+    monkeypatch.setattr(LivePage, "run", lambda *_: None)
     both_play = "pretrained robust --viewer browser --num-envs 4".split()
     play.main(both_play)
     play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
@@ -1445,10 +1472,11 @@ def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
     assert "shows one policy" in sentence and "--viewer browser" in sentence
 
 
-def test_the_windows_own_toggles_of_the_used_keys_are_undone(env: BounceBall) -> None:
+def test_the_windows_own_toggles_of_the_used_keys_are_undone(scripted: Simulation) -> None:
     keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
     keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
-    used = {letter for words in native._help(env) for letter in words if letter.isupper()}
+    (*_, (_, _, names, _)) = native.Window(scripted, 1.0)._texts()
+    used = {*names.split("\n")} - {"space"}
     assert keys == used == set(native._KEYS)
 
 

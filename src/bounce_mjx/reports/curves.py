@@ -101,26 +101,35 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     Raises:
       UserError: a run has no config or no scalars.
     """
-    groups: dict[str, dict[Path, TrainConfig]] = {}
-    settings: dict[str, dict[str, Any]] = {}
-    for run in runs:
-        config = load_run_config(run)
-        # The paths of the run's own copies would make every run a group of its own.
-        flat = _settings(config) | {"task": identify_task(config.task)}
-        if config.env.mjcf is not None:
-            flat["env.mjcf"] = identify_robot(config.env.mjcf, run)
-        key = json.dumps(flat)
-        groups.setdefault(key, {})[run] = config
-        settings[key] = flat
-    labels = _differences(list(settings.values()))
+    configs = [load_run_config(run) for run in runs]
+    settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
+    differing = [
+        name for name in settings[0] if any(x[name] != settings[0][name] for x in settings)
+    ]
+    groups: dict[str, list[int]] = {}
+    for i, each in enumerate(settings):
+        groups.setdefault(json.dumps(each), []).append(i)
     return [
         Group(
-            _label(differences, [config.seed for config in configs.values()]),
-            [read_curves(run) for run in configs],
-            next(iter(configs.values())).env.task.curves,
+            _label(
+                {name: settings[members[0]][name] for name in differing},
+                [configs[i].seed for i in members],
+            ),
+            [read_curves(runs[i]) for i in members],
+            configs[members[0]].env.task.curves,
         )
-        for differences, configs in zip(labels, groups.values(), strict=True)
+        for members in groups.values()
     ]
+
+
+def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
+    """The settings that affect the training, by dotted name."""
+    flat = _flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
+    # The paths of the run's own copies would make every run a group of its own.
+    flat["task"] = identify_task(config.task)
+    if config.env.mjcf is not None:
+        flat["env.mjcf"] = identify_robot(config.env.mjcf, run)
+    return flat
 
 
 def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,26 +145,13 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     return steps, values.mean(axis=0), values.std(axis=0)
 
 
-def _settings(config: TrainConfig) -> dict[str, Any]:
-    """The settings that affect the training, by dotted name."""
-    flat: dict[str, Any] = {}
-
-    def flatten(group: dict[str, Any], prefix: str) -> None:
-        for name, value in group.items():
-            if isinstance(value, dict):
-                flatten(value, f"{prefix}{name}.")
-            else:
-                flat[prefix + name] = value
-
-    flatten(config.model_dump(mode="json", exclude=set(_FREE_KEYS)), "")
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings in groups as settings by dotted name."""
+    flat = {}
+    for name, value in settings.items():
+        name = prefix + name
+        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return flat
-
-
-def _differences(settings: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For each config, the settings that differ between the configs."""
-    first = settings[0]
-    names = [name for name in first if any(each[name] != first[name] for each in settings)]
-    return [{name: each[name] for name in names} for each in settings]
 
 
 def _label(differences: dict[str, Any], seeds: Sequence[int]) -> str:

@@ -3,9 +3,9 @@
 They do not use pyplot, so they need no display and can be drawn in several threads.
 """
 
-import contextlib
+import functools
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import jax
 import matplotlib
@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.recording import paddle_points
@@ -39,88 +39,74 @@ _STYLE = {
     # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
 }
+style = functools.partial(matplotlib.rc_context, _STYLE)
+"""The look of all figures, around what draws them."""
 
 
+@style()
 def curves_figure(groups: Sequence[Group]) -> Figure:
-    """The return and the curves of the task over the training, with a dotted line where a run first
-    met all results."""
+    """The return and the curves of the task over the training."""
     shown = [Curve("episode/return", "", title="return of an episode")]
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
-    with style():
-        figure, panels = _panels(len(shown), columns=3, size=2.1, top=0.3, bottom=0.8, wspace=0.22)
-        for axes, curve in zip(panels, shown, strict=True):
-            _draw_curve(axes, groups, curve)
-            axes.set_ylim(bottom=0.0)
-            for group, colour in _coloured(groups):
-                for run in group.runs:
-                    if run.solved_steps is not None:
-                        axes.axvline(run.solved_steps, color=colour, linestyle=":", linewidth=1.0)
-        _add_legend(figure, groups, solved=True)
+    figure, panels = _panels(len(shown), columns=3, height=2.4)
+    for axes, curve in zip(panels, shown, strict=True):
+        _draw_curve(axes, groups, curve)
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel("environment steps")
+    _add_legend(figure, groups)
     return figure
 
 
+@style()
 def rewards_figure(groups: Sequence[Group]) -> Figure:
     """The weighted reward terms over the training."""
     logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
     terms = [name for name in logged if name.startswith(_REWARD)]
-    with style():
-        figure, panels = _panels(len(terms), columns=5, size=1.4, top=0.7, bottom=0.6, wspace=0.42)
-        for axes, name in zip(panels, terms, strict=True):
-            title = name.removeprefix(_REWARD).replace("_", " ")
-            _draw_curve(axes, groups, Curve(name, "", title=title))
-            axes.set_xlabel("")
-        figure.suptitle(
-            "weighted reward terms over environment steps, mean of a control step", fontsize=10
-        )
-        _add_legend(figure, groups, solved=False)
+    figure, panels = _panels(len(terms), columns=5, height=1.6)
+    for axes, name in zip(panels, terms, strict=True):
+        title = name.removeprefix(_REWARD).replace("_", " ")
+        _draw_curve(axes, groups, Curve(name, "", title=title))
+    figure.suptitle(
+        "weighted reward terms over environment steps, mean of a control step", fontsize=10
+    )
+    _add_legend(figure, groups)
     return figure
 
 
+@style()
 def evaluation_figure(env: Env, recording: Recording) -> Figure:
     """The heights of ball and paddle over the first recorded episode, and what the task draws of
     all recorded episodes."""
     recording = jax.device_get(recording)
     plots = env.task.plots(recording)
     rows = 1 + -(-len(plots) // 2)
-    height = 2.8 * rows
-    with style():
-        figure = Figure(figsize=(10.0, height))
-        grid = figure.add_gridspec(
-            rows,
-            2,
-            width_ratios=(1.5, 1.0),
-            left=0.06,
-            right=0.985,
-            top=1.0 - 0.34 / height,
-            bottom=0.45 / height,
-            hspace=0.36,
-        )
-        _draw_heights(figure.add_subplot(grid[0, :]), env, recording)
-        for i, plot in enumerate(plots):
-            axes = figure.add_subplot(grid[1 + i // 2, i % 2])
-            if isinstance(plot, Hits):
-                _draw_hits(axes, env, plot, paddle_points(env, recording, plot.steps))
-            else:
-                _draw_histogram(axes, plot)
+    figure = Figure(figsize=(10.0, 2.8 * rows), layout="constrained")
+    grid = figure.add_gridspec(rows, 2, width_ratios=(1.5, 1.0))
+    _draw_heights(figure.add_subplot(grid[0, :]), env, recording)
+    for i, plot in enumerate(plots):
+        axes = figure.add_subplot(grid[1 + i // 2, i % 2])
+        if isinstance(plot, Hits):
+            _draw_hits(axes, env, plot, paddle_points(env, recording, plot.steps))
+        else:
+            _draw_histogram(axes, plot)
     return figure
 
 
+@style()
 def image(figure: Figure, suffix: str) -> bytes:
     """A figure as an image file of the format `suffix`, "png" or "svg"."""
     buffer = io.BytesIO()
-    with style():
-        figure.savefig(
-            buffer, format=suffix, dpi=150, metadata={"Date": None} if suffix == "svg" else None
-        )
+    metadata = {"Date": None} if suffix == "svg" else None
+    figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
     return buffer.getvalue()
 
 
+@style()
 def pixels(figure: Figure) -> np.ndarray:
     """A figure as a picture [height, width, 3] (uint8)."""
-    with style():
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
@@ -129,34 +115,16 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-@contextlib.contextmanager
-def style() -> Iterator[None]:
-    """The look of all figures."""
-    with matplotlib.rc_context(_STYLE):
-        yield
-
-
 def _coloured(groups: Sequence[Group]) -> list[tuple[Group, str]]:
     return [(group, _COLOURS[i % len(_COLOURS)]) for i, group in enumerate(groups)]
 
 
-def _panels(
-    count: int, columns: int, size: float, top: float, bottom: float, wspace: float
-) -> tuple[Figure, list[Axes]]:
-    """A figure with a number of panels in rows.
-
-    Args:
-      size: height of a row, in.
-      top, bottom: margins, in.
-    """
+def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a number of panels in rows of a height in inches."""
     columns = max(1, min(columns, count))
     rows = max(1, -(-count // columns))
-    height = size * rows + top + bottom
-    figure = Figure(figsize=(10.0, height))
-    margins = dict(left=0.06, right=0.985, top=1.0 - top / height, bottom=bottom / height)
-    grid = figure.subplots(
-        rows, columns, squeeze=False, gridspec_kw=dict(wspace=wspace, hspace=0.55, **margins)
-    )
+    figure = Figure(figsize=(10.0, height * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.remove()
     return figure, [*grid.flat[:count]]
@@ -164,9 +132,12 @@ def _panels(
 
 def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
-    standard deviation on each side."""
+    standard deviation on each side. A dotted line shows where a run first met all results."""
     name, factor = shown.tag, shown.scale
     for group, colour in _coloured(groups):
+        for run in group.runs:
+            if run.solved_steps is not None:
+                axes.axvline(run.solved_steps, color=colour, linestyle=":", linewidth=1.0)
         curves = [run.curves[name] for run in group.runs if name in run.curves]
         if not curves:
             continue
@@ -181,29 +152,19 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
                 steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
             )
     axes.set_title(literal(shown.title))
-    axes.set_xlabel("environment steps")
     axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter(FuncFormatter(_steps_label))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    axes.yaxis.set_major_formatter(FuncFormatter(_value_label))
 
 
-def _steps_label(steps: float, _) -> str:
-    return f"{steps / 1e6:g}M" if steps >= 1e5 else f"{steps / 1e3:g}k" if steps else "0"
-
-
-def _value_label(value: float, _) -> str:
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def _add_legend(figure: Figure, groups: Sequence[Group], *, solved: bool) -> None:
+def _add_legend(figure: Figure, groups: Sequence[Group]) -> None:
     handles = [
         Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
         for group, colour in _coloured(groups)
     ]
-    if solved and any(run.solved_steps is not None for group in groups for run in group.runs):
+    if any(run.solved_steps is not None for group in groups for run in group.runs):
         handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))
-    figure.legend(handles=handles, loc="lower center", ncols=min(3, len(handles)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)))
 
 
 def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
@@ -248,32 +209,28 @@ def _draw_histogram(axes: Axes, plot: Histogram) -> None:
 
 def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     """The paddle's outline with a dot for each hit."""
-    half_x, half_y = env.mj_model.geom_size[find_addresses(env.mj_model).paddle_geom, :2]
-    axes.set_title(literal(f"{plot.title} ({len(points):,})"))
+    outline = env.mj_model.geom_size[find_addresses(env.mj_model).paddle_geom, :2]
+    half_x, half_y = 100.0 * outline
     axes.add_patch(
         Rectangle(
-            (-100 * half_y, -100 * half_x),
-            200 * half_y,
-            200 * half_x,
+            (-half_y, -half_x),
+            2.0 * half_y,
+            2.0 * half_x,
             facecolor="#f6ebe0",
             edgecolor=_COLOURS[1],
         )
     )
     axes.plot([0], [0], "+", color=_GREY)
-    axes.plot(
-        100 * points[:, 1],
-        100 * points[:, 0],
-        ".",
-        markersize=3,
-        alpha=0.4,
-        color=_COLOURS[0],
-        markeredgewidth=0,
+    x, y = 100.0 * points.T[:2]
+    axes.plot(y, x, ".", markersize=3, alpha=0.4, color=_COLOURS[0], markeredgewidth=0)
+    axes.set(
+        title=literal(f"{plot.title} ({len(points):,})"),
+        xlabel="paddle's y",
+        ylabel="paddle's x",
+        xlim=(-1.3 * half_y, 1.3 * half_y),
+        ylim=(-1.3 * half_x, 1.3 * half_x),
+        aspect="equal",
     )
-    axes.set_xlim(-130 * half_y, 130 * half_y)
-    axes.set_ylim(-130 * half_x, 130 * half_x)
-    axes.set_aspect("equal")
-    axes.set_xlabel("paddle's y")
-    axes.set_ylabel("paddle's x")
     if not len(points):
         _note(axes, "none")
 

@@ -5,7 +5,7 @@ A training writes it after its results; `bounce-mjx report [RUN]` writes it agai
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jax
@@ -17,17 +17,11 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.figures import (
-    curves_figure,
-    evaluation_figure,
-    image,
-    rewards_figure,
-)
+from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
-from bounce_mjx.reports.tables import details_line, figure_text, verdict
+from bounce_mjx.reports.tables import details_line, figure_text, result_cells
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
@@ -86,10 +80,11 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
 
 def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
     report = results.best
-    pictures = "".join(
-        f'<h2>{title}</h2>\n<img alt="{title}" src="{_embed(figure)}">\n'
-        for title, figure in figures.items()
-    )
+    pictures = ""
+    for title, figure in figures.items():
+        data = base64.b64encode(image(figure, "svg")).decode()
+        source = f"data:image/svg+xml;base64,{data}"
+        pictures += f'<h2>{title}</h2>\n<img alt="{title}" src="{source}">\n'
     seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
@@ -112,7 +107,7 @@ def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 {html.escape(results.device)}. The best of {len(evaluations)} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
-{_results(report)}
+{_table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 {pictures}
 <h2>Where the time went</h2>
 {_table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
@@ -130,31 +125,19 @@ def _standing(evaluation: Evaluation) -> str:
     return "screening" if evaluation.screening else "-"
 
 
-def _results(report: Report) -> str:
-    rows = [
-        [result.name, result.measured, figure_text(result.value), result.bound, verdict(result)]
-        for result in report.results
-    ]
-    return _table(["result", "measured", "value", "bound", ""], rows)
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in HTML, with coloured verdicts."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        inner = "".join(f'<{tag} class="{_class(c)}">{html.escape(c)}</{tag}>' for c in cells)
+        classes = [{"pass": "pass", "FAIL": "fail"}.get(cell, "") for cell in cells]
+        inner = "".join(
+            f'<{tag} class="{name}">{html.escape(cell)}</{tag}>'
+            for name, cell in zip(classes, cells, strict=True)
+        )
         return f"<tr>{inner}</tr>\n"
 
     body = "".join(row("td", cells) for cells in rows)
     return f"<table>\n{row('th', header)}{body}</table>"
-
-
-def _class(cell: str) -> str:
-    return {"pass": "pass", "FAIL": "fail"}.get(cell, "")
-
-
-def _embed(figure: Figure) -> str:
-    return f"data:image/svg+xml;base64,{base64.b64encode(image(figure, 'svg')).decode()}"
 
 
 _STYLE = """

@@ -1,16 +1,16 @@
 """Robustness reports as a table and as a figure."""
 
 import string
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 from rich import box
 from rich.markup import escape
 from rich.table import Table
@@ -29,10 +29,9 @@ _COLOURS = LinearSegmentedColormap.from_list("stable", ["#c2451e", "#f4e3c3", "#
 # Most of the colour range covers the interesting shares near 100%.
 _SCALE = PowerNorm(2.5, 0.0, 100.0)
 _INK, _PAPER = "#222222", "#ffffff"
-
-# Lengths in inches.
-_WIDTH, _LINE, _LABEL = 10.0, 0.29, 1.95
-_TOP, _BOTTOM = 0.65, 0.95
+_TICK = "\u2713"
+# Height of a row, in.
+_LINE = 0.29
 
 
 def load_robustness(folder: Path) -> RobustnessReport | None:
@@ -86,7 +85,12 @@ def robustness_table(report: RobustnessReport) -> Table:
             name = escape(outcome.perturbation) if i == 0 else ""
             strength = "" if outcome.strength is None else f"{outcome.strength:g} {outcome.unit}"
             verdict = "[green]pass" if outcome.passed else "[red]FAIL"
-            table.add_row(name, strength.rstrip(), *_figures(outcome), verdict)
+            texts = {result: short_text(value) for result, value in outcome.values.items()}
+            figures = [
+                f"[red]{text}*" if result in outcome.failed else f"{text} "
+                for result, text in texts.items()
+            ]
+            table.add_row(name, strength.rstrip(), *figures, verdict)
     return table
 
 
@@ -101,35 +105,36 @@ def result_letters(report: RobustnessReport) -> dict[str, str]:
     return letters
 
 
+@style()
 def robustness_figure(report: RobustnessReport) -> Figure:
     """Chart of perturbations by strength. The colour of a cell shows the share of the episodes
     that last until their time limit. A cell has a tick or the letters of the missed results; a
     frame marks conditions within the training ranges."""
-    columns, letters = _columns(report.outcomes), result_letters(report)
-    lines = max(sum(_lines(group) for group in column) for column in columns)
-    height = _LINE * lines + _TOP + _BOTTOM
-    with style():
-        figure = Figure(figsize=(_WIDTH, height))
-        title = f"{report.met} of {len(report.outcomes)} conditions meet all judged results"
-        below = f"{report.episodes} episodes in each condition, {_engines_text(report)}"
-        figure.text(0.02, 1 - 0.25 / height, title, va="center", fontsize=11, fontweight="bold")
-        figure.text(0.02, 1 - 0.48 / height, literal(below), va="center", fontsize=8.5)
-        cells = max(len(row) for column in columns for _, rows in column for row in rows)
-        for i, column in enumerate(columns):
-            axes = figure.add_axes(
-                (
-                    (i * _WIDTH / 2 + _LABEL) / _WIDTH,
-                    _BOTTOM / height,
-                    (_WIDTH / 2 - _LABEL - 0.12) / _WIDTH,
-                    _LINE * lines / height,
-                )
-            )
-            axes.set_xlim(0.0, max(8, cells))
-            axes.set_ylim(lines, 0.0)
-            axes.axis("off")
-            _draw_column(axes, column, letters)
-        framed = any(outcome.trained for outcome in report.outcomes[1:])
-        _draw_legend(figure, height, letters, framed)
+    letters = result_letters(report)
+    halves = _halves(report.outcomes)
+    lines = max(map(len, halves))
+    figure = Figure(figsize=(10.0, _LINE * lines + 1.8), layout="constrained")
+    title = f"{summary(report)}\n{literal(_engines_text(report))}"
+    figure.suptitle(title, fontsize=10, wrap=True)
+    columns = figure.subplots(1, 2, squeeze=False)[0]
+    cells = max(8, *(len(outcomes) for half in halves for _, outcomes in half))
+    for axes, half in zip(columns, halves, strict=True):
+        axes.set(xlim=(0.0, cells), ylim=(lines, 0.0), xticks=[], frame_on=False)
+        axes.set_yticks(np.arange(len(half)) + 0.5, [literal(label) for label, _ in half])
+        axes.tick_params(length=0, labelsize=8)
+        axes.grid(False)
+        for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), half, strict=True)):
+            label.set_fontweight("normal" if outcomes else "bold")
+            for x, outcome in enumerate(outcomes):
+                _draw_cell(axes, x, y, outcome, letters)
+    scale = ScalarMappable(_SCALE, _COLOURS)
+    bar = figure.colorbar(
+        scale, ax=columns, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
+    )
+    bar.set_label("episodes until the time limit, %", fontsize=8)
+    missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
+    below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
+    figure.supxlabel(literal(below), fontsize=8, wrap=True)
     return figure
 
 
@@ -145,123 +150,41 @@ def _engines_text(report: RobustnessReport) -> str:
     return f"on {names[most]}{''.join(others)}"
 
 
-def _figures(outcome: ConditionOutcome) -> Iterable[str]:
-    """Cells of a table row for the results."""
-    for name, value in outcome.values.items():
-        text = short_text(value)
-        yield f"[red]{text}*" if name in outcome.failed else f"{text} "
-
-
 def _perturbations(outcomes: Sequence[ConditionOutcome]) -> list[list[ConditionOutcome]]:
     """Outcomes grouped by perturbation, in the order of the suite."""
     return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
 
 
-_Heading = tuple[str, list[list[ConditionOutcome]]]
-"""A group's name, and the outcomes of each of its perturbations."""
+_Row = tuple[str, list[ConditionOutcome]]
+"""A perturbation and its outcomes, or the heading of a group, without outcomes."""
 
 
-def _columns(outcomes: Sequence[ConditionOutcome]) -> list[list[_Heading]]:
-    """Groups of perturbations in two columns of about equal length."""
-    rows = _perturbations(outcomes)
-    groups = [(name, list(members)) for name, members in groupby(rows, lambda row: row[0].group)]
-    lengths = [_lines(group) for group in groups]
-    splits = range(1, len(groups) + 1)
-    split = min(splits, key=lambda i: max(sum(lengths[:i]), sum(lengths[i:])))
-    return [groups[:split], groups[split:]] if groups[split:] else [groups[:split]]
-
-
-def _lines(group: _Heading) -> float:
-    """Height of a group in lines, including its heading and a gap."""
-    name, rows = group
-    return len(rows) + (0.3 if name == NOMINAL else 1.6)
-
-
-def _draw_column(axes: Axes, groups: Sequence[_Heading], letters: dict[str, str]) -> None:
-    y = 0.0
-    for name, rows in groups:
-        if name != NOMINAL:
-            heading = literal(name)
-            axes.text(
-                -0.15, y + 0.75, heading, ha="right", va="center", fontsize=9, fontweight="bold"
-            )
-            y += 1.3
-        for row in rows:
-            unit = row[0].unit
-            label = f"{row[0].perturbation}, {unit}" if unit else row[0].perturbation
-            axes.text(
-                -0.15, y + 0.5, literal(label), ha="right", va="center", fontsize=8, color=_INK
-            )
-            for x, outcome in enumerate(row):
-                _draw_cell(axes, x, y, outcome, letters)
-            _draw_frames(axes, y, [outcome.trained for outcome in row])
-            y += 1.0
-        y += 0.3
+def _halves(outcomes: Sequence[ConditionOutcome]) -> tuple[list[_Row], list[_Row]]:
+    """The rows in two columns of about equal length, which no group spans."""
+    rows: list[_Row] = []
+    for group, members in groupby(_perturbations(outcomes), lambda row: row[0].group):
+        if group != NOMINAL:
+            rows.append((group, []))
+        for row in members:
+            first = row[0]
+            unit = f", {first.unit}" if first.unit else ""
+            rows.append((first.perturbation + unit, row))
+    headings = [i for i, (_, members) in enumerate(rows) if not members]
+    split = min(headings, key=lambda i: abs(2 * i - len(rows)), default=len(rows))
+    return rows[:split], rows[split:]
 
 
 def _draw_cell(
     axes: Axes, x: float, y: float, outcome: ConditionOutcome, letters: dict[str, str]
 ) -> None:
     shade = float(_SCALE(100.0 * outcome.lasted))
-    axes.add_patch(
-        Rectangle((x + 0.03, y + 0.04), 0.94, 0.92, facecolor=_COLOURS(shade), edgecolor="none")
-    )
     ink = _INK if 0.2 < shade < 0.8 else _PAPER
-    if outcome.strength is not None:
-        text = f"{outcome.strength:g}".replace("-", "\u2212")
-        axes.text(x + 0.5, y + 0.3, text, ha="center", va="center", fontsize=7.5, color=ink)
+    edge = _INK if outcome.trained else "none"
+    axes.add_patch(
+        Rectangle((x + 0.05, y + 0.06), 0.9, 0.88, facecolor=_COLOURS(shade), edgecolor=edge)
+    )
+    strength = "" if outcome.strength is None else f"{outcome.strength:g}".replace("-", "\u2212")
     missed = "".join(letter for name, letter in letters.items() if name in outcome.failed)
-    axes.text(
-        x + 0.5,
-        y + (0.5 if outcome.strength is None else 0.71),
-        missed or "\u2713",
-        ha="center",
-        va="center",
-        fontsize=6 if missed else 8,
-        fontweight="normal" if missed else "bold",
-        color=ink,
-    )
-
-
-def _draw_frames(axes: Axes, y: float, trained: Sequence[bool]) -> None:
-    """Draws one frame around each row of neighbouring cells within the training ranges."""
-    x = 0
-    for inside, cells in groupby(trained):
-        width = len(list(cells))
-        if inside:
-            axes.add_patch(
-                Rectangle(
-                    (x + 0.03, y + 0.04),
-                    width - 0.06,
-                    0.92,
-                    fill=False,
-                    edgecolor=_INK,
-                    linewidth=1.5,
-                    clip_on=False,
-                )
-            )
-        x += width
-
-
-def _draw_legend(figure: Figure, height: float, letters: dict[str, str], framed: bool) -> None:
-    bar = figure.add_axes((0.02, 0.52 / height, 0.22, 0.14 / height))
-    scale = ScalarMappable(_SCALE, _COLOURS)
-    figure.colorbar(scale, cax=bar, orientation="horizontal", ticks=(0, 50, 75, 90, 100))
-    bar.set_title("episodes until the time limit, %", fontsize=8)
-    bar.tick_params(labelsize=8, length=0)
-    first = next(iter(letters.values()))
-    missed = literal("   ".join(f"{letter} {name}" for name, letter in letters.items()))
-    handles = [
-        Line2D([], [], marker="$\u2713$", linestyle="", color=_INK, label="all judged results met"),
-        Line2D([], [], marker=f"${first}$", linestyle="", color=_INK, label=f"missed: {missed}"),
-    ]
-    if framed:
-        handles.insert(
-            2,
-            Patch(
-                facecolor="none", edgecolor=_INK, linewidth=1.5, label="within the trained ranges"
-            ),
-        )
-    figure.legend(
-        handles=handles, loc="lower left", bbox_to_anchor=(0.27, 0.0), fontsize=8, ncols=1
-    )
+    place = dict(ha="center", va="center", color=ink)
+    axes.text(x + 0.5, y + 0.3, strength, fontsize=7.5, **place)
+    axes.text(x + 0.5, y + 0.7, missed or _TICK, fontsize=6 if missed else 8, **place)

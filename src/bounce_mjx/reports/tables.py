@@ -59,7 +59,7 @@ def results_table(report: Report, title: str) -> Table:
     for result in report.results:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
-            table.caption = f"{result.name}: {verdict(result)} ({condition}"
+            table.caption = f"{result.name}: not judged ({condition}"
             table.caption_justify = "left"
         colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
         table.add_row(result.name, result.measured, figure_text(result.value), bound, colour)
@@ -75,9 +75,8 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     """
     known = [report for report in reports.values() if report is not None]
     table = _plain_table("best checkpoint of each seed")
-    results = [result.name for result in known[0].results]
     own = [f"{d.title}, {d.unit}" if d.unit else d.title for d in _details(known[0])]
-    for header in ("seed", *results, *own, "all met"):
+    for header in ("seed", *(result.name for result in known[0].results), *own, "all met"):
         table.add_column(header.replace(" ", "\n"), justify="right")
 
     for seed, report in reports.items():
@@ -104,29 +103,29 @@ def _seed_figures(report: Report) -> list[float | None]:
     return [item.value for item in (*report.results, *_details(report))]
 
 
+def result_cells(result: Result) -> list[str]:
+    """A result as texts: name, measured quantity, value, bound and verdict."""
+    verdict = {True: "pass", False: "FAIL", None: "not judged"}[result.passed]
+    return [result.name, result.measured, figure_text(result.value), result.bound, verdict]
+
+
 def results_markdown(report: Report) -> str:
     """The results as a Markdown table."""
     lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
     for result in report.results:
         # An unescaped | would begin a new cell.
-        measured = result.measured.replace("|", "&#124;")
-        cells = (result.name, measured, figure_text(result.value), result.bound, verdict(result))
+        cells = [cell.replace("|", "&#124;") for cell in result_cells(result)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def verdict(result: Result) -> str:
-    """Whether a result met its bound, in a word or two."""
-    return {True: "pass", False: "FAIL", None: "not judged"}[result.passed]
-
-
 def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
-    details, own = report.details, _details(report)
-    units = ["" if d.value is None else f" {d.unit}".rstrip() for d in own]
-    texts = [f"{d.title} {short_text(d.value)}{u}" for d, u in zip(own, units, strict=True)]
-    means = [text for text, detail in zip(texts, own, strict=True) if detail.is_mean]
-    others = [text for text in texts if text not in means]
+    details = report.details
+    means, others = [], []
+    for title, unit, value, is_mean in _details(report):
+        text = f"{title} {short_text(value)} {'' if value is None else unit}".rstrip()
+        (means if is_mean else others).append(text)
     means += [f"return {details['mean_return']:.0f}", f"length {details['mean_length_s']:.2f} s"]
     line = ", ".join([f"{', '.join(means)} (means)", *others])
     return f"{details['episodes']:.0f} episodes: {line}"

@@ -1,33 +1,29 @@
 """The live page: viser serves the scene, the controls and the plots to any browser."""
 
 import collections
-import colorsys
 import html
 import itertools
 import json
 import socket
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
 import viser
 import viser.uplot
-from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.controls import Controls, words
-from bounce_mjx.viewers.options import Address, PageStart
-from bounce_mjx.viewers.pace import Pace
-from bounce_mjx.viewers.page import open_server, replay
+from bounce_mjx.viewers.options import PageStart
+from bounce_mjx.viewers.pace import in_real_time
+from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import EnvFrame, SideBySide, Simulation, of_environment, stacked
+from bounce_mjx.viewers.simulation import EnvFrame, Simulation, of_environment, stacked
+from bounce_mjx.viewers.trail import TRAIL_RGB, TRAIL_SECONDS
 
-# Pictures and plots per second.
-_PICTURE_RATE = 50.0
+# Plots per second.
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
 _SAVED_SECONDS = 10.0
@@ -35,38 +31,6 @@ AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
 """Style of the axes of a plot."""
 _LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
 _REWARD = "reward/"
-_SHAPES = {"cylinder": "disc", "frame": "frame", "box": "box"}
-# Every 30 degrees of the colour wheel.
-_HUES = "red orange yellow green green green cyan blue blue purple pink pink".split()
-
-
-def run_browser(
-    simulation: Simulation | SideBySide,
-    start: PageStart,
-    address: Address,
-    *,
-    seconds: float | None,
-    console: Console,
-    stop: StopRequest,
-) -> None:
-    """Serves the page until the simulated `seconds` are over (None: without an end).
-
-    Args:
-      address: has a free port of this machine.
-
-    Raises:
-      Interrupted: a stop was requested.
-    """
-    with open_server(*address) as server:
-        page = LivePage(server, simulation, start)
-        # A host name may look like rich's markup.
-        console.print(
-            f"viewer: {address.url}  (Ctrl-C ends it)",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-        page.run(seconds, stop.check)
 
 
 def _window_title(title: str) -> str:
@@ -81,7 +45,7 @@ class LivePage:
     def __init__(
         self,
         server: viser.ViserServer,
-        simulation: Simulation | SideBySide,
+        simulation: Simulation,
         start: PageStart,
         side: viser.PanelHandle | None = None,
     ):
@@ -101,13 +65,11 @@ class LivePage:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(280)
         gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
-        self._controls = Controls(server, simulation, start)
-        self._settings = self._controls.read()
+        self._controls = Controls(gui, simulation, start)
+        # viser calls it in a thread, as writing a page takes seconds.
+        self._controls.save.on_click(self._save)
         self._scene = Scene(server, simulation.env, start.num_shown, start.names)
         self._history: collections.deque[EnvFrame] = collections.deque(
-            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
-        )
-        self._seen: collections.deque[EnvFrame] = collections.deque(
             maxlen=round(_SAVED_SECONDS / simulation.env.dt)
         )
         side = side or gui.add_panel()
@@ -122,63 +84,34 @@ class LivePage:
           seconds: simulated time; None for no end.
           between: called between two pictures.
         """
-        simulation = self._simulation
-        pace = Pace(simulation.env.dt)
-        self._scene.update([simulation.frame])
-        steps_left = float("inf") if seconds is None else round(seconds / simulation.env.dt)
+        simulation, controls, scene = self._simulation, self._controls, self._scene
         next_plot = 0.0
-        while steps_left > 0:
+        for frames in in_real_time(simulation, seconds, controls.pace):
             between()
-            changed = self._obey_controls()
-            due = 0 if self._settings.paused else pace.due(self._settings.speed)
-            due = min(due, steps_left)
-            frames = [simulation.step() for _ in range(due)]
-            steps_left -= due
+            controls.apply()
+            if controls.num_shown.value != scene.num_envs:
+                scene.show(controls.num_shown.value)
             self._history.extend(frames)
-            self._seen.extend(frames)
-            if frames or changed:
-                self._scene.update(frames or [simulation.frame])
-                if time.monotonic() >= next_plot:
-                    self._update_plots()
-                    next_plot = time.monotonic() + 1.0 / _PLOT_RATE
-            if self._settings.following:
-                self._scene.follow(simulation.frame)
-            time.sleep(1.0 / _PICTURE_RATE)
-            if self._settings.paused:
-                pace.forget()
+            scene.update(frames or [simulation.frame])
+            if frames and time.monotonic() >= next_plot:
+                self._update_plots()
+                next_plot = time.monotonic() + 1.0 / _PLOT_RATE
+            if controls.following.value:
+                scene.follow(simulation.frame)
         self._server.flush()
 
-    def _obey_controls(self) -> bool:
-        """Applies the controls' settings and requests; returns whether anything changed."""
-        before, now = self._settings, self._controls.read()
-        self._settings = now
-        if now.command != before.command:
-            self._simulation.command = now.command
-        if now.world != before.world:
-            self._simulation.world = now.world
-        if now.num_shown != before.num_shown:
-            self._scene.show(now.num_shown)
-        reset, push = self._controls.take_reset(), self._controls.take_push()
-        if reset:
-            self._simulation.reset()
-            self._history.clear()
-        if push is not None:
-            self._simulation.push(push)
-        for client in self._controls.take_saving():
-            # Writing a page takes seconds.
-            threading.Thread(
-                target=self._save, args=(client, list(self._seen)), daemon=True
-            ).start()
-        return now != before or reset or push is not None
-
-    def _save(self, client: viser.ClientHandle, frames: list[EnvFrame]) -> None:
-        """Sends a page that replays the last seconds."""
+    def _save(self, event: viser.GuiEvent) -> None:
+        """Sends a page that replays the last seconds; the button waits for it."""
+        frames = list(self._history)
         if not frames:
             return
-        shown = self._settings.num_shown
-        recording = jax.tree.map(lambda values: values[:, :shown], stacked(frames))
-        text = replay(self._simulation.env, recording, names=self._names)
-        client.send_file_download("replay.html", text.encode(), save_immediately=True)
+        event.target.disabled = True
+        try:
+            recording = jax.tree.map(lambda x: x[:, : self._scene.num_envs], stacked(frames))
+            text = replay(self._simulation.env, recording, names=self._names)
+            event.client.send_file_download("replay.html", text.encode(), save_immediately=True)
+        finally:
+            event.target.disabled = False
 
     def _add_plots(self, side: viser.PanelHandle) -> None:
         gui, frame = self._server.gui, self._simulation.frame
@@ -212,15 +145,12 @@ class LivePage:
         return self._simulation.env.task.levels(of_environment(frame.command, 0))
 
     def _update_plots(self) -> None:
-        if not self._history:
-            return
-        heights = np.array(
-            [(f.ball[0, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in self._history]
-        )
-        dt = self._simulation.env.dt
-        times = np.arange(1 - len(heights), 1) * dt
-        self._heights.data = (times, *heights.T)
-        recent = list(self._history)[-round(1.0 / _PLOT_RATE / dt) :]
+        env = self._simulation.env
+        frames = list(self._history)[-round(_PLOT_SECONDS / env.dt) :]
+        heights = [(f.ball[0, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
+        times = np.arange(1 - len(heights), 1) * env.dt
+        self._heights.data = (times, *np.array(heights).T)
+        recent = frames[-round(1.0 / _PLOT_RATE / env.dt) :]
         terms = jax.tree.map(lambda *values: np.mean(values), *map(_reward_terms, recent))
         self._terms.content = reward_bars(terms)
 
@@ -236,51 +166,37 @@ def _reward_terms(frame: EnvFrame) -> dict[str, float]:
 
 def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
-    rows = [
-        (f"{_colour_name(rgba)} {_SHAPES[shape]}", 0.65 * 255.0 * np.array(rgba[:3]), words(name))
-        for name, _, _, rgba, shape in env.task.markers(of_environment(frame.command, 0))
-    ]
-    rows.append(("orange line", (232.0, 89.0, 12.0), "path of the ball, 0.6 s"))
+    markers = env.task.markers(of_environment(frame.command, 0))
+    rows = [(255.0 * np.array(marker.rgba[:3]), words(marker.name)) for marker in markers]
+    rows.append((TRAIL_RGB, f"path of the ball, {TRAIL_SECONDS} s"))
     lines = [
-        f'<b style="color:rgb({",".join(f"{c:.0f}" for c in colour)})">{what}</b> '
+        f'<b style="color:rgb({",".join(f"{c:.0f}" for c in rgb)})">&#9632;</b> '
         f"{html.escape(meaning)}<br>"
-        for what, colour, meaning in rows
+        for rgb, meaning in rows
     ]
-    moved = [f"<b>T G</b> {html.escape(words(name))}, " for name in list(env.config.commands)[:1]]
     return f"""<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
 {"".join(lines)}
-<b>space</b> pause, <b>R</b> reset, {"".join(moved)}<b>M N</b> speed,
-<b>I K J L</b> push the ball, <b>Ctrl-K</b> all keys
+<b>space</b> pause, <b>R</b> reset, <b>Ctrl-K</b> all keys
 </div>"""
-
-
-def _colour_name(rgba: Sequence[float]) -> str:
-    hue, saturation, _ = colorsys.rgb_to_hsv(*rgba[:3])
-    return _HUES[round(len(_HUES) * hue) % len(_HUES)] if saturation > 0.2 else "grey"
 
 
 def reward_bars(terms: Mapping[str, float]) -> str:
     """A bar chart of the weighted reward terms as HTML, and their sum."""
     longest = max(5.0, *map(abs, terms.values()))
-    lines = []
+    rows = []
     for name, value in terms.items():
-        share = value / longest
-        left = 50.0 + 50.0 * min(share, 0.0)
-        color = "#2b8a3e" if value >= 0.0 else "#c92a2a"
-        lines.append(
-            f'<div style="display:flex;align-items:center;height:15px">'
-            f'<span style="width:48%;white-space:nowrap;overflow:hidden;text-overflow:ellipsis">'
-            f"{html.escape(words(name))}</span>"
-            f'<span style="width:16%;text-align:right;padding-right:6px">{_rounded(value)}</span>'
-            f'<span style="width:36%;height:9px;position:relative;background:#eef0f3">'
-            f'<span style="position:absolute;height:9px;left:{left:.1f}%;'
-            f'width:{50.0 * abs(share):.1f}%;background:{color}"></span></span></div>'
+        width = 50.0 * abs(value) / longest
+        left = 50.0 - width * (value < 0.0)
+        colour = "#2b8a3e" if value >= 0.0 else "#c92a2a"
+        rows.append(
+            f"<tr><td>{html.escape(words(name))}</td>"
+            f'<td style="text-align:right">{_rounded(value)}</td>'
+            f'<td style="width:36%"><div style="height:9px;margin-left:{left:.1f}%;'
+            f'width:{width:.1f}%;background:{colour}"></div></td></tr>'
         )
     total = _rounded(sum(terms.values()))
-    return (
-        f'<div style="font:11px sans-serif;padding:0 12px 8px 12px">{"".join(lines)}'
-        f'<div style="padding-top:4px"><b>sum {total}</b> a step</div></div>'
-    )
+    rows.append(f'<tr><td colspan="3"><b>sum {total}</b> a step</td></tr>')
+    return f'<table style="font:11px sans-serif;padding:0 12px;width:100%">{"".join(rows)}</table>'
 
 
 def _rounded(value: float) -> str:

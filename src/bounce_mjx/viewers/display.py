@@ -1,7 +1,6 @@
 """The displayed model: the task's markers, and each visible geom as a mesh."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -26,48 +25,56 @@ class Display:
 
     def __init__(self, env: Env):
         self._task = env.task
-        commands = env.config.commands
-        lowest, highest = (
-            env.task.markers({name: command[end] for name, command in commands.items()})
-            for end in range(2)
-        )
-        self.model = _with_markers(env.config, lowest)
+        lowest = {name: command.low for name, command in env.config.commands.items()}
+        self.model = _with_markers(env.config, env.task.markers(lowest))
         self.data = mujoco.MjData(self.model)
-        self.markers = tuple(name for marker in lowest for name in _site_names(marker))
-        """Names of the sites of the task's markers."""
-        moving = [one.name for one, other in zip(lowest, highest, strict=True) if one != other]
-        self._moving = frozenset(moving)
-        for name in self.markers:
-            # MuJoCo ignores changes to a position that was zero in the file.
-            self.model.site(name).sameframe = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
     def pose(self, qpos: np.ndarray, command: dict[str, float]) -> None:
         """Moves `data` to generalised positions [nq], and the markers to those of the commands."""
         self.data.qpos[:] = qpos
         for marker in self._task.markers(command):
-            if marker.name in self._moving:
-                names, offsets = _site_names(marker), _offsets(self.model.site(marker.name), marker)
-                for name, offset in zip(names, offsets, strict=True):
-                    self.model.site(name).pos = np.asarray(marker.position) + offset
+            body = self.model.body(marker_body(marker.name))
+            self.data.mocap_pos[body.mocapid] = marker.position
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
 
-def _site_names(marker: Marker) -> tuple[str, ...]:
-    """The sites of a marker; a plate would hide what a frame surrounds."""
-    if marker.shape != "frame":
-        return (marker.name,)
-    return tuple(f"{marker.name}_edge{i}" for i in range(4))
+def marker_body(name: str) -> str:
+    """Name of a marker's body in the displayed model."""
+    return f"marker {name}"
 
 
-def _offsets(plate: Any, marker: Marker) -> np.ndarray:
-    """Positions of a marker's sites [K, 3] from the centre of its site, m."""
-    if marker.shape != "frame":
-        return np.zeros((1, 3))
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, plate.quat)
-    return np.array([middle for middle, _ in _edges(plate.size)]) @ rotation.reshape(3, 3).T
+def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjModel:
+    """The config's model with a body for each marker, which has the size and the colour of the
+    model's site of its name, if there is one."""
+    spec, path = scene_spec(config.mjcf, config.robot)
+    looks = {marker.name: (marker.size, marker.rgba) for marker in markers}
+    for site in spec.sites:
+        if site.name in looks:
+            material = spec.material(site.material)
+            looks[site.name] = site.size, (site if material is None else material).rgba
+        # The project's own file has markers of one task.
+        if site.name in looks or config.mjcf is None:
+            site.group = _SHOWN_GROUPS
+    for name, position, _, _, shape in markers:
+        size, rgba = looks[name]
+        body = spec.worldbody.add_body(name=marker_body(name), pos=position, mocap=True)
+        boxes = [((0.0, 0.0, 0.0), size)]
+        if shape == "frame":
+            # A plate would hide what a frame surrounds.
+            boxes, rgba = _edges(size), (*rgba[:3], 0.9)
+        is_round = shape == "cylinder"
+        for center, half in boxes:
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER if is_round else mujoco.mjtGeom.mjGEOM_BOX,
+                pos=center,
+                size=half,
+                rgba=rgba,
+                contype=0,
+                conaffinity=0,
+            )
+    return compile_spec(spec, path)
 
 
 def _edges(size: np.ndarray) -> list[tuple[list[float], list[float]]]:
@@ -81,48 +88,6 @@ def _edges(size: np.ndarray) -> list[tuple[list[float], list[float]]]:
     ]
 
 
-def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjModel:
-    """The config's model with the sites of the markers, of which it may have some."""
-    spec, path = scene_spec(config.mjcf, config.robot)
-    if config.mjcf is None:
-        # The project's own file has markers of one task.
-        for site in {site.name for site in spec.sites} - {marker.name for marker in markers}:
-            spec.site(site).rgba = np.zeros(4)
-            spec.site(site).material = ""
-    kinds = {"cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
-    for marker in markers:
-        site = spec.site(marker.name)
-        if site is None:
-            site = spec.worldbody.add_site(
-                name=marker.name,
-                type=kinds.get(marker.shape, mujoco.mjtGeom.mjGEOM_BOX),
-                pos=marker.position,
-                size=marker.size,
-                rgba=marker.rgba,
-            )
-        if marker.shape == "frame":
-            _add_outline(spec, site, marker)
-    return compile_spec(spec, path)
-
-
-def _add_outline(spec: mujoco.MjSpec, plate: mujoco.MjsSite, marker: Marker) -> None:
-    """Adds the four edges around a plate, which becomes invisible."""
-    material = spec.material(plate.material)
-    rgba = plate.rgba.copy() if material is None else material.rgba.copy()
-    plate.rgba = [*rgba[:3], 0.0]
-    edges = zip(_site_names(marker), _offsets(plate, marker), _edges(plate.size), strict=True)
-    for name, offset, (_, size) in edges:
-        spec.worldbody.add_site(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=plate.pos + offset,
-            quat=plate.quat,
-            size=size,
-            rgba=[*rgba[:3], 0.9],
-            group=plate.group,
-        )
-
-
 def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
     """Each body with visible geoms: its id, and those geoms as meshes in the body's frame."""
     for body in range(model.nbody):
@@ -132,19 +97,13 @@ def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
             rgba = _color(model, geom)
             if mesh is None or rgba[3] == 0.0 or model.geom_group[geom] >= _SHOWN_GROUPS:
                 continue
-            mesh.apply_transform(_transform(model.geom_pos[geom], model.geom_quat[geom]))
             mesh.visual = trimesh.visual.TextureVisuals(material=_material(rgba))
+            pose = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+            pose[:3, 3] = model.geom_pos[geom]
+            mesh.apply_transform(pose)
             scene.add_geometry(mesh)
         if scene.geometry:
             yield body, scene
-
-
-def site_mesh(model: mujoco.MjModel, name: str) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """A marker's mesh in its own frame, and its colour [4] from 0 to 1."""
-    site = model.site(name)
-    material = site.matid.item()
-    rgba = site.rgba if material < 0 else model.mat_rgba[material]
-    return _primitive(site.type.item(), site.size), rgba
 
 
 def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
@@ -194,11 +153,3 @@ def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
         roughnessFactor=0.55,
         alphaMode="OPAQUE" if rgba[3] >= 1.0 else "BLEND",
     )
-
-
-def _transform(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    transform = np.eye(4)
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
-    return transform

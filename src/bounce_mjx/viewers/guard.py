@@ -6,13 +6,14 @@ or by a name that it lets point to this machine (DNS rebinding).
 """
 
 import asyncio
+import contextlib
 import functools
 import http
 import ipaddress
 import logging
 import socket
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
@@ -32,6 +33,9 @@ _LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 _ALL_ADDRESSES = ("0.0.0.0", "::", "")
 # The longest message of a page, its camera, has 400 bytes.
 _MAX_BYTES = 4096
+_ROUNDING = 1e-6
+# viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
+_STOP_SECONDS = 1.0
 _REFUSAL = (
     "the page was opened by another website, or under a name that it does not have; open the "
     "address that the command printed, or give the command the name with --allow-host (train: "
@@ -62,24 +66,23 @@ class _Key(StrictModel):
     uuid: str
 
 
-class _Value(StrictModel):
-    value: Any
-
-
 class _Update(StrictModel):
     type: Literal["GuiUpdateMessage"]
     uuid: str
-    updates: _Value
+    updates: Annotated[dict[Literal["value"], Any], Field(min_length=1)]
 
 
 _MESSAGES = pydantic.TypeAdapter(Annotated[_Camera | _Key | _Update, Field(discriminator="type")])
 
 
-def start_server(host: str, port: int, allowed: Collection[str] = ()) -> viser.ViserServer:
-    """Starts a viser server that admits its own page only, and valid messages only. It prints
-    nothing.
+@contextlib.contextmanager
+def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator[viser.ViserServer]:
+    """A viser server that admits its own page only, and valid messages only. It prints nothing.
+
+    Closing it takes at most a second: a background thread waits for clients that do not answer.
 
     Args:
+      port: 0 takes any free port.
       allowed: names of hosts, besides the address, at which a browser may open the page.
 
     Raises:
@@ -96,12 +99,17 @@ def start_server(host: str, port: int, allowed: Collection[str] = ()) -> viser.V
             guard.server = viser.ViserServer(host=host, port=port, verbose=False)
         finally:
             websockets.asyncio.server.serve = serve
-    if not guard.is_serving:
-        guard.server.stop()
-        raise UserError(
-            f"viser {viser.__version__} would admit every website to the page; install viser 1.1"
-        )
-    return guard.server
+    try:
+        if not guard.is_serving:
+            raise UserError(
+                f"viser {viser.__version__} would admit every website to the page; install viser "
+                "1.1"
+            )
+        yield guard.server
+    finally:
+        stopping = threading.Thread(target=guard.server.stop, daemon=True)
+        stopping.start()
+        stopping.join(_STOP_SECONDS)
 
 
 class _Guard:
@@ -147,7 +155,10 @@ class _Guard:
 
     def _is_name(self, name: str) -> bool:
         """Whether the page may be opened at a name. No website can let an address point here."""
-        return name in self._names or (self._is_everywhere and _is_address(name))
+        if self._is_everywhere and name not in self._names:
+            with contextlib.suppress(ValueError):
+                return bool(ipaddress.ip_address(name))
+        return name in self._names
 
     def _is_own(self, origin: str, host: str) -> bool:
         """Whether a page of an origin may connect to a host: the page from there, and one through a
@@ -166,14 +177,14 @@ class _Guard:
 
     def _fits(self, update: _Update) -> bool:
         """Whether a control offers the new value."""
-        gui, value = getattr(self.server, "gui", None), update.updates.value
+        gui, value = getattr(self.server, "gui", None), update.updates["value"]
         handle = gui and gui._gui_input_handle_from_uuid.get(update.uuid)
         if handle is None or handle.disabled:
             return False
         if isinstance(handle, viser.GuiSliderHandle):
-            # A page rounds the ends of a slider to its decimals.
-            low, high = handle.min - handle.step, handle.max + handle.step
-            return type(value) in (int, float) and low <= value <= high
+            # A page sends whole numbers as such, and rounds the others.
+            is_number = type(value) in (int, type(handle.value))
+            return is_number and handle.min - _ROUNDING <= value <= handle.max + _ROUNDING
         if isinstance(handle, viser.GuiButtonGroupHandle):
             return value in handle.options
         return isinstance(value, bool)
@@ -195,15 +206,6 @@ class _Connection(ServerConnection):
 
 def _host_name(url: str) -> str:
     """The host of a URL, without its port; empty for anything else."""
-    try:
+    with contextlib.suppress(ValueError):
         return urlsplit(url).hostname or ""
-    except ValueError:
-        return ""
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    return ""

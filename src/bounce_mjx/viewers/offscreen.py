@@ -1,20 +1,22 @@
 """Rendering without a screen."""
 
+import functools
+import importlib
 import os
 import subprocess
 import sys
 
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.trail import TRAIL_RGB
 
 CAMERA = "overview"
 _TRAIL_RADIUS = 0.004
-_TRAIL_RGB = (1.0, 0.45, 0.05)
-_MAX_GEOMS = 2000
 _BACKENDS = ("egl", "osmesa")
 # Runs in a separate process: a library that fails to load would remain partly loaded in this one.
 _PROBE = """
@@ -56,43 +58,52 @@ def works(backend: str) -> bool:
     return subprocess.run(probe, capture_output=True).returncode == 0
 
 
+@functools.cache
+def choose_opengl() -> None:
+    """Chooses the library for every later `mujoco.Renderer`.
+
+    MuJoCo itself chooses when it is imported, and without MUJOCO_GL takes GLFW, which needs a
+    screen.
+
+    Raises:
+      UserError: no library works.
+    """
+    gl_context.GLContext = importlib.import_module(f"mujoco.{choose_backend()}").GLContext
+
+
 class Renderer:
     """Renders one environment. A context manager, which frees the GPU's memory."""
 
     def __init__(
-        self,
-        env: Env,
-        width: int,
-        height: int,
-        backend: str,
-        camera: str | None = None,
-        plain: bool = False,
+        self, env: Env, width: int, height: int, camera: str | None = None, plain: bool = False
     ):
         """Compiles the displayed model.
 
         Args:
-          camera: name of a camera of the model; None for the overview.
+          camera: name of a camera of the model; None for the overview, or the default free camera
+            of MuJoCo's viewer if the model has no overview.
           plain: leaves out shadows and antialiasing, which take 7/8 of the time on a CPU.
 
         Raises:
-          UserError: the model has no such camera.
+          UserError: the model has no such camera, or no OpenGL library works.
         """
         self._display = Display(env)
         model = self._display.model
-        self._camera = _camera(model, camera)
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        if camera is not None and camera not in cameras:
+            raise UserError(
+                f"the model has no camera {camera!r}; its cameras are: "
+                f"{', '.join(cameras) or 'none'}"
+            )
+        self._camera = camera or (CAMERA if CAMERA in cameras else -1)
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         # Half of the model's setting: twice as fast on a CPU, and still smooth.
         shadows, samples = (0, 0) if plain else (2048, 4)
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, shadows)
         model.vis.quality.offsamples = min(model.vis.quality.offsamples, samples)
-        self._gl = _gl_context(backend)(width, height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not plain
-        self._option = mujoco.MjvOption()
-        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        choose_opengl()
+        self._renderer = mujoco.Renderer(model, height, width)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not plain
 
     def __enter__(self) -> "Renderer":
         return self
@@ -103,9 +114,8 @@ class Renderer:
     def close(self) -> None:
         """Frees the GPU's memory."""
         # Otherwise this would free objects of the renderer that drew last.
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+        self._renderer._gl_context.make_current()
+        self._renderer.close()
 
     def render(
         self, qpos: np.ndarray, command: dict[str, float], trail: np.ndarray | None = None
@@ -118,22 +128,10 @@ class Renderer:
           trail: ball positions [P, 3] to connect by a line, oldest first, m.
         """
         self._display.pose(qpos, command)
-        self._gl.make_current()
-        mujoco.mjv_updateScene(
-            self._display.model,
-            self._display.data,
-            self._option,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL,
-            self._scene,
-        )
+        self._renderer.update_scene(self._display.data, self._camera)
         if trail is not None:
-            draw_trail(self._scene, trail)
-        mujoco.mjr_render(self._viewport, self._scene, self._context)
-        picture = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
-        return np.flipud(picture)
+            draw_trail(self._renderer.scene, trail)
+        return self._renderer.render()
 
 
 def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
@@ -142,36 +140,8 @@ def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
         if scene.ngeom >= scene.maxgeom:
             return
         geom = scene.geoms[scene.ngeom]
-        rgba = np.array([*_TRAIL_RGB, (i + 1) / len(trail)], np.float32)
+        rgba = np.array([*TRAIL_RGB / 255.0, (i + 1) / len(trail)], np.float32)
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
         mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
         mujoco.mjv_connector(geom, capsule, _TRAIL_RADIUS, start, end)
         scene.ngeom += 1
-
-
-def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
-    """A camera of the model. Without a name it is the overview camera, or the default free camera
-    of MuJoCo's viewer if the model has no overview camera."""
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, camera)
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name or CAMERA)
-    if name is not None and index < 0:
-        known = [model.camera(i).name for i in range(model.ncam)]
-        raise UserError(
-            f"the model has no camera {name!r}; its cameras are: {', '.join(known) or 'none'}"
-        )
-    if index >= 0:
-        camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        camera.fixedcamid = index
-    return camera
-
-
-def _gl_context(backend: str):
-    # A process can use only the first of these libraries that it imports.
-    if backend == "egl":
-        from mujoco.egl import GLContext
-    elif backend == "osmesa":
-        from mujoco.osmesa import GLContext
-    else:
-        from mujoco import GLContext
-    return GLContext

@@ -7,10 +7,11 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 
 from bounce_mjx.config.settings import HostName, Positive, StrictModel
-from bounce_mjx.viewers.pace import SPEED_RANGE
 
 MAX_ENVS = 16
 """Largest number of robots side by side."""
+SPEED_RANGE = (0.1, 4.0)
+"""Slowest and fastest speed of a viewer, as factors of real time."""
 
 
 class ViewerOptions(StrictModel):

@@ -1,31 +1,31 @@
 """Simulation in real time."""
 
 import time
+from collections.abc import Callable, Iterator
 
-SPEED_RANGE = (0.1, 2.0)
-"""Slowest and fastest speed of a viewer, as factors of real time."""
+from bounce_mjx.viewers.simulation import EnvFrame, Simulation
 
+_PICTURES_PER_SECOND = 50.0
 # If the simulation falls behind by more than this, it slows down instead of catching up, s.
 _MAX_LAG = 0.1
 
 
-class Pace:
-    """Number of control steps that are due according to the clock."""
+def in_real_time(
+    simulation: Simulation, seconds: float | None, speed: Callable[[], float]
+) -> Iterator[list[EnvFrame]]:
+    """Steps a simulation with the clock, and yields for each picture the frames since the last one.
 
-    def __init__(self, dt: float):
-        self._dt = dt
-        self._owed = 0.0
-        self.forget()
-
-    def forget(self) -> None:
-        """Skips the time since the last call."""
-        self._last = time.monotonic()
-
-    def due(self, speed: float) -> int:
-        """Control steps that became due since the last call, at `speed` times real time."""
+    Args:
+      seconds: simulated time; None for no end.
+      speed: the present factor of real time; 0 is a pause.
+    """
+    dt = simulation.env.dt
+    left = float("inf") if seconds is None else round(seconds / dt)
+    owed, last = 0.0, time.monotonic()
+    while left > 0:
         now = time.monotonic()
-        self._owed += speed * min(now - self._last, _MAX_LAG)
-        self._last = now
-        steps = int(self._owed / self._dt)
-        self._owed -= steps * self._dt
-        return steps
+        owed += speed() * min(now - last, _MAX_LAG) / dt
+        due, last = min(int(owed), left), now
+        owed, left = owed - due, left - due
+        yield [simulation.step() for _ in range(due)]
+        time.sleep(1.0 / _PICTURES_PER_SECOND)

@@ -1,28 +1,22 @@
 """The replay page: episodes in one HTML file, for any browser, offline."""
 
-import contextlib
-import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-import viser
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.files import new_output
-from bounce_mjx.viewers.guard import start_server
+from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import EnvFrame, SideBySide, Simulation, frame_at, resample
+from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
 _VISER_TITLE = "<title>Viser</title>"
-# viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
-_STOP_SECONDS = 1.0
 
 
 def write_page(
     path: Path,
-    simulation: Simulation | SideBySide,
+    simulation: Simulation,
     recording: EnvFrame,
     fps: int | None,
     names: Sequence[str] | None = None,
@@ -52,18 +46,3 @@ def replay(
             scene.update([frame_at(frames, i)])
             recorder.insert_sleep(1.0 / fps)
         return recorder.as_html().replace(_VISER_TITLE, "<title>bounce_mjx</title>", 1)
-
-
-@contextlib.contextmanager
-def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator[viser.ViserServer]:
-    """A server of `start_server`; port 0 takes any free port.
-
-    Closing it takes at most a second: a background thread waits for clients that do not answer.
-    """
-    server = start_server(host, port, allowed)
-    try:
-        yield server
-    finally:
-        stopping = threading.Thread(target=server.stop, daemon=True)
-        stopping.start()
-        stopping.join(_STOP_SECONDS)

@@ -1,6 +1,5 @@
 """The 3D scene of the live page and of the replay page, built with viser."""
 
-import collections
 import contextlib
 import math
 import time
@@ -10,16 +9,15 @@ import numpy as np
 import viser
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.viewers.display import Display, body_scenes, site_mesh
+from bounce_mjx.viewers.display import Display, body_scenes
 from bounce_mjx.viewers.simulation import EnvFrame, frame_readings, of_environment
+from bounce_mjx.viewers.trail import TRAIL_RGB, Trail
 
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
 # Distance of a label above its target, which the ball may exceed.
 _LABEL_DISTANCE = 0.14
 _ANNOUNCED_SECONDS = 1.5
-_TRAIL_SECONDS = 0.6
-_TRAIL_COLOR = np.array([235.0, 85.0, 0.0])
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
 # With the task's focus at _USUAL_FOCUS, the camera looks at this point, from a place that far from
 # it, and sees one arm and its ball up to the highest target.
@@ -65,53 +63,38 @@ class Scene:
 
     def show(self, num_envs: int) -> None:
         """Builds the scene for the first `num_envs` environments of the next frames."""
-        self._num_envs = num_envs
+        self.num_envs = num_envs
+        """Number of environments that are shown."""
         self._offsets = _grid(num_envs)
         scene = self._server.scene
         scene.reset()
-        no_trail = np.zeros((num_envs, 3)), np.ones(num_envs, bool)
-        length = round(_TRAIL_SECONDS / self._env.dt)
-        self._passed = collections.deque([no_trail] * length, maxlen=length)
         scene.set_up_direction("+z")
         scene.configure_environment_map(hdri=None)
-        scene.configure_default_lights(False)
-        _add_lights(scene)
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.add_light_hemisphere("/sky", ground_color=(170, 165, 160), intensity=1.3)
         _add_floor(scene)
         model = self._display.model
-        home = np.zeros((num_envs, 3)) + self._offsets
-        upright = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
         self._bodies = {
             body: scene.add_batched_glb(
                 f"/robot/{model.body(body).name}",
                 shapes.export(file_type="glb"),
-                batched_wxyzs=upright,
-                batched_positions=home,
+                batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)),
+                batched_positions=self._offsets,
                 lod="off",
+                # A marker casts none.
+                cast_shadow=bool(model.body_mocapid[body] < 0),
             )
             for body, shapes in body_scenes(model)
         }
-        middle = {n: 0.5 * (c.low + c.high) for n, c in self._env.config.commands.items()}
-        self._display.pose(model.qpos0, middle)
-        self._markers = {}
-        for name in self._display.markers:
-            mesh, rgba = site_mesh(model, name)
-            self._markers[name] = scene.add_batched_meshes_simple(
-                f"/markers/{name}",
-                mesh.vertices,
-                mesh.faces,
-                batched_wxyzs=upright,
-                batched_positions=self._display.data.site(name).xpos + self._offsets,
-                batched_colors=np.round(rgba[:3] * 255.0).astype(np.uint8),
-                opacity=0.9 if "_edge" in name else 0.55,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-                lod="off",
-            )
+        self._trail = Trail(self._env.dt)
+        segments = self._trail.length - 1
+        age = np.linspace(1.0, 0.0, self._trail.length)[:, None, None]
+        colors = age * _BACKGROUND + (1.0 - age) * TRAIL_RGB
+        colors = np.stack([colors[:-1], colors[1:]], axis=2)
         self._line = scene.add_line_segments(
             "/trail",
-            np.zeros((num_envs * (length - 1), 2, 3)),
-            np.zeros((num_envs * (length - 1), 2, 3), np.uint8),
+            np.zeros((segments * num_envs, 2, 3)),
+            np.repeat(colors, num_envs, axis=1).reshape(-1, 2, 3).astype(np.uint8),
             thickness=0.006,
         )
         self._focus = np.array(self._env.task.focus())
@@ -137,39 +120,30 @@ class Scene:
 
     def update(self, frames: Sequence[EnvFrame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
-        display, model, number = self._display, self._display.model, self._num_envs
-        frame = frames[-1]
+        display, model, number = self._display, self._display.model, self.num_envs
         positions = np.zeros((number, model.nbody, 3))
         rotations = np.zeros((number, model.nbody, 4))
-        markers = {name: np.zeros((number, 3)) for name in self._markers}
-        tops = np.zeros(number)
-        for i in range(number):
-            command = of_environment(frame.command, i)
-            display.pose(frame.qpos[i], command)
-            positions[i], rotations[i] = display.data.xpos, display.data.xquat
-            for name, places in markers.items():
-                places[i] = display.data.site(name).xpos
-            tops[i] = max(self._env.task.levels(command).values(), default=0.0)
+        for frame in frames:
+            self._trail.add(frame)
+            over = frame.over[:number]
+            self._lost = np.where(over, frame.lost[:number], self._lost)
         with self._server.atomic():
+            for i, label in enumerate(self._labels):
+                command = of_environment(frame.command, i)
+                display.pose(frame.qpos[i], command)
+                positions[i], rotations[i] = display.data.xpos, display.data.xquat
+                # An empty label would be a white stroke.
+                label.text = self._label(frame, i)
+                label.visible = bool(label.text)
+                top = max(self._env.task.levels(command).values(), default=0.0)
+                height = max(_LABEL_HEIGHT, top + _LABEL_DISTANCE)
+                label.position = self._label_places[i] + (0.0, 0.0, height)
             for body, handle in self._bodies.items():
                 if model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
-            for name, places in markers.items():
-                self._markers[name].batched_positions = places + self._offsets
-            self._line.points, self._line.colors = self._trails(frames)
-            for seen in frames:
-                over = seen.over[:number]
-                self._lost = np.where(over, seen.lost[:number], self._lost)
-            for i, label in enumerate(self._labels):
-                text = self._label(frame, i)
-                if label.text != text:
-                    # An empty label would be a white stroke.
-                    label.text, label.visible = text, bool(text)
-                height = max(_LABEL_HEIGHT, tops[i] + _LABEL_DISTANCE)
-                position = self._label_places[i] + (0.0, 0.0, height)
-                if not np.array_equal(label.position, position):
-                    label.position = position
+            path = self._trail.points[:, :number] + self._offsets
+            self._line.points = np.stack([path[:-1], path[1:]], axis=2).reshape(-1, 2, 3)
 
     def follow(self, frame: EnvFrame) -> None:
         """Moves the camera of every page smoothly with the first ball."""
@@ -185,10 +159,10 @@ class Scene:
     def _label(self, frame: EnvFrame, index: int) -> str:
         """An environment's name if there are several, and the task's readings or the loss of its
         ball."""
-        name = "" if self._num_envs == 1 else f"{index + 1}:  "
+        name = "" if self.num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
-        short = self._num_envs > _MAX_LONG_LABELS
+        short = self.num_envs > _MAX_LONG_LABELS
         if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
             return f"{name}LOST" if short else f"{name}BALL LOST"
         readings = frame_readings(self._env, frame, index)
@@ -196,25 +170,6 @@ class Scene:
             return name + next(iter(readings.values()), "")
         text = name + "   ".join(f"{word} {value}" for word, value in readings.items())
         return text.strip()
-
-    def _trails(self, frames: Sequence[EnvFrame]) -> tuple[np.ndarray, np.ndarray]:
-        """The balls' recent paths as line segments [S, 2, 3], and their colours, which fade with
-        age; a reset cuts the paths."""
-        for frame in frames:
-            self._passed.append((frame.ball[: self._num_envs], frame.over[: self._num_envs]))
-        balls = np.stack([ball for ball, _ in self._passed])
-        cut = np.stack([over for _, over in self._passed])[:-1]
-        cut = np.flip(np.logical_or.accumulate(np.flip(cut, axis=0), axis=0), axis=0)
-        segments = np.stack([balls[:-1], balls[1:]], axis=2) + self._offsets[:, None]
-        # The page always draws its initial number of segments, so a segment from an earlier episode
-        # stays and shrinks to the ball.
-        segments = np.where(cut[..., None, None], (balls[-1] + self._offsets)[:, None], segments)
-        age = np.linspace(1.0, 0.0, len(balls))[:, None]
-        colors = age * _BACKGROUND + (1.0 - age) * _TRAIL_COLOR
-        colors = np.broadcast_to(
-            np.stack([colors[:-1], colors[1:]], axis=1)[:, None], segments.shape
-        )
-        return segments.reshape(-1, 2, 3), colors.reshape(-1, 2, 3).astype(np.uint8)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a new page, and once more when its panels have taken their room."""
@@ -269,18 +224,6 @@ def _grid(number: int) -> np.ndarray:
     row, column = np.divmod(np.arange(number), columns)
     offsets = np.stack([row, column, np.zeros(number)], axis=1) * _SPACING
     return offsets - 0.5 * (offsets.min(axis=0) + offsets.max(axis=0))
-
-
-def _add_lights(scene: viser.SceneApi) -> None:
-    scene.add_light_hemisphere(
-        "/lights/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=1.3
-    )
-    scene.add_light_directional(
-        "/lights/key", intensity=2.0, cast_shadow=True, position=(1.5, -2.0, 3.5)
-    )
-    scene.add_light_directional(
-        "/lights/fill", color=(210, 225, 255), intensity=0.5, position=(1.5, 2.5, 1.5)
-    )
 
 
 def _add_floor(scene: viser.SceneApi) -> None:

@@ -13,7 +13,7 @@ from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.files import check_writable
-from bounce_mjx.viewers.native import check_display, has_display, run_native
+from bounce_mjx.viewers.native import Window, check_display, has_display
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
@@ -59,7 +59,7 @@ def show(
     present(simulation, _page_start(shown, options))
 
 
-Present = Callable[[Simulation | SideBySide, PageStart], None]
+Present = Callable[[Simulation, PageStart], None]
 """Shows a simulation."""
 
 
@@ -92,7 +92,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
 
         check_writable(options.html, "--html", SUFFIXES)
 
-    def present(simulation: Simulation | SideBySide, start: PageStart) -> None:
+    def present(simulation: Simulation, start: PageStart) -> None:
         with console.status("recording"):
             recording = simulation.record(options.seconds or _RECORDED_SECONDS)
             if film is not None:
@@ -101,8 +101,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
                 write_page(options.html, simulation, recording, options.fps, start.names)
         for path in (options.video, options.html):
             if path is not None:
-                # rich would read brackets in a path as markup.
-                console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
+                console.out(f"written: {path}", highlight=False)
 
     return present
 
@@ -113,23 +112,28 @@ def _window(options: ViewerOptions, console: Console) -> Present:
 
     def present(simulation: Simulation, start: PageStart) -> None:
         with contextlib.suppress(Interrupted), StopRequest() as stop:
-            run_native(simulation, speed=start.speed, seconds=options.seconds, stop=stop)
+            Window(simulation, start.speed).run(options.seconds, stop.check)
 
     return present
 
 
 def _page(options: ViewerOptions, console: Console) -> Present:
     """Serves the page; looks for a port at once."""
-    from bounce_mjx.viewers.browser import free_port, run_browser
+    from bounce_mjx.viewers.browser import LivePage, free_port
+    from bounce_mjx.viewers.guard import open_server
 
     port = free_port(options.host, options.port)
     address = Address(options.host, port, options.allow_host)
 
-    def present(simulation: Simulation | SideBySide, start: PageStart) -> None:
-        with contextlib.suppress(Interrupted), StopRequest() as stop:
-            run_browser(
-                simulation, start, address, seconds=options.seconds, console=console, stop=stop
-            )
+    def present(simulation: Simulation, start: PageStart) -> None:
+        with (
+            contextlib.suppress(Interrupted),
+            StopRequest() as stop,
+            open_server(*address) as server,
+        ):
+            page = LivePage(server, simulation, start)
+            console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
+            page.run(options.seconds, stop.check)
 
     return present
 
@@ -144,7 +148,7 @@ def _simulate(
     options: ViewerOptions,
     commands: dict[str, float],
     has_sliders: bool,
-) -> Simulation | SideBySide:
+) -> Simulation:
     """Compiles the simulation.
 
     Args:

@@ -47,7 +47,7 @@ class _Changes(NamedTuple):
     push: np.ndarray
     """Velocity that is added to the ball's [3], m/s."""
     world: World
-    """Terms of the world; nan keeps an entry."""
+    """Terms of the world that have a nominal value; nan keeps an entry."""
 
 
 def of_environment(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
@@ -94,7 +94,8 @@ class Simulation:
         self.num_envs = num_envs
         self.policy = policy
         """The policy that acts; another one of the same shapes may replace it between two steps."""
-        self._command: dict[str, float] = {}
+        self.command: dict[str, float] = {}
+        """Commands of all environments that are set; the others are drawn."""
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for the world drawn at each reset."""
@@ -118,26 +119,15 @@ class Simulation:
         self.reset()
 
     @property
-    def command(self) -> dict[str, float]:
-        """Commands of all environments that are set; the others are drawn."""
-        return self._command
-
-    @command.setter
-    def command(self, command: dict[str, float]) -> None:
-        self._command = dict(command)
-        self.frame = self._with_command(self.frame)
-
-    def _with_command(self, frame: EnvFrame) -> EnvFrame:
-        """A frame that already shows the commands that the next step sets."""
-        given = {
-            name: np.full_like(frame.command[name], value) for name, value in self._command.items()
-        }
+    def frame(self) -> EnvFrame:
+        """The current frame, which already shows the commands that the next step sets."""
+        frame = self._frame
+        given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
 
-    def reset(self) -> EnvFrame:
-        """Starts a new episode in every environment; returns the first frame."""
-        self.frame = self._reset(np.ones(self.num_envs, bool))
-        return self.frame
+    def reset(self) -> None:
+        """Starts a new episode in every environment."""
+        self._frame = self._reset(np.ones(self.num_envs, bool))
 
     def push(self, velocity: tuple[float, float, float]) -> None:
         """Adds a velocity (m/s) to every ball at the start of the next step."""
@@ -149,9 +139,9 @@ class Simulation:
         # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
         self._key, self._states, self._steps, frame = self._step_program(*inputs)
-        self.frame = jax.device_get(frame)
-        if self.frame.over.any():
-            self._reset(self.frame.over)
+        self._frame = jax.device_get(frame)
+        if self._frame.over.any():
+            self._reset(self._frame.over)
         return self.frame
 
     def record(self, seconds: float) -> EnvFrame:
@@ -160,32 +150,24 @@ class Simulation:
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
         return stacked(frames)
 
-    def _set_command(self) -> dict[str, np.float32]:
-        """Every command; nan where the drawn one stays."""
-        return {
-            name: np.float32(self._command.get(name, np.nan)) for name in self.env.config.commands
-        }
-
-    def _world(self) -> World:
-        """The terms that have a nominal value; nan where the drawn ones stay."""
-        values = {}
-        for name in self.env.config.randomization.terms:
+    def _inputs(self) -> tuple:
+        """Arguments of the program of a step."""
+        config = self.env.config
+        command = {name: np.float32(self.command.get(name, np.nan)) for name in config.commands}
+        world = {}
+        for name in config.randomization.terms:
             shape, nominal = TERMS[name].shape(self.env.action_size), TERMS[name].nominal
             if nominal is not None:
                 entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
-                values[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
-        return values
-
-    def _inputs(self) -> tuple:
-        """Arguments of the program of a step."""
-        changes = _Changes(self._set_command(), self._push, self._world())
+                world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
+        changes = _Changes(command, self._push, world)
         return self.policy, self._key, self._states, self._steps, changes
 
     def _reset(self, over: np.ndarray) -> EnvFrame:
         """Starts a new episode in some environments [N]; the frame of all."""
         self._key, key = jax.random.split(self._key)
         self._states, self._steps, frame = self._reset_program(key, self._states, self._steps, over)
-        return self._with_command(jax.device_get(frame))
+        return jax.device_get(frame)
 
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
@@ -208,63 +190,37 @@ class Simulation:
         return key, after, steps, _view(self.env, after, steps, over)
 
 
-class SideBySide:
+class SideBySide(Simulation):
     """Several simulations of one robot, shown as one; the environments of the first come first."""
 
     def __init__(self, simulations: Sequence[Simulation]):
         self._simulations = simulations
-        self.env = simulations[0].env
+        first = simulations[0]
+        self.env, self.command, self.world = first.env, first.command, first.world
         self.num_envs = sum(simulation.num_envs for simulation in simulations)
+        self._push = np.zeros(3, np.float32)
 
     @property
-    def frame(self) -> EnvFrame:
-        """The current frame of all environments."""
-        return _joined([simulation.frame for simulation in self._simulations])
+    def _frame(self) -> EnvFrame:
+        frames = [simulation.frame for simulation in self._simulations]
+        # Each world has its own metrics.
+        shared = set.intersection(*(set(frame.metrics) for frame in frames))
+        frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
+        return jax.tree.map(lambda *values: np.concatenate(values), *frames)
 
-    @property
-    def command(self) -> dict[str, float]:
-        """See `Simulation.command`."""
-        return self._simulations[0].command
-
-    @command.setter
-    def command(self, command: dict[str, float]) -> None:
-        for simulation in self._simulations:
-            simulation.command = command
-
-    @property
-    def world(self) -> dict[str, Sequence[float]] | None:
-        """See `Simulation.world`."""
-        return self._simulations[0].world
-
-    @world.setter
-    def world(self, world: dict[str, Sequence[float]] | None) -> None:
-        for simulation in self._simulations:
-            simulation.world = world
-
-    def reset(self) -> EnvFrame:
+    def reset(self) -> None:
         """See `Simulation.reset`."""
         for simulation in self._simulations:
             simulation.reset()
-        return self.frame
-
-    def push(self, velocity: tuple[float, float, float]) -> None:
-        """See `Simulation.push`."""
-        for simulation in self._simulations:
-            simulation.push(velocity)
 
     def step(self) -> EnvFrame:
         """See `Simulation.step`."""
-        return _joined([simulation.step() for simulation in self._simulations])
-
-    def record(self, seconds: float) -> EnvFrame:
-        """See `Simulation.record`."""
-        recordings = [simulation.record(seconds) for simulation in self._simulations]
-        return _joined(recordings, axis=1)
-
-
-def _joined(frames: Sequence[EnvFrame], axis: int = 0) -> EnvFrame:
-    """Frames of several simulations as one; the environments are along the axis."""
-    return jax.tree.map(lambda *values: np.concatenate(values, axis), *frames)
+        push, self._push = self._push, np.zeros(3, np.float32)
+        for simulation in self._simulations:
+            simulation.command, simulation.world = self.command, self.world
+            simulation.push(push)
+            simulation.step()
+        return self.frame
 
 
 def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
@@ -300,29 +256,29 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
 
 def _changed(env: Env, states: State, changes: _Changes) -> State:
     """States [..., N] with the changes of a user."""
-    command, push, world = changes
     before = states.pipeline_state
     velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
+    qvel = before.physics.qvel.at[velocity].add(changes.push[:, None])
     changed = before._replace(
-        physics=before.physics._replace(qvel=before.physics.qvel.at[velocity].add(push[:, None])),
-        command={
-            name: jnp.where(jnp.isnan(command[name]), drawn, command[name])
-            for name, drawn in before.command.items()
-        },
+        physics=before.physics._replace(qvel=qvel),
+        command=_given_or_drawn(changes.command, before.command),
     )
 
     def in_world(state: EnvState) -> EnvState:
-        terms = {
-            name: jnp.where(jnp.isnan(value), state.world[name], value)
-            for name, value in world.items()
-        }
-        terms = state.world | terms
+        terms = _given_or_drawn(changes.world, state.world)
         return state._replace(world=terms, parameters=physics_parameters(terms, env.mj_model))
 
-    if world:
+    if changes.world:
         changed = jax.vmap(in_world, in_axes=-1, out_axes=-1)(changed)
     observation = jax.vmap(env.observe, in_axes=-1, out_axes=-1)(changed)
     return states.replace(pipeline_state=changed, obs=observation)
+
+
+def _given_or_drawn(given: World, drawn: World) -> World:
+    """Drawn values by name, some of which are replaced; nan replaces none."""
+    return drawn | {
+        name: jnp.where(jnp.isnan(value), drawn[name], value) for name, value in given.items()
+    }
 
 
 def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFrame:

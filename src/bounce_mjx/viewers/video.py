@@ -13,7 +13,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.files import new_output
-from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
     Simulation,
@@ -22,12 +22,12 @@ from bounce_mjx.viewers.simulation import (
     of_environment,
     resample,
 )
+from bounce_mjx.viewers.trail import Trail
 
 SUFFIXES = (".mp4", ".gif")
 # A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
 _DEFAULT_FPS = {".mp4": 60, ".gif": 25}
 _MAX_GIF_FPS = 50
-_TRAIL_SECONDS = 0.5
 _ENCODINGS = {
     ".mp4": "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart".split(),
     # One palette, for the moving parts; each picture stores only its changed pixels.
@@ -64,7 +64,7 @@ class VideoWriter:
                 f"--fps {self.fps} does not suit a GIF, which counts time in 1/100 s; give 10, "
                 "20, 25 or 50"
             )
-        self._backend = choose_backend()
+        choose_opengl()
 
     def write(self, simulation: Simulation, recording: EnvFrame) -> None:
         """Writes a recording of the simulation's first environment.
@@ -105,15 +105,13 @@ class VideoWriter:
 
     def _pictures(self, env: Env, frames: EnvFrame) -> Iterator[np.ndarray]:
         """One picture [height, width, 3] for each frame."""
-        length = round(_TRAIL_SECONDS * self.fps)
-        with Renderer(env, *self._size, self._backend) as renderer:
+        trail = Trail(1.0 / self.fps)
+        with Renderer(env, *self._size) as renderer:
             for i in range(len(frames.time)):
                 frame = frame_at(frames, i)
-                start = max(0, i - length)
-                resets = np.flatnonzero(np.diff(frames.time[start : i + 1, 0]) < 0.0)
-                start += resets[-1] + 1 if resets.size else 0
-                trail = frames.ball[start : i + 1, 0]
-                picture = renderer.render(frame.qpos[0], of_environment(frame.command, 0), trail)
+                trail.add(frame)
+                command = of_environment(frame.command, 0)
+                picture = renderer.render(frame.qpos[0], command, trail.points[:, 0])
                 yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 

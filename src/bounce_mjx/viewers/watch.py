@@ -23,8 +23,8 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
 from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
 from bounce_mjx.viewers.controllers import make_exchangeable_controller
+from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
-from bounce_mjx.viewers.page import open_server
 from bounce_mjx.viewers.simulation import Simulation
 
 _ROBOTS = 4
@@ -47,7 +47,7 @@ class TrainingPage:
         """Starts the thread, which first compiles the simulation.
 
         Args:
-          allowed: see `start_server`.
+          allowed: see `open_server`.
 
         Raises:
           UserError: the page cannot be served there.
@@ -109,12 +109,14 @@ class TrainingPage:
 
     def _tell(self, simulation: Simulation, panel: "_Panel") -> None:
         """Shows the news since the last call."""
+        if self._news.empty():
+            return
         while not self._news.empty():
             self._news.get()(simulation, panel)
-        panel.refresh()
+        panel.draw()
 
     def _say(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.out(line, highlight=False)
 
 
 class _Panel:
@@ -126,7 +128,6 @@ class _Panel:
         self._curves = (_RETURN, *titled)
         self._points: collections.deque[tuple[float, ...]] = collections.deque(maxlen=_MAX_POINTS)
         self._met_at: dict[str, int] = {}
-        self._changed = False
         with side.add_tab("training", viser.Icon.SCHOOL):
             self._progress = gui.add_html(_text("compiling"))
             self._results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
@@ -152,7 +153,6 @@ class _Panel:
         rate = means["speed/steps_per_second"]
         done = f"{steps:,} of {self._total_steps:,} steps"
         self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
-        self._changed = True
 
     def end(self) -> None:
         """Says that the training has ended."""
@@ -162,16 +162,13 @@ class _Panel:
         """Shows the results of an evaluation."""
         self._results.content = results_list(report, steps, self._met_at)
 
-    def refresh(self) -> None:
-        """Draws new points."""
-        if not self._changed:
-            return
-        self._changed = False
-        steps, *curves = np.array(self._points).T
-        for plot, values in zip(self._plots, curves, strict=True):
-            known = np.isfinite(values)
+    def draw(self) -> None:
+        """Draws the curves."""
+        steps, *values = np.array(self._points).reshape(-1, 1 + len(self._plots)).T
+        for plot, curve in zip(self._plots, values, strict=True):
+            known = np.isfinite(curve)
             if known.any():
-                plot.data = (steps[known], values[known])
+                plot.data = (steps[known], curve[known])
 
 
 def results_list(report: Report, steps: int, met_at: dict[str, int]) -> str:

@@ -14,7 +14,6 @@ import numpy as np
 from brax.io import image, mjcf
 from flax import struct
 
-from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
@@ -23,6 +22,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.world.config import WorldConfig
 
 ENV_NAME = "bounce_ball"

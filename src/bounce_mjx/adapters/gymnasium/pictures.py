@@ -7,7 +7,7 @@ import numpy as np
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.viewers.offscreen import Renderer, choose_backend
+from bounce_mjx.viewers.offscreen import Renderer
 
 WIDTH, HEIGHT = 640, 480
 """Default size of a picture, pixels."""
@@ -29,7 +29,7 @@ class Pictures:
         for name, value in (("width", width), ("height", height)):
             if not isinstance(value, int) or not 1 <= value <= 4096:
                 raise UserError(f"{name} is {value!r}, but must be a whole number from 1 to 4096")
-        self._settings = (width, height, choose_backend(), camera)
+        self._settings = (width, height, camera)
         self._renderer: Renderer | None = None
         self._open(task)
 
@@ -37,7 +37,7 @@ class Pictures:
         """The picture [height, width, 3], uint8, of generalised positions [nq] and commands."""
         if self._renderer is None:
             self._open(task)
-        return np.ascontiguousarray(self._renderer.render(qpos, command))
+        return self._renderer.render(qpos, command)
 
     def close(self) -> None:
         """Frees the renderer."""

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from bounce_mjx.adapters.opengl import choose_opengl
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env import state as core
@@ -22,6 +21,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.viewers.offscreen import choose_opengl
 
 with needed("MuJoCo Playground", "playground"):
     silence_mjx()
