@@ -20,11 +20,7 @@ from bounce_mjx.env.state import State
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.episodes import (
-    make_evaluator,
-    make_reporting_evaluator,
-    reset_episodes,
-)
+from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
@@ -615,7 +611,7 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     assert env.backend == "fused"
     key = jax.random.key(31)
     shares, shares_on_c = [], []
-    fused = flat(make_reporting_evaluator(env, networks, 8, shares.append)(random_policy, key))
+    fused = flat(make_evaluator(env, networks, 8, shares.append)(random_policy, key))
     mujoco = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)(random_policy, key)
     mujoco = flat(mujoco)
     assert shares == shares_on_c == [1.0], "each second of simulated time is reported"

@@ -25,7 +25,7 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -107,9 +107,9 @@ def save_config(run: Path, config: TrainConfig) -> None:
     write_atomically(run / CONFIG_FILE, dump_config(config))
 
 
-def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
-    """Folders of a run's seeds."""
-    return [run / f"seed_{seed:03d}" for seed in seeds]
+def seed_folder(run: Path, seed: int) -> Path:
+    """Folder of a run's seed."""
+    return run / f"seed_{seed:03d}"
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
