@@ -54,6 +54,7 @@ def main(args: Sequence[str]) -> None:
     with no_garbage_collection():
         from bounce_mjx.env.env import Env
         from bounce_mjx.robot.adopt import adopt
+        from bounce_mjx.runs.files import writable, write_output
         from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax()
@@ -73,7 +74,10 @@ def main(args: Sequence[str]) -> None:
         console.print(line, markup=False)
     console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
-    write_config(out, values, command.mjcf, adoption)
+    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    with writable(out, "--out"):
+        write_output(out, f"# {on_one_line(head)}\n{text}")
     console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
     if command.view:
         # The viewers import seconds of libraries.
@@ -121,20 +125,3 @@ def described(adoption: "Adoption") -> list[str]:
             f"kv {servo.damping:.4g}, {limit_words(servo.force_limit)}"
         )
     return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]
-
-
-def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adoption") -> None:
-    """Writes the YAML file of an adopted arm.
-
-    Raises:
-      UserError: the file cannot be written.
-    """
-    from bounce_mjx.runs.files import writable, write_output
-
-    site = adoption.config.site
-    head = f"An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}"
-    text = f"# {on_one_line(head)}\n" + yaml.safe_dump(
-        values, sort_keys=False, default_flow_style=None, width=100
-    )
-    with writable(out, "--out"):
-        write_output(out, text)

@@ -61,7 +61,10 @@ class Reporter:
           seconds: duration of the block.
           metrics: each [seeds, iterations]; NaN is ignored.
         """
-        means = {name: _finite_mean(values) for name, values in metrics.items()}
+        means = {
+            name: np.ma.masked_invalid(values).mean(axis=1).filled(math.nan)
+            for name, values in metrics.items()
+        }
         # A sum, because a mean would hide a single event in many iterations.
         non_finite = np.nansum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
@@ -156,14 +159,6 @@ class Reporter:
 def say(console: Console, line: str) -> None:
     """Prints a line unchanged: rich would read square brackets in a path as markup."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _finite_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the finite values of each row; NaN where there is none."""
-    finite = np.isfinite(values)
-    number = finite.sum(axis=1)
-    total = np.where(finite, values, 0.0).sum(axis=1)
-    return np.where(number > 0, total / np.maximum(number, 1), math.nan)
 
 
 def _mean_and_deviation(values: np.ndarray, form: str) -> str:
