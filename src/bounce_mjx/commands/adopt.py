@@ -60,11 +60,10 @@ def main(args: Sequence[str]) -> None:
     set_up_jax()
     task = find_task(command.task)
     console = Console(soft_wrap=True, highlight=False)
-    default = WorldConfig()
-    paddle = command.paddle
-    fixed = not {"position", "quaternion"}.isdisjoint(paddle.model_dump(exclude_defaults=True))
-    robot = RobotConfig(site=command.site, joints=command.joints, paddle=paddle)
-    adoption = adopt(command.mjcf, robot, default.control_dt, fixed)
+    given = command.paddle.model_dump(exclude_defaults=True)
+    fixed = not {"position", "quaternion"}.isdisjoint(given)
+    robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
+    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, fixed)
     values = {"env": env_values(command.mjcf, adoption, task.Config)}
     if command.task != DEFAULT:
         values = {"task": command.task, **values}
@@ -76,7 +75,7 @@ def main(args: Sequence[str]) -> None:
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-    with writable(out, "--out"):
+    with writable(out, "choose another --out"):
         write_output(out, f"# {on_one_line(head)}\n{text}")
     console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
     if command.view:

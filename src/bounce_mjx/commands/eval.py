@@ -83,7 +83,7 @@ def main(args: Sequence[str]) -> None:
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
-        with writable(command.json_file, "--json"):
+        with writable(command.json_file, "give another file with --json"):
             write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
 

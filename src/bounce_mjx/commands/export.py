@@ -46,6 +46,6 @@ def main(args: Sequence[str]) -> None:
         if path is None:
             continue
         content = export(checkpoint)
-        with writable(path, flag):
+        with writable(path, f"give another file with {flag}"):
             write_output(path, content)
         console.out(f"written: {path} ({len(content) / 1000:.0f} kB)", highlight=False)

@@ -52,7 +52,7 @@ def main(args: Sequence[str]) -> None:
     for name, figure in drawn.items():
         for suffix in command.formats:
             path = command.out / f"{name}.{suffix}"
-            with writable(path, "--out"):
+            with writable(path, "choose another folder with --out"):
                 command.out.mkdir(parents=True, exist_ok=True)
                 write_output(path, figures.image(figure, suffix))
             print(path)

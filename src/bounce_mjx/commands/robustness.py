@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
     shipped = checkpoint.run in map(resource_path, SHIPPED.values())
     out = command.out or (Path("robustness") if shipped else checkpoint.run)
     # Fails before the measurement if its results could not be written.
-    with writable(out, "--out"):
+    with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
     options = EvaluationOptions(command.episodes, command.seed, command.physics)
     with Progress(console=console, transient=True) as bar:
@@ -95,7 +95,7 @@ def main(args: Sequence[str]) -> None:
     files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}
     for name, content in files.items():
-        with writable(out, "--out"):
+        with writable(out, "choose another folder with --out"):
             write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
     sys.exit(0 if report.passed else 1)

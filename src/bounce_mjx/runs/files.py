@@ -73,8 +73,11 @@ def write_output(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def writable(path: Path, flag: str) -> Iterator[None]:
-    """Around the writing of what the user named with a flag.
+def writable(path: Path, advice: str) -> Iterator[None]:
+    """Around the writing of what the user named.
+
+    Args:
+      advice: the end of the error, such as "choose another --out".
 
     Raises:
       UserError: it cannot be written.
@@ -82,9 +85,7 @@ def writable(path: Path, flag: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be written ({error.strerror}); choose another {flag}"
-        ) from error
+        raise UserError(f"{path} cannot be written ({error.strerror}); {advice}") from error
 
 
 def check_output(path: Path | None, flag: str) -> None:

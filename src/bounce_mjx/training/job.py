@@ -26,6 +26,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
@@ -153,9 +154,7 @@ class _Job:
         if self.resumed:
             self._resume()
         if hosts.is_leader():
-            for folder, own in self._configs().items():
-                if self.resumed or folder != self.run:
-                    _write_config(folder, own)
+            self._write_configs()
         mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
@@ -198,6 +197,14 @@ class _Job:
     def _configs(self) -> dict[Path, TrainConfig]:
         """The config of each folder: the run's, and with several seeds, those of the seeds."""
         return {self.run: self.config} | {member.run: member.config for member in self.members}
+
+    def _write_configs(self) -> None:
+        for folder, config in self._configs().items():
+            # A new run has its own config.
+            if self.resumed or folder != self.run:
+                with writable(folder, "make room there or make it writable"):
+                    folder.mkdir(exist_ok=True)
+                    folders.save_config(folder, config)
 
     def _resume(self) -> None:
         folders.check_links(self.run)
@@ -528,16 +535,6 @@ def _wait_until_saved(
             time.sleep(RETRY_SECONDS)
             writer.retry()
     reporter.saving_problem(None)
-
-
-def _write_config(run: Path, config: TrainConfig) -> None:
-    try:
-        run.mkdir(exist_ok=True)
-        folders.save_config(run, config)
-    except OSError as error:
-        raise UserError(
-            f"{run} cannot be written ({error.strerror}); make room there or make it writable"
-        ) from error
 
 
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: folders.Checkpoint) -> Progress:
