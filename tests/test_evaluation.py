@@ -632,7 +632,7 @@ def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
     reports; without a simulation."""
     seen, reports = [], []
 
-    def make_evaluator(env, networks, episodes):
+    def make_evaluator(env, networks, episodes, progress):
         def evaluate(policy, key, ranges):
             start = reset_episodes(env, key, episodes, ranges)
             state = jax.tree.map(lambda x: x[..., 0], start.pipeline_state)
