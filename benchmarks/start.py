@@ -51,7 +51,7 @@ MODULES = (
     "bounce_mjx.commands.train",
     "bounce_mjx.training.job",
     "bounce_mjx.training.ppo_trainer",
-    "bounce_mjx.training.report",
+    "bounce_mjx.reports.page",
     "jax.experimental.pallas.mosaic_gpu",
     "orbax.checkpoint",
     "tensorboardX",

@@ -33,6 +33,6 @@ def listen(event: str, arguments: tuple) -> None:
 
 sys.addaudithook(listen)
 try:
-    main()
+    main(sys.argv[1:])
 finally:
     Path(os.environ["TIMED_TRAIN_EVENTS"]).write_text(json.dumps(events), encoding="utf-8")

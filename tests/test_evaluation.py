@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
 import pytest
 from rich.console import Console
 
@@ -20,11 +21,7 @@ from bounce_mjx.env.state import State
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.episodes import (
-    make_evaluator,
-    make_reporting_evaluator,
-    reset_episodes,
-)
+from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
@@ -320,7 +317,7 @@ def test_nothing_to_measure_fails(result, changes, env):
     assert (apex_error is None) == (result == HEIGHT)
     plain = json.loads(json.dumps(report.to_dict(), allow_nan=False))
     assert plain["results"][result]["value"] is None
-    assert Report.from_dict(plain) == report
+    assert pydantic.TypeAdapter(Report).validate_python(plain) == report
 
 
 def test_nothing_to_measure_is_shown_as_a_dash(env):
@@ -615,7 +612,7 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     assert env.backend == "fused"
     key = jax.random.key(31)
     shares, shares_on_c = [], []
-    fused = flat(make_reporting_evaluator(env, networks, 8, shares.append)(random_policy, key))
+    fused = flat(make_evaluator(env, networks, 8, shares.append)(random_policy, key))
     mujoco = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)(random_policy, key)
     mujoco = flat(mujoco)
     assert shares == shares_on_c == [1.0], "each second of simulated time is reported"
@@ -635,7 +632,7 @@ def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
     reports; without a simulation."""
     seen, reports = [], []
 
-    def make_evaluator(env, networks, episodes):
+    def make_evaluator(env, networks, episodes, progress):
         def evaluate(policy, key, ranges):
             start = reset_episodes(env, key, episodes, ranges)
             state = jax.tree.map(lambda x: x[..., 0], start.pipeline_state)

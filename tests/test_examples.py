@@ -54,7 +54,7 @@ from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.command import TrainingCommand, config_of, read_command
 
-config = config_of(read_command(TrainingCommand, sys.argv[1:], prog="train", description=""))
+config = config_of(read_command(TrainingCommand, sys.argv[1:], prog="train"))
 layers = {"hidden_layers": load_run_config(pretrained_checkpoint().run).ppo.hidden_layers}
 config = config.model_copy(update={"ppo": config.ppo.model_copy(update=layers)})
 run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())

@@ -28,6 +28,7 @@ from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.reports import page as report_page
 from bounce_mjx.reports.curves import Group, group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
     curves_figure,
@@ -41,8 +42,7 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
-from bounce_mjx.training import report as training_report
-from bounce_mjx.training.log import Logs, WandbLog, open_log
+from bounce_mjx.training.log import WandbLog, open_log
 
 TERMS = term_names(BounceReward)
 CURVES = (
@@ -421,7 +421,7 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
     def fail(*_):
         raise RuntimeError("no\nfonts")
 
-    monkeypatch.setattr(training_report, "write_report", fail)
+    monkeypatch.setattr(report_page, "write_report", fail)
     train_command.main([*TINY, "--total-steps", "128", "--log-dir", str(tmp_path)])
     (run,) = tmp_path.iterdir()
     assert json.loads((run / "results.json").read_text())["trained_steps"] == 128
@@ -488,7 +488,7 @@ class FakeWandb:
 def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
     config = TrainConfig(seed=7)
-    log = Logs([open_log(tmp_path), WandbLog(tmp_path, "bounce", config)])
+    log = open_log(tmp_path, config=config, wandb="bounce")
     log.add_scalar("episode/return", 2.5, 64)
     log.add_text("results", "| a |", 64)
     log.close()

@@ -531,7 +531,7 @@ def from_variable(self, state, action, *args):
 Env.step = from_variable
 entropy = Gaussian.entropy
 Gaussian.entropy = lambda self: LOSS * entropy(self)
-main()
+main(sys.argv[1:])
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
 """

@@ -390,16 +390,16 @@ def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
 
 PEER = """
 import sys, time
-from bounce_mjx.training.peers import Address, Peers
+from bounce_mjx.training.peers import Peers
 import os
-index, port, token = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+index, port, token = int(sys.argv[1]), sys.argv[2], sys.argv[3]
 peers = Peers(index, 3, 2.0, lambda: "start it again", os._exit)
 if index == 0:
     address, server = peers.listen()
-    print("address", *address, flush=True)
-    peers.accept(server, address.token)
+    print("address", address, flush=True)
+    peers.accept(server)
 else:
-    peers.connect("127.0.0.1", Address(port, token))
+    peers.connect("127.0.0.1", f"{port} {token}")
 print("values", peers.exchange({"from": index}), flush=True)
 time.sleep(60)
 """
@@ -432,10 +432,10 @@ def test_the_death_of_a_process_ends_the_others_with_a_sentence(tmp_path: Path, 
 def test_a_stranger_cannot_join_the_training():
     peers = Peers(0, 2, 5.0, lambda: "", os._exit)
     address, server = peers.listen()
-    accepting = threading.Thread(target=peers.accept, args=(server, address.token))
+    accepting = threading.Thread(target=peers.accept, args=(server,))
     accepting.start()
     for words in (b"GET / HTTP/1.0\r\n\r\n", b'{"token": "guess", "index": 1, "host": "me"}\n'):
-        with socket.create_connection(("127.0.0.1", address.port)) as stranger:
+        with socket.create_connection(("127.0.0.1", int(address.split()[0]))) as stranger:
             stranger.sendall(words)
             assert stranger.recv(1) == b""
     assert accepting.is_alive()

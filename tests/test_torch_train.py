@@ -29,7 +29,7 @@ from bounce_mjx.runs.config import load_config
 from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint, latest_checkpoint
 from bounce_mjx.runs.reading import load_policy
 from bounce_mjx.tasks.bounce_ball import BounceBall
-from bounce_mjx.training import command as training_command
+from bounce_mjx.training import run_command
 from tiny_runs import arrays
 
 SCRIPT = Path(__file__).parent.parent / "train_torch.py"
@@ -191,7 +191,7 @@ def test_stopped_run_has_the_model_of_its_checkpoint(tmp_path, monkeypatch):
 
     monkeypatch.setattr(TorchTrainer, "run", stop)
     # The process would end there.
-    monkeypatch.setattr(training_command, "leave", sys.exit)
+    monkeypatch.setattr(run_command, "leave", sys.exit)
     flags = [*TINY, "--block-steps", "128", "--log-dir", str(tmp_path)]
     for steps in (64, 128):
         with pytest.raises(SystemExit) as exit_info:
@@ -270,7 +270,7 @@ import sys
 sys.modules[{missing!r}] = None
 sys.argv = ["train_torch.py"] + {["--library", library, *TINY]!r}
 from bounce_mjx.commands.train_torch import main
-main()
+main(sys.argv[1:])
 """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path

@@ -1,7 +1,6 @@
 """Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
 
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +12,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, exit_on_user_error, on_one_line
+from bounce_mjx.errors import exit_on_user_error, on_one_line
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
@@ -28,7 +27,7 @@ DEFAULT_SITE = "attachment_site"
 
 
 class AdoptCommand(StrictModel):
-    """The command line."""
+    """Finds the start pose and the servos of an arm, and writes its config."""
 
     mjcf: Annotated[Path, tyro.conf.Positional]
     """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
@@ -48,47 +47,42 @@ class AdoptCommand(StrictModel):
 
 
 @interruptible
-def main(args: Sequence[str] | None = None) -> None:
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error():
-        command = parse(
-            AdoptCommand,
-            sys.argv[1:] if args is None else args,
-            prog="bounce-mjx adopt",
-            description="Finds the start pose and the servos of an arm, and writes its config.",
-        )
-        with no_garbage_collection():
-            from bounce_mjx.env.env import Env
-            from bounce_mjx.robot.adopt import adopt
-            from bounce_mjx.training.setup import set_up_jax
+    command = parse(AdoptCommand, args, prog="bounce-mjx adopt")
+    with no_garbage_collection():
+        from bounce_mjx.env.env import Env
+        from bounce_mjx.robot.adopt import adopt
+        from bounce_mjx.runs.files import writable, write_output
+        from bounce_mjx.training.setup import set_up_jax
 
-        set_up_jax()
-        task = find_task(command.task)
-        console = Console(soft_wrap=True, highlight=False)
-        default = WorldConfig()
-        paddle = command.paddle
-        fixed = (paddle.position, paddle.quaternion) != (
-            PaddleConfig().position,
-            PaddleConfig().quaternion,
-        )
-        robot = RobotConfig(site=command.site, joints=command.joints, paddle=paddle)
-        adoption = adopt(command.mjcf, robot, default.control_dt, fixed)
-        values = {"env": env_values(command.mjcf, adoption, task.Config)}
-        if command.task != DEFAULT:
-            values = {"task": command.task, **values}
-        config = validate(train_config(task), values, str(command.mjcf))
-        env = Env(config.env)
-        for line in described(adoption):
-            console.print(line, markup=False)
-        console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
-        out = command.out or Path(f"{command.mjcf.stem}.yaml")
-        write_config(out, values, command.mjcf, adoption)
-        console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
-        if command.view:
-            # The viewers import seconds of libraries.
-            from bounce_mjx.commands import view
+    set_up_jax()
+    task = find_task(command.task)
+    console = Console(soft_wrap=True, highlight=False)
+    given = command.paddle.model_dump(exclude_defaults=True)
+    fixed = not {"position", "quaternion"}.isdisjoint(given)
+    robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
+    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, fixed)
+    values = {"env": env_values(command.mjcf, adoption, task.Config)}
+    if command.task != DEFAULT:
+        values = {"task": command.task, **values}
+    config = validate(train_config(task), values, str(command.mjcf))
+    env = Env(config.env)
+    for line in described(adoption):
+        console.print(line, markup=False)
+    console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
+    out = command.out or Path(f"{command.mjcf.stem}.yaml")
+    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    with writable(out, "choose another --out"):
+        write_output(out, f"# {on_one_line(head)}\n{text}")
+    console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
+    if command.view:
+        # The viewers import seconds of libraries.
+        from bounce_mjx.commands import view
 
-            view.main(["--robot", str(out), "--actions", "zero"])
+        view.main(["--robot", str(out), "--actions", "zero"])
 
 
 def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:
@@ -130,24 +124,3 @@ def described(adoption: "Adoption") -> list[str]:
             f"kv {servo.damping:.4g}, {limit_words(servo.force_limit)}"
         )
     return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]
-
-
-def write_config(out: Path, values: dict[str, Any], mjcf: Path, adoption: "Adoption") -> None:
-    """Writes the YAML file of an adopted arm.
-
-    Raises:
-      UserError: the file cannot be written.
-    """
-    from bounce_mjx.runs.files import write_atomically
-
-    site = adoption.config.site
-    head = f"An arm with a paddle: bounce-mjx adopt {mjcf} --site {site}"
-    text = f"# {on_one_line(head)}\n" + yaml.safe_dump(
-        values, sort_keys=False, default_flow_style=None, width=100
-    )
-    try:
-        write_atomically(out, text)
-    except OSError as error:
-        raise UserError(
-            f"{out} cannot be written ({error.strerror}); choose another --out"
-        ) from error

@@ -1,6 +1,5 @@
 """Shows a trained policy: `bounce-mjx play [CHECKPOINT]`."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -8,14 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import RunOptions, parse_with_commands
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.commands.run_options import RunCommand, parse_with_commands
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -26,8 +23,8 @@ if TYPE_CHECKING:
     from bounce_mjx.viewers.show import Shown
 
 
-class PlayCommand(StrictModel):
-    """The command line."""
+class PlayCommand(RunCommand):
+    """Shows a trained policy, or several side by side."""
 
     checkpoints: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
@@ -37,49 +34,39 @@ class PlayCommand(StrictModel):
     """Physics engine; config is the engine of the training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
-    of_run: Annotated[RunOptions, tyro.conf.arg(name="")] = RunOptions()
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
 @interruptible
-def main(args: Sequence[str] | None = None) -> None:
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error():
-        command, flags = parse_with_commands(
-            PlayCommand,
-            sys.argv[1:] if args is None else args,
-            prog="bounce-mjx play",
-            description="Shows a trained policy, or several side by side.",
-        )
-        if len(command.checkpoints) > MAX_ENVS:
-            raise UserError(
-                f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}"
-            )
-        with no_garbage_collection():
-            from bounce_mjx.runs.folders import choose_checkpoint
-            from bounce_mjx.training.setup import set_up_jax
-            from bounce_mjx.viewers.show import show
+    command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
+    if len(command.checkpoints) > MAX_ENVS:
+        raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    with no_garbage_collection():
+        from bounce_mjx.runs.folders import choose_checkpoint
+        from bounce_mjx.training.setup import set_up_jax
+        from bounce_mjx.viewers.show import show
 
-        console = Console()
-        chosen = [
-            choose_checkpoint(path, command.of_run.folder, console)
-            for path in command.checkpoints or (None,)
-        ]
-        configs = [_config(checkpoint, command) for checkpoint in chosen]
-        (commands, *_) = [flags.values(config.env) for config in configs]
-        join_loops(*(config.env for config in configs))
-        set_up_jax()
-        show(
-            [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
-            command.viewing,
-            commands=commands,
-            console=console,
-        )
+    console = Console()
+    chosen = [
+        choose_checkpoint(path, command.folder, console) for path in command.checkpoints or (None,)
+    ]
+    configs = [_config(checkpoint, command) for checkpoint in chosen]
+    (commands, *_) = [given_commands(config.env) for config in configs]
+    set_up_jax(*(config.env for config in configs))
+    show(
+        [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
+        command.viewing,
+        commands=commands,
+        console=console,
+    )
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the engine and the world that are to be shown."""
-    config = command.of_run.config(checkpoint.run)
+    config = command.config(checkpoint.run)
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization

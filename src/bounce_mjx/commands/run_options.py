@@ -1,11 +1,12 @@
-"""Shared by the commands that show or measure a run: whose run it is, and the task's commands."""
+"""Shared by the commands about a run: whose run it is, and the commands of its task as flags."""
 
-import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from bounce_mjx.config.command_line import flag_of, flags_of, parse
+import tyro
+
+from bounce_mjx.config.command_line import flag_of, flags_of, parse, unknown_argument
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
@@ -16,8 +17,8 @@ from bounce_mjx.world.config import WorldConfig
 CommandT = TypeVar("CommandT", bound=StrictModel)
 
 
-class RunOptions(StrictModel):
-    """Whose run it is."""
+class RunCommand(StrictModel):
+    """A command line about a run."""
 
     task: str | None = None
     """Task of the run. A run of a task in a file, FILE.py:CLASS, needs it, as the file is code."""
@@ -38,14 +39,28 @@ class RunOptions(StrictModel):
         return load_run_config(run, self.task)
 
 
+class PolicyCommand(RunCommand):
+    """A command line about a trained policy."""
+
+    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained or robust. The default is the newest run, or
+    pretrained if there is no run."""
+
+
 def parse_with_commands(
-    command_class: type[CommandT], args: Sequence[str], *, prog: str, description: str
-) -> tuple[CommandT, "CommandFlags"]:
+    command_class: type[CommandT], args: Sequence[str], *, prog: str
+) -> tuple[CommandT, Callable[[WorldConfig], dict[str, float]]]:
     """Reads a command line in which the commands of the run's task are flags too, such as
     `--target-height 0.5` of the task bounce.
 
+    Returns:
+      The command line; and a function of the run's `env` to the given values of its task's commands
+      by name, which raises a UserError for a flag that is not the task's, or a value outside of its
+      limits.
+
     Raises:
-      UserError: a flag has a bad value.
+      UserError: a flag has a bad value, or no task has it.
     """
     known = {*flags_of(command_class), "--help"}
     words, given = [], {}
@@ -59,42 +74,25 @@ def parse_with_commands(
             words.append(word)
     task = early_flag(words, "--task")
     commands = find_task(task or DEFAULT).Config().commands
+    description = command_class.__doc__
     if commands:
         flags = ", ".join(f"{flag_of(name)} {c.unit.upper()}" for name, c in commands.items())
         description += f" The commands of the task {task or DEFAULT} are flags too: {flags}."
+
+    def check(flags: Iterable[str]) -> None:
+        for flag in given.keys() - flags:
+            unknown = unknown_argument(flag, sorted({*known, *flags}))
+            raise UserError(f"{unknown} (see {prog} --help)")
+
+    def values(env: WorldConfig) -> dict[str, float]:
+        flags = {flag_of(name): name for name in env.commands}
+        check(flags.keys())
+        return {
+            flags[flag]: env.commands[flags[flag]].checked(text, flag)
+            for flag, text in given.items()
+        }
+
     # Without --task, the run may be of any registered task.
     tasks = [task] if task else registered_tasks() if given else []
-    possible = {flag_of(name) for task in tasks for name in find_task(task).Config().commands}
-    for flag in given.keys() - possible:
-        raise _unknown(flag, [*known, *possible], prog)
-    command = parse(command_class, words, prog=prog, description=description)
-    return command, CommandFlags(given, sorted(known), prog)
-
-
-class CommandFlags:
-    """Flags that may be the commands of a task, which is known once the run is found."""
-
-    def __init__(self, given: dict[str, str], known: Sequence[str], prog: str):
-        self._given, self._known, self._prog = given, known, prog
-
-    def values(self, env: WorldConfig) -> dict[str, float]:
-        """The given values of the task's commands by name.
-
-        Raises:
-          UserError: a flag is not one of the command's or of the task's, or its value is outside of
-            its limits.
-        """
-        commands = {flag_of(name): (name, command) for name, command in env.commands.items()}
-        values = {}
-        for flag, text in self._given.items():
-            if flag not in commands:
-                raise _unknown(flag, [*self._known, *commands], self._prog)
-            name, command = commands[flag]
-            values[name] = command.checked(text, flag)
-        return values
-
-
-def _unknown(flag: str, known: Sequence[str], prog: str) -> UserError:
-    near = difflib.get_close_matches(flag, known, n=1)
-    advice = f"; did you mean {near[0]}?" if near else ""
-    return UserError(f"unknown argument {flag}{advice} (see {prog} --help)")
+    check({flag_of(name) for task in tasks for name in find_task(task).Config().commands})
+    return parse(command_class, words, prog=prog, description=description), values

@@ -1,6 +1,5 @@
 """Trains a policy in JAX and writes a run's folder (`bounce-mjx train`)."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -12,23 +11,15 @@ from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import (
-    TrainingCommand,
-    asks_for_help,
-    config_of,
-    early_flag,
-    run_command,
-)
+from bounce_mjx.training.command import TrainingCommand, config_of, early_flag
 from bounce_mjx.training.command import read_command as read
-from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
 PROG = "bounce-mjx train"
 
 
 class TrainCommand(TrainingCommand):
-    """The command line: the config's keys as flags, the preset or run to start from, and other
-    hosts."""
+    """Trains a policy; by default, one that keeps the ball bouncing."""
 
     distributed: bool = False
     """Train together with the same command on other hosts, started by Slurm, Open MPI or
@@ -52,23 +43,22 @@ class TrainCommand(TrainingCommand):
     counts as dead."""
 
 
-def main(args: Sequence[str] | None = None) -> None:
+def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    args = sys.argv[1:] if args is None else args
-    several_hosts = _hosts(args)
+    several_hosts, known_engines = _hosts(args), ()
     with exit_on_user_error(), interruptible_imports():
-        if several_hosts is None or asks_for_help(args):
+        if several_hosts is None:
             command = read_command(args, default_preset(has_plugin()))
-            join_loops(command.env)
-    with interruptible_imports():
+            known_engines = (command.env,)
         from bounce_mjx.training.setup import find_devices, set_up_jax
 
-        set_up_jax()
+        set_up_jax(*known_engines)
         if several_hosts is None:
             # CUDA starts beside the imports.
             find_devices()
-        from bounce_mjx.training import hosts, job  # noqa: F401
+        from bounce_mjx.training import hosts
         from bounce_mjx.training.ppo_trainer import PPOTrainer
+        from bounce_mjx.training.run_command import run_command
 
     with hosts.leave_at_once(), exit_on_user_error():
         if several_hosts is not None:
@@ -76,30 +66,28 @@ def main(args: Sequence[str] | None = None) -> None:
             hosts.join(*several_hosts)
         if several_hosts is not None or has_plugin() != has_accelerator():
             command = read_command(args)
-        hosts.agree(config_of(command), command.resume)
-        if not command.watch or not hosts.is_leader():
-            run_command(command, PPOTrainer, PROG)
-            return
-        # Only a training that is watched pays for this import.
-        from bounce_mjx.viewers.watch import TrainingPage
+        page = None
+        if command.watch and hosts.is_leader():
+            # Only a training that is watched pays for this import.
+            from bounce_mjx.viewers.watch import TrainingPage
 
-        address = command.watch_host, command.watch_port
-        page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
+            address = command.watch_host, command.watch_port
+            page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
         run_command(command, PPOTrainer, PROG, page)
-        page.wait()
-        # A thread that simulates cannot be stopped.
-        leave(0)
+        if page is not None:
+            page.wait()
+            # A thread that simulates cannot be stopped.
+            leave(0)
 
 
 def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
-    description = "Trains a policy; by default, one that keeps the ball bouncing."
-    return read(TrainCommand, args, prog=PROG, description=description, preset=preset)
+    return read(TrainCommand, args, prog=PROG, preset=preset)
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:
     """The address, number of processes, number of this process, and time limit of a training on
-    several hosts; None for a training on one."""
+    several hosts; None for a training on one, and for a command line that asks for help."""
     address = early_flag(args, "--coordinator-address")
     words = [early_flag(args, f) for f in ("--num-processes", "--process-id", "--host-timeout")]
     try:
@@ -111,5 +99,7 @@ def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int
     distributed = early_flag(args, "--distributed")
     wanted = distributed is not None and distributed.lower() != "false"
     if not wanted and all(value is None for value in (address, processes, process)):
+        return None
+    if not {"-h", "--help"}.isdisjoint(args):
         return None
     return address, processes, process, timeout or DEFAULT_TIMEOUT

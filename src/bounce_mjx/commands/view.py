@@ -1,6 +1,5 @@
 """Shows the environment without a policy: `bounce-mjx view`."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,13 +16,12 @@ from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import read_preset, train_config
 from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.training.command import early_flag, path_flag
-from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.world.config import WorldConfig
 
 
 class ViewCommand(StrictModel):
-    """The command line."""
+    """Shows the environment under random, zero or scripted actions."""
 
     actions: Literal["random", "zero", "scripted"] = "random"
     """random: uniform; zero: the servos hold their angles; scripted: the task's own controller."""
@@ -37,39 +35,28 @@ class ViewCommand(StrictModel):
 
 
 @interruptible
-def main(args: Sequence[str] | None = None) -> None:
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    with exit_on_user_error():
-        args = sys.argv[1:] if args is None else args
-        robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
-        env = read_preset(Path("default"), robot, task).env
-        command_class = train_config(env.task, ViewCommand)
-        command = parse(
-            command_class,
-            args,
-            prog="bounce-mjx view",
-            description="Shows the environment under random, zero or scripted actions.",
-            default=command_class(env=env, robot=robot),
-        )
-        with no_garbage_collection():
-            join_loops(command.env)
-            from bounce_mjx.training.setup import set_up_jax
-            from bounce_mjx.viewers.controllers import (
-                make_random_controller,
-                make_scripted_controller,
-                make_zero_controller,
-            )
-            from bounce_mjx.viewers.show import Shown, show
+    robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
+    env = read_preset(Path("default"), robot, task).env
+    command_class = train_config(env.task, ViewCommand)
+    command = parse(
+        command_class,
+        args,
+        prog="bounce-mjx view",
+        default=command_class(env=env, robot=robot),
+    )
+    with no_garbage_collection():
+        from bounce_mjx.training.setup import set_up_jax
+        from bounce_mjx.viewers import controllers
+        from bounce_mjx.viewers.show import Shown, show
 
-        controllers = {
-            "random": make_random_controller,
-            "zero": make_zero_controller,
-            "scripted": make_scripted_controller,
-        }
-        set_up_jax()
-        show(
-            [Shown(command.env, controllers[command.actions], f"{command.actions} actions")],
-            command.viewing,
-            commands={},
-            console=Console(),
-        )
+    make_controller = {
+        "random": controllers.make_random_controller,
+        "zero": controllers.make_zero_controller,
+        "scripted": controllers.make_scripted_controller,
+    }
+    set_up_jax(command.env)
+    shown = Shown(command.env, make_controller[command.actions], f"{command.actions} actions")
+    show([shown], command.viewing, commands={}, console=Console())

@@ -4,7 +4,7 @@ import difflib
 import itertools
 import sys
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import pydantic
@@ -26,12 +26,13 @@ def parse(
     args: Sequence[str],
     *,
     prog: str,
-    description: str,
+    description: str | None = None,
     default: CommandT | None = None,
 ) -> CommandT:
     """Reads a command line into a config.
 
     Args:
+      description: what the command does; by default, the type's docstring.
       default: values for the flags that are not given; by default, the type's own default values.
 
     Raises:
@@ -104,11 +105,7 @@ def _mistake(
     event: tyro_errors.ParseErrorEvent, command_class: type[pydantic.BaseModel], args: Sequence[str]
 ) -> str:
     if isinstance(event, tyro_errors.UnrecognizedArgs):
-        given = event.tokens[0].split("=")[0].replace("_", "-")
-        near = difflib.get_close_matches(given, flags_of(command_class), n=1)
-        return f"unknown argument {event.tokens[0]}" + (
-            f"; did you mean {near[0]}?" if near else ""
-        )
+        return unknown_argument(event.tokens[0], flags_of(command_class))
     invalid = _validation_error()
     if invalid is not None:
         return _bad_value(invalid, command_class)
@@ -118,6 +115,12 @@ def _mistake(
     flag = (argument.lowered.name_or_flags or [argument.field.extern_name])[0]
     wanted = (argument.lowered.metavar or "no value").removeprefix("{None}|")
     return f"{flag} takes {wanted}, but was given {_given(args, flag) or 'nothing'}"
+
+
+def unknown_argument(word: str, flags: Iterable[str]) -> str:
+    """A word of a command line that is none of the flags, as part of an error."""
+    near = difflib.get_close_matches(word.split("=")[0].replace("_", "-"), flags, n=1)
+    return f"unknown argument {word}" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
 from bounce_mjx.physics import (
-    Control,
     PhysicsParameters,
     PhysicsState,
     edited_model,
@@ -52,7 +50,8 @@ def make_mujoco_evaluator(
     def decide(policy, states):
         actions = act(networks, policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
-        return actions, states, _control_inputs(env, control)
+        targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
+        return actions, states, targets, control.ball_push, control.air_drag
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -68,10 +67,11 @@ def make_mujoco_evaluator(
         statistics = empty_statistics(env, states)
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, states, inputs = decide(policy, states)
-                inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
-                simulated[:, ball_velocity] += inputs.ball_push
-                simulated = _next_states(pool, models, data, simulated, inputs)
+                actions, states, *inputs = decide(policy, states)
+                targets, push, air_drag = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
+                if push is not None:
+                    simulated[:, ball_velocity] += push.T
+                simulated = _next_states(pool, models, data, simulated, targets, air_drag)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
                 if step % 100 < 99:
@@ -85,43 +85,31 @@ def make_mujoco_evaluator(
     return evaluate
 
 
-class _Inputs(NamedTuple):
-    """Inputs of MuJoCo over one control step of N episodes."""
-
-    targets: np.ndarray
-    """Servo targets [N, substeps, nu]."""
-    ball_push: np.ndarray
-    """Velocities [N, 3] that pushes add to the balls, m/s."""
-    air_drag: np.ndarray | None
-    """Deceleration [N] of the balls by the air divided by their squared speed, 1/m."""
-
-
-def _control_inputs(env: Env, control: Control) -> _Inputs:
-    """Inputs from controls whose batch is last."""
-    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-    push = jnp.zeros((len(targets), 3)) if control.ball_push is None else control.ball_push.T
-    return _Inputs(targets, push, control.air_drag)
-
-
 def _next_states(
     pool: rollout.Rollout,
     models: list[mujoco.MjModel],
     data: list[mujoco.MjData],
     states: np.ndarray,
-    inputs: _Inputs,
+    targets: np.ndarray,
+    air_drag: np.ndarray | None,
 ) -> np.ndarray:
-    """States [N, size] after one control step. The drag needs the velocity in each physics step."""
-    if inputs.air_drag is None:
-        trajectory, _ = pool.rollout(models, data, states, inputs.targets, control_spec=_CTRL)
+    """States [N, size] after one control step. The drag needs the velocity in each physics step.
+
+    Args:
+      targets: servo targets [N, substeps, nu].
+      air_drag: deceleration [N] of the balls by the air divided by their squared speed, 1/m.
+    """
+    if air_drag is None:
+        trajectory, _ = pool.rollout(models, data, states, targets, control_spec=_CTRL)
         return trajectory[:, -1]
     ball, ball_velocity = find_addresses(models[0]).ball_body, _ball_velocity(models[0])
-    drag = inputs.air_drag * [model.body_mass[ball] for model in models]
+    drag = air_drag * [model.body_mass[ball] for model in models]
     forces = np.zeros((len(states), models[0].nbody, 6))
-    for targets in np.moveaxis(inputs.targets, 1, 0):
+    for target in np.moveaxis(targets, 1, 0):
         velocity = states[:, ball_velocity]
         speed = np.linalg.norm(velocity, axis=1)
         forces[:, ball, :3] = -(drag * speed)[:, None] * velocity
-        control = np.concatenate([targets, forces.reshape(len(states), -1)], axis=1)[:, None]
+        control = np.concatenate([target, forces.reshape(len(states), -1)], axis=1)[:, None]
         trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
         states = trajectory[:, 0]
     return states

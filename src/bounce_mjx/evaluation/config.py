@@ -2,6 +2,8 @@
 
 from typing import Literal, NamedTuple
 
+from bounce_mjx.world.config import WorldConfig
+
 DEFAULT_EPISODES = 1024
 DEFAULT_SEED = 20_000
 """Seed of the resets; a training evaluates with a different one."""
@@ -11,6 +13,11 @@ DEFAULT_CONDITION_EPISODES = 64
 
 Physics = Literal["config", "fused", "mjx", "mujoco"]
 """Engine of an evaluation: "mujoco" is MuJoCo's C engine, "config" the choice in the config."""
+
+
+def on_engine(env: WorldConfig, physics: Physics) -> WorldConfig:
+    """The settings of an environment with an evaluation's choice of the engine."""
+    return env.model_copy(update={"physics": physics}) if physics in ("fused", "mjx") else env
 
 
 class EvaluationOptions(NamedTuple):

@@ -26,17 +26,43 @@ class _UnderWay(NamedTuple):
     """Control steps so far [], int32."""
 
 
-def make_evaluator(env: Env, networks: Networks, episodes: int) -> Callable[..., Statistics]:
-    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
-    each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
-    limit is reached. The ranges are optional.
+def make_evaluator(
+    env: Env,
+    networks: Networks,
+    episodes: int,
+    progress: Callable[[float], None] | None = None,
+) -> Callable[..., Statistics]:
+    """A function (policy, key, ranges) -> statistics of `episodes` deterministic episodes, each
+    from its own reset (`reset_episodes`). It stops when all episodes have ended or their time limit
+    is reached. The ranges are optional.
+
+    Args:
+      progress: called every second of simulated time with the share of the time limit that is
+        simulated; without it, the function is one jitted program.
     """
-    recording_evaluator = make_recording_evaluator(env, networks, episodes, recorded=0)
+    if progress is None:
+        measure = make_recording_evaluator(env, networks, episodes, recorded=0)
+        return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
+
+    @jax.jit
+    def start(key: jax.Array, ranges: Ranges | None) -> _UnderWay:
+        return _begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
+
+    @jax.jit
+    def go_on(policy: Policy, now: _UnderWay, last_step: jax.Array) -> _UnderWay:
+        return _run_until(env, networks, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
-        return recording_evaluator(policy, key, ranges)[0]
+        now, limit = start(key, ranges), env.config.episode_steps
+        second = max(1, round(1.0 / env.dt))
+        for done in range(0, limit, second):
+            now = go_on(policy, now, np.int32(min(done + second, limit)))
+            if not np.any(now.statistics.running):
+                break
+            progress(min(1.0, (done + second) / limit))
+        return now.statistics
 
-    return jax.jit(evaluate)
+    return evaluate
 
 
 def make_recording_evaluator(
@@ -116,30 +142,3 @@ def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | Non
     keys = jax.random.split(key, each)[index % each]
     ranges = jax.tree.map(lambda end: jnp.asarray(end)[index // each], ranges)
     return jax.vmap(env.reset, out_axes=-1)(keys, ranges)
-
-
-def make_reporting_evaluator(
-    env: Env, networks: Networks, episodes: int, progress: Callable[[float], None]
-) -> Callable[..., Statistics]:
-    """Like `make_evaluator`, but calls `progress` every second of simulated time with the share of
-    the time limit that is simulated."""
-
-    @jax.jit
-    def start(key: jax.Array, ranges: Ranges | None) -> _UnderWay:
-        return _begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
-
-    @jax.jit
-    def go_on(policy: Policy, now: _UnderWay, last_step: jax.Array) -> _UnderWay:
-        return _run_until(env, networks, policy, now, last_step)
-
-    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
-        now, limit = start(key, ranges), env.config.episode_steps
-        second = max(1, round(1.0 / env.dt))
-        for done in range(0, limit, second):
-            now = go_on(policy, now, np.int32(min(done + second, limit)))
-            if not np.any(now.statistics.running):
-                break
-            progress(min(1.0, (done + second) / limit))
-        return now.statistics
-
-    return evaluate

@@ -1,6 +1,5 @@
 """The results of a policy, on any engine."""
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,8 +8,8 @@ import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions
-from bounce_mjx.evaluation.episodes import make_evaluator, make_reporting_evaluator
+from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
+from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.config import PPOConfig
@@ -55,10 +54,7 @@ def evaluate_policy(
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
-    if progress is not None:
-        make = make_mujoco_evaluator if on_c else make_reporting_evaluator
-        make = functools.partial(make, progress=progress)
-    evaluate = make(env, networks, options.episodes)
+    evaluate = make(env, networks, options.episodes, progress)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
     key = jax.random.PRNGKey(options.seed)
     statistics = evaluate(policy, key, ranges if commands else None)
@@ -80,9 +76,7 @@ def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:
         # Nothing is left to change within an episode.
         constant = {"command_interval": None}
         changes["randomization"] = env.randomization.model_copy(update=constant)
-    if options.physics in ("fused", "mjx"):
-        changes["physics"] = options.physics
-    return env.model_copy(update=changes)
+    return on_engine(env.model_copy(update=changes), options.physics)
 
 
 def _commands(env: WorldConfig, options: EvaluationOptions) -> dict[str, tuple[float, float]]:

@@ -63,11 +63,6 @@ class Report:
         met = sum(result.passed is not False for result in self.results)
         return not self.screening, met, self.margin, self.details["mean_return"]
 
-    @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> "Report":
-        """The inverse of `to_dict`; a pydantic.ValidationError for anything else."""
-        return pydantic.TypeAdapter(cls).validate_python(plain)
-
     def to_dict(self) -> dict[str, Any]:
         """The report as plain data for JSON, with null for a missing figure."""
         return {

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import EvaluationOptions, Physics
+from bounce_mjx.evaluation.config import EvaluationOptions, Physics, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import Statistics
@@ -186,10 +186,8 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
                 min(float(np.min(low)) for low, _ in ranges),
                 max(float(np.max(high)) for _, high in ranges),
             )
-    changes = {"randomization": RandomizationConfig(**spans)}
-    if physics in ("fused", "mjx"):
-        changes["physics"] = physics
-    return env.model_copy(update=changes)
+    world = env.model_copy(update={"randomization": RandomizationConfig(**spans)})
+    return on_engine(world, physics)
 
 
 def _given_names(env: Env, conditions: Sequence[Condition]) -> list[str]:

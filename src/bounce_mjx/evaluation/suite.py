@@ -21,24 +21,13 @@ from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
-UNITS = {
-    "": 1.0,
-    "factor": 1.0,
+_CONFIG_UNITS = "factor", "s", "Hz", "m", "m/s", "1/m", "rad", "rad/s", "kg", "N m", "N m s/rad"
+UNITS = dict.fromkeys(("", *_CONFIG_UNITS), 1.0) | {
     "%": 0.01,
-    "s": 1.0,
     "ms": 1e-3,
-    "Hz": 1.0,
-    "m": 1.0,
     "cm": 1e-2,
     "mm": 1e-3,
-    "m/s": 1.0,
-    "1/m": 1.0,
-    "rad": 1.0,
     "deg": math.radians(1.0),
-    "rad/s": 1.0,
-    "kg": 1.0,
-    "N m": 1.0,
-    "N m s/rad": 1.0,
 }
 """Units of strengths, and the factors that convert them to the units of the config."""
 
@@ -188,7 +177,7 @@ def _check_keys(p: Perturbation, known: Sequence[str], source: str) -> None:
     if changes == p.trained_ranges:
         reason = "has both terms and trained_ranges" if changes else "changes nothing"
         raise UserError(f"{source}: it {reason}; give terms, settings or trained_ranges: true")
-    uses = _uses_strength(p.terms) or _uses_strength(p.settings)
+    uses = any(_filled_in(values, 0.0) != values for values in (p.terms, p.settings))
     if uses and not p.strengths:
         raise UserError(f"{source}: it has no strengths; give a list such as strengths: [1, 2]")
     if p.strengths and not uses:
@@ -209,7 +198,7 @@ def _condition(
     scale = UNITS[perturbation.unit]
     value = None if strength is None else strength * scale
     plain = trained.model_copy(update={"randomization": RandomizationConfig()})
-    env = _with_changes(plain, perturbation.settings, value, source)
+    env = _with_changes(plain, _filled_in(perturbation.settings, value), source)
     if perturbation.trained_ranges:
         config = trained.randomization
         n = trained.num_joints
@@ -217,8 +206,8 @@ def _condition(
         ranges |= {name: _shaped(name, n, c.low, c.high) for name, c in trained.commands.items()}
     else:
         ranges = {
-            term: _bounds(term, trained.num_joints, entry, value, source)
-            for term, entry in perturbation.terms.items()
+            term: _bounds(term, trained.num_joints, entry, source)
+            for term, entry in _filled_in(perturbation.terms, value).items()
         }
     _check_limits(env, ranges, source)
     contained = not differing_keys(env, plain) and all(
@@ -227,9 +216,7 @@ def _condition(
     return Condition(perturbation, strength, env, ranges, contained)
 
 
-def _with_changes(
-    env: WorldConfig, settings: dict[str, Any], strength: float | None, source: str
-) -> WorldConfig:
+def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:
     """A config with changed settings."""
     if not settings:
         return env
@@ -244,7 +231,7 @@ def _with_changes(
                 f"{source}: {shorten(name)} is not a setting to perturb; give a key of env, and "
                 "terms of the randomisation under terms"
             )
-        group[key] = _filled_in(value, strength)
+        group[key] = value
     changed = validate(type(env), values, source)
     if changed.layout != env.layout:
         raise UserError(
@@ -279,34 +266,25 @@ def _check_limits(env: WorldConfig, ranges: dict[str, Bounds], source: str) -> N
     validate(type(env), dict(env) | {"randomization": spans}, source)
 
 
-def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, source: str) -> Bounds:
+def _bounds(term: str, num_joints: int, entry: Any, source: str) -> Bounds:
     """Range of a term from its entry in the suite: a value, a list with one value for each entry of
     the term, or a mapping {from, to} of either."""
     size = math.prod(_shape(term, num_joints))
-    ends = [entry, entry]
-    if isinstance(entry, dict):
-        if entry.keys() != {"from", "to"}:
-            raise UserError(f"{source}: {term} has other keys than from and to; give both")
-        ends = [entry["from"], entry["to"]]
-
-    def number(value: Any) -> float:
-        if isinstance(value, str) and value in _SIGNS:
-            return _SIGNS[value] * strength
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-            raise UserError(
-                f"{source}: {term} is {shorten(repr(value))}, but must be a number, strength or "
-                "-strength"
-            )
-        return float(value)
-
-    def numbers(end: Any) -> Any:
-        if not isinstance(end, list):
-            return number(end)
-        if len(end) != size:
-            raise UserError(f"{source}: {term} has {len(end)} values, but must have {size}")
-        return [number(value) for value in end]
-
-    low, high = _shaped(term, num_joints, *map(numbers, ends))
+    ends = entry if isinstance(entry, dict) else {"from": entry, "to": entry}
+    if ends.keys() != {"from", "to"}:
+        raise UserError(f"{source}: {term} has other keys than from and to; give both")
+    for end in ends.values():
+        values = end if isinstance(end, list) else [end]
+        if values is end and len(values) != size:
+            raise UserError(f"{source}: {term} has {len(values)} values, but must have {size}")
+        for value in values:
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not abs(value) < 1e12:
+                raise UserError(
+                    f"{source}: {term} is {shorten(repr(value))}, but must be a number, strength "
+                    "or -strength"
+                )
+    low, high = _shaped(term, num_joints, ends["from"], ends["to"])
     if np.any(low > high):
         raise UserError(f"{source}: {term} is from a value to a lower one; swap from and to")
     return low, high
@@ -314,15 +292,9 @@ def _bounds(term: str, num_joints: int, entry: Any, strength: float | None, sour
 
 def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape; a list of one value also fits a scalar term."""
+    low, high = (np.squeeze(np.asarray(end, np.float64)) for end in (low, high))
     shape = _shape(term, num_joints)
-
-    def shaped(end: Any) -> np.ndarray:
-        array = np.asarray(end, np.float64)
-        return (
-            array.reshape(shape) if array.size == 1 and not shape else np.broadcast_to(array, shape)
-        )
-
-    return shaped(low), shaped(high)
+    return np.broadcast_to(low, shape), np.broadcast_to(high, shape)
 
 
 def _shape(term: str, num_joints: int) -> tuple[int, ...]:
@@ -340,11 +312,3 @@ def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
         return False
     (low, high), tolerance = drawn, 1e-9
     return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))
-
-
-def _uses_strength(values: Any) -> bool:
-    if isinstance(values, dict):
-        return any(map(_uses_strength, values.values()))
-    if isinstance(values, list):
-        return any(map(_uses_strength, values))
-    return isinstance(values, str) and values in _SIGNS

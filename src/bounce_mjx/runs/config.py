@@ -144,9 +144,8 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
         is a file that the user has not named.
     """
     path = run / CONFIG_FILE
-    values = _with_paths_from(run, read_mapping(path, "config file", _EXAMPLE))
-    name = _task_of(values, path)
-    config = validate(train_config(task_of_run(name, run, task)), values, str(path))
+    values = _read(path)
+    config = validate(train_config(task_of_run(values["task"], run, task)), values, str(path))
     if config.env.mjcf is not None:
         check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
     return config
@@ -164,35 +163,32 @@ def load_config(path: Path, robot: Path | None = None, task: str | None = None) 
       UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
         its task is a file that the user has not named.
     """
-    values = _with_paths_from(path.parent, read_mapping(path, "config file", _EXAMPLE))
-    name = task or _task_of(values, path)
+    values = _read(path)
+    name = task or values["task"]
     if task is None and is_file(name):
         raise UserError(
             f"{path} has its task in the file {name}, which is code; name it yourself to run it: "
             f"--task {name}"
         )
     config_class = train_config(find_task(name))
-    values |= {"task": name}
+    values["task"] = name
     if robot is None:
         return validate(config_class, values, str(path))
-    own = read_mapping(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
-    own = _robot_for(config_class, _with_paths_from(robot.parent, own), robot)
+    own = _robot_for(config_class().env.task, robot)
     return validate(config_class, _merged(values, own), f"{path} with {robot}")
 
 
-def _robot_for(
-    config_class: type[TrainConfig], values: dict[str, Any], robot: Path
-) -> dict[str, Any]:
+def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
     """The values of a robot's config for a task. Those of another task are replaced by the task's
     own for an arm with this paddle."""
-    name, task = _task_of(values, robot), config_class().env.task
+    values = _read(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
+    name = values.pop("task")
     its_task = known_task(name) if is_file(name) else find_task(name)
     if its_task is None:
         raise UserError(
             f"{robot} is of a task in the file {name}, which is code; adopt the arm again without "
             "--task"
         )
-    values = {key: value for key, value in values.items() if key != "task"}
     known = validate(train_config(its_task), values, str(robot)).env
     if issubclass(task, its_task):
         return values
@@ -258,20 +254,16 @@ def has_plugin() -> bool:
     return bool(plugins) or any(importlib.util.find_spec(name) for name in names)
 
 
-def _task_of(values: dict[str, Any], path: Path) -> str:
-    """Name of the task in a config's values."""
-    name = values.get("task", DEFAULT)
+def _read(path: Path, kind: str = "config file", example: str = _EXAMPLE) -> dict[str, Any]:
+    """The values of a config file (`read_mapping`) with the name of the task, and absolute paths of
+    the MJCF file and of the task's file."""
+    values = read_mapping(path, kind, example)
+    name, env = values.get("task", DEFAULT), values.get("env")
     if not isinstance(name, str):
         raise UserError(f"{path}: task is {shorten(repr(name))}; give the name of a task")
-    return name
-
-
-def _with_paths_from(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """A config's values with absolute paths of the MJCF file and of the task's file."""
-    name, env = values.get("task"), values.get("env")
-    if isinstance(name, str) and is_file(name) and not name.startswith("~"):
-        values = values | {"task": str((folder / name).absolute())}
+    if is_file(name) and not name.startswith("~"):
+        name = str((path.parent / name).absolute())
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
-    if not isinstance(mjcf, str) or mjcf.startswith("~") or is_packaged(Path(mjcf)):
-        return values
-    return values | {"env": env | {"mjcf": str(folder / mjcf)}}
+    if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):
+        values = values | {"env": env | {"mjcf": str(path.parent / mjcf)}}
+    return values | {"task": name}

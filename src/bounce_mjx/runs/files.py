@@ -1,8 +1,10 @@
 """Files of a run: validated JSON, atomic writes, and a manifest that verifies a checkpoint."""
 
+import contextlib
 import hashlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -68,6 +70,34 @@ def write_output(path: Path, content: str | bytes) -> None:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
     else:
         write_atomically(path, content)
+
+
+@contextlib.contextmanager
+def writable(path: Path, advice: str) -> Iterator[None]:
+    """Around the writing of what the user named.
+
+    Args:
+      advice: the end of the error, such as "choose another --out".
+
+    Raises:
+      UserError: it cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror}); {advice}") from error
+
+
+def check_output(path: Path | None, flag: str) -> None:
+    """Fails before the work if a file that the user named with a flag could not be written.
+
+    Raises:
+      UserError: it is a folder, or in one that does not exist.
+    """
+    if path is not None and not os.path.isdir(path.absolute().parent):
+        raise UserError(f"the folder of {flag} {path} does not exist; make it")
+    if path is not None and os.path.isdir(path):
+        raise UserError(f"{flag} {path} is a folder; give a file")
 
 
 def sync(path: Path) -> None:

@@ -25,7 +25,7 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -107,9 +107,9 @@ def save_config(run: Path, config: TrainConfig) -> None:
     write_atomically(run / CONFIG_FILE, dump_config(config))
 
 
-def seed_folders(run: Path, seeds: Iterable[int]) -> list[Path]:
-    """Folders of a run's seeds."""
-    return [run / f"seed_{seed:03d}" for seed in seeds]
+def seed_folder(run: Path, seed: int) -> Path:
+    """Folder of a run's seed."""
+    return run / f"seed_{seed:03d}"
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
@@ -184,20 +184,18 @@ def find_checkpoint(path: Path) -> Checkpoint:
         place = Path(os.path.abspath(run))
     elif place in (siblings := stored_checkpoints(place.parent)).values():
         return Checkpoint(run, place, next(n for n, p in siblings.items() if p == place))
-    for folder in (place, place / CHECKPOINTS / "best", place / CHECKPOINTS / "latest"):
-        if stored := stored_checkpoints(folder):
-            return Checkpoint(run, stored[max(stored)], max(stored))
-    raise _no_checkpoint(path)
+    inner = (place / CHECKPOINTS / name for name in ("best", "latest"))
+    return _checkpoint_in(run, path, place, *inner)
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """Newest checkpoint of a run, from which its training resumes."""
-    return _checkpoint_of(run, "latest")
+    return _checkpoint_in(run, run, run / CHECKPOINTS / "latest")
 
 
 def best_checkpoint(run: Path) -> Checkpoint:
     """Checkpoint of a run with the best evaluation."""
-    return _checkpoint_of(run, "best")
+    return _checkpoint_in(run, run, run / CHECKPOINTS / "best")
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -290,15 +288,16 @@ def _has_checkpoint(run: Path) -> bool:
     return any(stored_checkpoints(folder) for folder in (run / CHECKPOINTS).glob("*"))
 
 
-def _checkpoint_of(run: Path, name: CheckpointName) -> Checkpoint:
-    folder = run / CHECKPOINTS / name
-    if not stored_checkpoints(folder):
-        raise _no_checkpoint(run)
-    return find_checkpoint(folder)
+def _checkpoint_in(run: Path, named: Path, *folders: Path) -> Checkpoint:
+    """The newest checkpoint in the first of the folders that has one.
 
-
-def _no_checkpoint(path: Path) -> UserError:
-    return UserError(
-        f"{path} holds no checkpoint, as the first one follows the first evaluation; train longer "
+    Args:
+      named: what the user named, for the error.
+    """
+    for folder in folders:
+        if stored := stored_checkpoints(folder.absolute()):
+            return Checkpoint(run, stored[max(stored)], max(stored))
+    raise UserError(
+        f"{named} holds no checkpoint, as the first one follows the first evaluation; train longer "
         "or give another run's folder"
     )

@@ -45,11 +45,8 @@ class Record(pydantic.BaseModel):
 
 def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
-    size = config.env.layout.size
-    networks = make_networks(config.ppo, size, config.env.num_joints)
     read_record(checkpoint)
-    shapes = jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
-    policy = _read_arrays(checkpoint, "policy", shapes)
+    policy = _read_arrays(checkpoint, "policy", policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
         if not np.all(np.isfinite(array)):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -58,6 +55,13 @@ def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
                 f"finite, in {name}; give another checkpoint"
             )
     return policy
+
+
+def policy_shapes(config: TrainConfig) -> Policy:
+    """Shapes and dtypes of the policy of one seed."""
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints)
+    return jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
 
 
 def load_training_state(

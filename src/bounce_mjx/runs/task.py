@@ -14,15 +14,7 @@ from pathlib import Path
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.files import check_copy, seal, write_atomically
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import (
-    admit,
-    content_of,
-    find_task,
-    is_file,
-    known_task,
-    read_source,
-    source_file,
-)
+from bounce_mjx.tasks import registry
 
 TASK = "task"
 
@@ -37,11 +29,11 @@ def copy_task(name: str, run: Path) -> str:
       OSError: the copy cannot be written.
       UserError: the file cannot be read.
     """
-    path, attribute = source_file(name), name.rpartition(":")[2]
+    path, attribute = registry.source_file(name), name.rpartition(":")[2]
     folder = run / TASK
     if not folder.exists():
         folder.mkdir()
-        write_atomically(folder / path.name, read_source(name))
+        write_atomically(folder / path.name, registry.read_source(name))
         seal(folder)
     return f"{TASK}/{path.name}:{attribute}"
 
@@ -58,25 +50,25 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
       UserError: the user has not named the file; or the run has another task, or its copy was
         edited.
     """
-    if not is_file(name):
-        task = find_task(name)
-        if given is not None and find_task(given) is not task:
+    if not registry.is_file(name):
+        task = registry.find_task(name)
+        if given is not None and registry.find_task(given) is not task:
             raise UserError(
                 f"the run {run} was trained with the task {name}, but --task is {given}; leave it "
                 "out"
             )
         return task
-    check_copy(source_file(name), run / TASK, "--task")
+    check_copy(registry.source_file(name), run / TASK, "--task")
     if given is not None:
-        task = find_task(given)
+        task = registry.find_task(given)
         if not is_same_task(name, given):
             print(
                 f"warning: {given} differs from the task that {run} was trained with; the one of "
                 f"the training is {name}",
                 file=sys.stderr,
             )
-        admit(name, task)
-    task = known_task(name)
+        registry.admit(name, task)
+    task = registry.known_task(name)
     if task is None:
         raise UserError(
             f"the run {run} was trained with a task in a file, which is code; name it to run it: "
@@ -87,14 +79,14 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
 
 def is_same_task(name: str, given: str) -> bool:
     """Whether two names stand for equal code."""
-    if is_file(name) and is_file(given):
-        return content_of(name) == content_of(given)
-    return find_task(name) is find_task(given)
+    if registry.is_file(name) and registry.is_file(given):
+        return registry.content_of(name) == registry.content_of(given)
+    return registry.find_task(name) is registry.find_task(given)
 
 
 def identify_task(name: str) -> str:
     """A task's name; for FILE.py:CLASS without the folder, and with eight digits of the hash."""
-    if not is_file(name):
+    if not registry.is_file(name):
         return name
-    digest, attribute = content_of(name)
-    return f"{source_file(name).name}:{attribute} {digest[:8]}"
+    digest, attribute = registry.content_of(name)
+    return f"{registry.source_file(name).name}:{attribute} {digest[:8]}"

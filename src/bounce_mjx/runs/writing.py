@@ -21,15 +21,9 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
-from bounce_mjx.runs.folders import (
-    CHECKPOINTS,
-    REPLACED,
-    CheckpointName,
-    save_config,
-    stored_checkpoints,
-)
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import RECORD_FILE
 
@@ -53,7 +47,7 @@ class CheckpointWriter:
 
     def save(
         self,
-        names: Sequence[CheckpointName],
+        names: Sequence[folders.CheckpointName],
         steps: int,
         policy: Policy,
         training: TrainingState | None = None,
@@ -76,7 +70,7 @@ class CheckpointWriter:
         self.problem()
         new = {}
         for name in names:
-            folder = self._run / CHECKPOINTS / name / str(steps)
+            folder = self._run / folders.CHECKPOINTS / name / str(steps)
             new[name] = partial(_write_checkpoint, folder, items, record)
         if results is not None:
             path = self._run / RESULTS_FILE
@@ -122,7 +116,7 @@ class CheckpointWriter:
                 self._run.mkdir(parents=True)
             # The only copy of the robot may have been in the folder.
             with contextlib.suppress(UserError):
-                save_config(self._run, self._run_config)
+                folders.save_config(self._run, self._run_config)
 
 
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
@@ -154,8 +148,8 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
         if number is None:
             raise
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
-    for steps, other in stored_checkpoints(folder.parent).items():
-        other.rename(folder.with_name(f"{steps}{REPLACED}"))
+    for steps, other in folders.stored_checkpoints(folder.parent).items():
+        other.rename(folder.with_name(f"{steps}{folders.REPLACED}"))
     unfinished.rename(folder)
     sync(folder.parent)
     _remove_leftovers(folder.parent)
@@ -193,9 +187,9 @@ def _silent_orbax() -> ModuleType:
 
 def _remove_leftovers(folder: Path) -> None:
     """Removes incomplete and replaced checkpoints from a folder."""
-    counting = stored_checkpoints(folder).values()
+    counting = folders.stored_checkpoints(folder).values()
     for path in folder.glob("*"):
-        if path.suffix in (PARTIAL, REPLACED) and path not in counting:
+        if path.suffix in (PARTIAL, folders.REPLACED) and path not in counting:
             shutil.rmtree(path, ignore_errors=True)
 
 

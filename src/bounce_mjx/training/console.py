@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.log import Logs, TensorBoardLog
+from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.trainer import Watcher
 
 
@@ -21,7 +21,7 @@ class Reporter:
 
     def __init__(
         self,
-        logs: Callable[[], Sequence[TensorBoardLog | Logs]],
+        logs: Callable[[], Sequence[TensorBoardLog]],
         console: Console,
         config: TrainConfig,
         first_step: int,
@@ -32,38 +32,25 @@ class Reporter:
           logs: returns one log per seed, none in a process that writes nothing; it is first called
             after the first block, as TensorBoard's library takes seconds to import.
         """
-        self._console, self._watcher = console, watcher
-        self._open_logs = logs
-        self._progress = Progress(
-            TextColumn("[bold]training"),
-            BarColumn(),
-            TextColumn("{task.percentage:>3.0f}% {task.fields[figures]}"),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._console, self._watcher, self._logs = console, watcher, logs
+        columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}")
+        self._bar = Progress(*columns, console=console, disable=not console.is_terminal)
         self._config, self._first_step = config, first_step
         self._started = time.monotonic()
-        self._task = self._progress.add_task(
-            "training", total=config.total_steps, completed=first_step, figures="", left=""
-        )
+        total = config.total_steps
+        self._task = self._bar.add_task("training", total=total, completed=first_step)
         unknown = np.full(config.num_seeds, math.nan)
         self._last = {"episode/return": unknown}
         self._last |= dict.fromkeys((c.tag for c in config.env.task.curves[:1]), unknown)
         self._saving_problem: str | None = None
 
-    @property
-    def _logs(self) -> Sequence[TensorBoardLog | Logs]:
-        return self._open_logs()
-
     def __enter__(self) -> "Reporter":
-        self._progress.start()
+        self._bar.start()
         return self
 
     def __exit__(self, *_) -> None:
-        self._progress.stop()
-        for log in self._logs:
+        self._bar.stop()
+        for log in self._logs():
             log.close()
 
     def block(self, steps: int, seconds: float, metrics: dict[str, np.ndarray]) -> None:
@@ -74,12 +61,15 @@ class Reporter:
           seconds: duration of the block.
           metrics: each [seeds, iterations]; NaN is ignored.
         """
-        means = {name: _finite_mean(values) for name, values in metrics.items()}
+        means = {
+            name: np.ma.masked_invalid(values).mean(axis=1).filled(math.nan)
+            for name, values in metrics.items()
+        }
         # A sum, because a mean would hide a single event in many iterations.
         non_finite = np.nansum(metrics["task/non_finite"], axis=1)
         means["task/non_finite"] = non_finite.astype(float)
         for name, seed_values in means.items():
-            for log, value in zip(self._logs, seed_values, strict=False):
+            for log, value in zip(self._logs(), seed_values, strict=False):
                 if math.isfinite(value):
                     log.add_scalar(name, float(value), steps)
         if self._watcher is not None:
@@ -91,10 +81,10 @@ class Reporter:
         for tag, values in self._last.items():
             form = ".0f" if tag == "episode/return" else ".3g"
             figures += f"  {tag.rpartition('/')[2]} {_mean_and_deviation(values, form)}"
-        left = self._time_left(steps)
-        self._progress.update(self._task, completed=steps, figures=figures, left=left)
+        line = f"{figures}  {seconds:.1f} s, {self._time_left(steps)}"
+        self._bar.update(self._task, completed=steps, description=line)
         if not self._console.is_terminal:
-            self.say(f"{figures}  {seconds:.1f} s, {left}")
+            self.say(line)
 
         if total := int(non_finite.sum()):
             had = "environment had a state that was not finite, and was reset"
@@ -116,7 +106,7 @@ class Reporter:
 
     def flush(self) -> None:
         """Writes everything reported so far to the logs' files."""
-        for log in self._logs:
+        for log in self._logs():
             log.flush()
 
     def saving_problem(
@@ -139,7 +129,7 @@ class Reporter:
           reports: one report per seed.
           healthy: False for a seed that diverged.
         """
-        for log, report, sound in zip(self._logs, reports, healthy, strict=False):
+        for log, report, sound in zip(self._logs(), reports, healthy, strict=False):
             if not sound:
                 continue
             group = "screening" if report.screening else "results"
@@ -148,22 +138,18 @@ class Reporter:
                 if value is not None:
                     log.add_scalar(f"{group}/{name}", value, steps)
             log.add_text(group, results_markdown(report), steps)
+        passed = [r for r, sound in zip(reports, healthy, strict=True) if r.passed and sound]
+        sure = sum(report.passed_with_margin for report in passed)
         if len(reports) == 1:
             (report,) = reports
-            figures = ", ".join(
-                f"{result.name} {figure_text(result.value, '.4g')}" for result in report.results
-            )
-            line = f"{report.summary} ({figures})"
-            if report.passed and not report.passed_with_margin:
-                line += ", not yet with a margin"
+            figures = (f"{r.name} {figure_text(r.value, '.4g')}" for r in report.results)
+            line = f"{report.summary} ({', '.join(figures)})"
+            missing = ", not yet with a margin"
         else:
-            solved = sum(r.passed and sound for r, sound in zip(reports, healthy, strict=True))
-            line = f"{solved} of {len(reports)} seeds meet all results"
-            sure = sum(
-                r.passed_with_margin and sound for r, sound in zip(reports, healthy, strict=True)
-            )
-            if sure < solved:
-                line += f", {sure} with a margin"
+            line = f"{len(passed)} of {len(reports)} seeds meet all results"
+            missing = f", {sure} with a margin"
+        if sure < len(passed):
+            line += missing
         kind = "evaluation"
         if reports[0].screening:
             kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"
@@ -173,14 +159,6 @@ class Reporter:
 def say(console: Console, line: str) -> None:
     """Prints a line unchanged: rich would read square brackets in a path as markup."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _finite_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the finite values of each row; NaN where there is none."""
-    finite = np.isfinite(values)
-    number = finite.sum(axis=1)
-    total = np.where(finite, values, 0.0).sum(axis=1)
-    return np.where(number > 0, total / np.maximum(number, 1), math.nan)
 
 
 def _mean_and_deviation(values: np.ndarray, form: str) -> str:

@@ -16,8 +16,9 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.reading import policy_shapes
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
 
@@ -104,7 +105,11 @@ class Evaluators:
             out_shardings=self._replicated,
             compiler_options=compiler_options(),
         )
-        return program.lower(policy_shapes(config, env), np.uint32(0), np.int32(0))
+        seeds = (config.num_seeds,) if config.num_seeds > 1 else ()
+        shapes = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), policy_shapes(config)
+        )
+        return program.lower(shapes, np.uint32(0), np.int32(0))
 
     @functools.cached_property
     def _threads(self) -> int:
@@ -146,13 +151,3 @@ def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:
     """The first episodes of all chunks as NumPy arrays; the episodes are the last axis."""
     parts = jax.device_get(chunks)
     return jax.tree.map(lambda *x: np.concatenate(x, axis=-1)[..., :episodes], *parts)
-
-
-def policy_shapes(config: TrainConfig, env: Env) -> Policy:
-    """Shapes of a training's policy; with several seeds, the seeds are the first axis."""
-    networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    shapes = jax.eval_shape(
-        lambda: untrained_policy(networks, env.observation_size, jax.random.PRNGKey(0))
-    )
-    seeds = (config.num_seeds,) if config.num_seeds > 1 else ()
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)

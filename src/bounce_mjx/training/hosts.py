@@ -14,7 +14,6 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -30,10 +29,9 @@ from jax.sharding import Sharding
 
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Address, Peers
+from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Peers
 
 Tree = TypeVar("Tree")
-Result = TypeVar("Result")
 
 _peers: Peers | None = None
 _ADDRESS = "bounce_mjx/address"
@@ -89,10 +87,12 @@ def join(
         return _connect(timeout)
 
     try:
-        _peers = _in_thread(connect).result(timeout)
+        # Ctrl-C cannot interrupt these functions, but it can interrupt the wait for a thread.
+        pool = concurrent.futures.ThreadPoolExecutor(1)
+        _peers = pool.submit(connect).result(timeout)
         # Waits for the devices of all hosts. The processes must be connected before: nothing else
         # ends this wait if one of them has died.
-        _in_thread(jax.devices).result()
+        pool.submit(jax.devices).result()
     except UserError:
         raise
     except concurrent.futures.TimeoutError as error:
@@ -110,20 +110,6 @@ def join(
         ) from error
 
 
-def _in_thread(function: Callable[[], Result]) -> concurrent.futures.Future[Result]:
-    """Calls a function that Ctrl-C cannot interrupt; the wait for its result can be."""
-    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
-
-    def run() -> None:
-        try:
-            future.set_result(function())
-        except Exception as error:  # noqa: BLE001
-            future.set_exception(error)
-
-    threading.Thread(target=run, daemon=True).start()
-    return future
-
-
 def _connect(timeout: float) -> Peers | None:
     """Connects the processes that JAX has joined; None if there is only one.
 
@@ -138,19 +124,17 @@ def _connect(timeout: float) -> Peers | None:
     peers = Peers(joined.process_id, joined.num_processes, timeout, lambda: _advice(), _exit)
     if joined.process_id == 0:
         address, server = peers.listen()
-        joined.client.key_value_set(_ADDRESS, f"{address.port} {address.token}")
-        connect = partial(peers.accept, server, address.token)
+        joined.client.key_value_set(_ADDRESS, address)
+        connect = partial(peers.accept, server)
     else:
-        text = joined.client.blocking_key_value_get(_ADDRESS, int(1000 * timeout))
-        port, token = text.split()
-        address = Address(int(port), token)
+        address = joined.client.blocking_key_value_get(_ADDRESS, int(1000 * timeout))
         connect = partial(peers.connect, host, address)
     try:
         connect()
     except OSError as error:
         raise UserError(
             f"the processes of this training cannot reach each other at {host}, port "
-            f"{address.port} ({error}); open the ports between the hosts"
+            f"{address.split()[0]} ({error}); open the ports between the hosts"
         ) from error
     return peers
 
@@ -170,19 +154,18 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     Raises:
       UserError: they differ, and so would the programs and the states of the processes.
     """
-    if _peers is None:
-        return
     # Only the leader uses the folder of the runs.
     plain = config.model_dump(mode="json", exclude={"log_dir"})
     plain["resume"] = resume and os.path.abspath(resume)
-    first, *others = map(_flat, _peers.exchange(plain))
+    first, *others = map(_flat, _exchange(plain))
     for i, other in enumerate(others, start=1):
         for key in sorted(first.keys() | other.keys()):
             ours, theirs = first.get(key), other.get(key)
             if ours != theirs:
+                ours, theirs = (shorten(json.dumps(value)) for value in (ours, theirs))
                 raise UserError(
-                    f"the processes of this training differ in {key}, which is {_shown(ours)} in "
-                    f"process 0 and {_shown(theirs)} in process {i}; start all with the same flags"
+                    f"the processes of this training differ in {key}, which is {ours} in process 0 "
+                    f"and {theirs} in process {i}; start all with the same flags"
                 )
 
 
@@ -195,8 +178,9 @@ def _flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _shown(value: Any) -> str:
-    return shorten(json.dumps(value))
+def _exchange(value: Any) -> list[Any]:
+    """The values of all processes, by number; the value of this process if it is alone."""
+    return [value] if _peers is None else _peers.exchange(value)
 
 
 def disconnect() -> None:
@@ -232,12 +216,12 @@ def is_leader() -> bool:
 def any_of(flag: bool) -> bool:
     """Whether the flag is set in any process. Every process must call this at the same point; there
     it waits for the others without a time limit."""
-    return flag if _peers is None else any(_peers.exchange(flag))
+    return any(_exchange(flag))
 
 
 def text_from_leader(text: str | None) -> str:
     """Returns the leader's text in every process; the others pass None."""
-    return text if _peers is None else _peers.exchange(text)[0]
+    return _exchange(text)[0]
 
 
 def gather(tree: Tree) -> Tree:
@@ -275,7 +259,7 @@ def _divert_native_output() -> None:
     file, _native_log = tempfile.mkstemp(prefix="bounce_mjx_", suffix=".log")
     os.dup2(file, 2)
     os.close(file)
-    atexit.register(_remove, _native_log)
+    atexit.register(Path(_native_log).unlink, missing_ok=True)
 
     def abort(_: int) -> None:
         # `Peers` has more information, and ends this process within this time if another one died.
@@ -294,14 +278,9 @@ def _divert_native_output() -> None:
     libc.signal(signal.SIGABRT, ctypes.cast(_on_abort, ctypes.c_void_p))
 
 
-def _remove(path: str) -> None:
-    with contextlib.suppress(OSError):
-        os.unlink(path)
-
-
 def _exit(status: Any) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
     if _native_log is not None:
-        _remove(_native_log)
+        Path(_native_log).unlink(missing_ok=True)
     os._exit(status if isinstance(status, int) else 1)

@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -24,19 +24,9 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folders import (
-    CHECKPOINTS,
-    Checkpoint,
-    best_checkpoint,
-    check_links,
-    create_run,
-    find_run,
-    latest_checkpoint,
-    save_config,
-    seed_folders,
-    stored_checkpoints,
-)
+from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
@@ -44,7 +34,7 @@ from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.log import Logs, TensorBoardLog, WandbLog, open_log
+from bounce_mjx.training.log import TensorBoardLog, open_log
 from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
 
 Tree = TypeVar("Tree")
@@ -53,26 +43,30 @@ Tree = TypeVar("Tree")
 RETRY_SECONDS = 2.0
 
 # Imported by name during the compilation, because this import takes half a second; so does orbax's.
-REPORT_MODULE = "bounce_mjx.training.report"
+REPORT_MODULE = "bounce_mjx.reports.page"
 
 
-class Outcome(NamedTuple):
-    """The end of the training of one seed."""
+@dataclasses.dataclass
+class SeedRun:
+    """One seed of a training."""
 
     run: Path
-    """The run's folder; with several seeds, the seed's folder."""
-    seed: int
-    report: Report | None
-    """Evaluation of the best checkpoint on fresh resets; None if the seed diverged before its first
-    evaluation."""
-    best_steps: int
-    """Environment steps at the best checkpoint."""
-    solved_steps: int | None
-    """Environment steps at the first evaluation that met all results."""
-    fault: str | None
-    """If the training diverged, the first quantity that was not finite, and the iteration."""
+    """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
+    config: TrainConfig
+    """The config of this seed, as for a training of one seed."""
     seconds: dict[str, float]
     """Seconds by phase, for all seeds together."""
+    progress: Progress = dataclasses.field(default_factory=Progress)
+    best_policy: Policy | None = None
+    """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
+    final: Report | None = None
+    """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
+
+    @property
+    def report(self) -> Report | None:
+        """The figures of the best checkpoint; None if the seed diverged before its first
+        evaluation."""
+        return self.final or self.progress.best
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,56 +88,32 @@ class Options:
 class TrainingStopped(Exception):
     """The user stopped the training; the text says how to continue."""
 
-    def __init__(self, text: str, runs: Sequence[Path] = ()):
-        super().__init__(text)
-        self.runs = runs
-        """Folders of the seeds; none if nothing was trained."""
-
 
 def train(
     config: TrainConfig,
     console: Console,
     make_trainer: Callable[[TrainConfig, Env], Trainer],
     options: Options,
-) -> list[Outcome]:
-    """Trains with a config, and returns an outcome for each seed.
+) -> list[SeedRun]:
+    """Trains with a config, and returns its seeds.
 
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
-        another process trains in the run's folder, the training diverged, or its final state could
-        not be saved.
+        another process trains in the run's folder, the hosts have different configs, the training
+        diverged, or its final state could not be saved.
       TrainingStopped: SIGINT or SIGTERM came; the state is saved.
     """
+    hosts.agree(config, options.resume)
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         job = _Job(config, console, make_trainer, options, stop, stack)
         job.compile()
         job.train()
         job.finish()
-        return job.outcomes()
-
-
-@dataclasses.dataclass
-class _Member:
-    """One seed of the training."""
-
-    run: Path
-    """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
-    config: TrainConfig
-    """The config of this seed, as for a training of one seed."""
-    progress: Progress
-    best_policy: Policy | None = None
-    """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
-    final: Report | None = None
-    """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
-
-    @property
-    def report(self) -> Report | None:
-        """The figures of the best checkpoint."""
-        return self.final or self.progress.best
+        return job.members
 
 
 class _Job:
@@ -167,9 +137,8 @@ class _Job:
         self.stop, self.stack = stop, stack
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
-        self.run, self.resumed = options.resume, options.resume is not None
+        self.resumed = options.resume is not None
         self.clock = Clock()
-        hosts.advise(self._advice)
         self.env = Env(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
@@ -177,10 +146,15 @@ class _Job:
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
         self.steps = 0
-        if options.resume is None:
-            self._create()
-        else:
-            self._resume(options.resume)
+        self.run = folders.find_run(options.resume) if self.resumed else self._create()
+        hosts.advise(self._advice)
+        if hosts.is_leader():
+            stack.enter_context(lock_run(self.run))
+        self.members = self._seed_runs()
+        if self.resumed:
+            self._resume()
+        if hosts.is_leader():
+            self._write_configs()
         mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
@@ -198,60 +172,49 @@ class _Job:
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process."""
-        try:
-            latest = latest_checkpoint(self.run) if self.run else None
-        except UserError:
-            latest = None
+        latest = self._latest()
         if latest is None:
             return "start again, as no checkpoint had been saved yet"
         return f"{self._go_on} on every host (the last checkpoint is {latest.folder})"
 
-    def _create(self) -> None:
-        run = str(create_run(self.config)) if hosts.is_leader() else None
-        self.run = Path(hosts.text_from_leader(run))
-        self._lock()
-        self.members = [
-            _Member(folder, config, Progress()) for folder, config in self._folders_of_seeds()
-        ]
-        if self.config.num_seeds > 1 and hosts.is_leader():
-            for member in self.members:
-                member.run.mkdir()
-                _write_config(member.run, member.config)
+    def _latest(self) -> folders.Checkpoint | None:
+        with contextlib.suppress(UserError):
+            return folders.latest_checkpoint(self.run)
+        return None
 
-    def _folders_of_seeds(self) -> list[tuple[Path, TrainConfig]]:
-        if self.config.num_seeds == 1:
-            return [(self.run, self.config)]
-        seeds = range(self.config.seed, self.config.seed + self.config.num_seeds)
-        alone = [self.config.model_copy(update={"seed": s, "num_seeds": 1}) for s in seeds]
-        return list(zip(seed_folders(self.run, seeds), alone, strict=True))
+    def _create(self) -> Path:
+        run = str(folders.create_run(self.config)) if hosts.is_leader() else None
+        return Path(hosts.text_from_leader(run))
 
-    def _lock(self) -> None:
-        """Locks the run's folder for this training; a refusal ends all processes."""
-        refusal = ""
-        if hosts.is_leader():
-            try:
-                self.stack.enter_context(lock_run(self.run))
-            except UserError as error:
-                refusal = str(error)
-        refusal = hosts.text_from_leader(refusal)
-        if refusal:
-            raise UserError(refusal)
+    def _seed_runs(self) -> list[SeedRun]:
+        config, seconds = self.config, self.clock.seconds
+        if config.num_seeds == 1:
+            return [SeedRun(self.run, config, seconds)]
+        seeds = range(config.seed, config.seed + config.num_seeds)
+        alone = [config.model_copy(update={"seed": seed, "num_seeds": 1}) for seed in seeds]
+        return [SeedRun(folders.seed_folder(self.run, own.seed), own, seconds) for own in alone]
 
-    def _resume(self, path: Path) -> None:
-        self.run = find_run(path)
-        self._lock()
-        check_links(self.run)
-        latest = latest_checkpoint(self.run)
+    def _configs(self) -> dict[Path, TrainConfig]:
+        """The config of each folder: the run's, and with several seeds, those of the seeds."""
+        return {self.run: self.config} | {member.run: member.config for member in self.members}
+
+    def _write_configs(self) -> None:
+        for folder, config in self._configs().items():
+            # A new run has its own config.
+            if self.resumed or folder != self.run:
+                with writable(folder, "make room there or make it writable"):
+                    folder.mkdir(exist_ok=True)
+                    folders.save_config(folder, config)
+
+    def _resume(self) -> None:
+        folders.check_links(self.run)
+        latest = folders.latest_checkpoint(self.run)
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
         self.steps = latest.steps
         seed_records = [plain] if self.config.num_seeds == 1 else plain["seeds"]
-        self.members = [
-            _Member(folder, config, _resumed_progress(folder, record, latest))
-            for (folder, config), record in zip(self._folders_of_seeds(), seed_records, strict=True)
-        ]
-        if hosts.is_leader():
-            _write_config(self.run, self.config)
+        for member, record in zip(self.members, seed_records, strict=True):
+            member.progress = _resumed_progress(member.run, record, latest)
         self._say_how_far()
 
     def _say_how_far(self) -> None:
@@ -287,12 +250,7 @@ class _Job:
             self.state = None
         self.writers: list[CheckpointWriter] = []
         if hosts.is_leader():
-            seed_folders = [(member.run, member.config) for member in self.members]
-            several = self.config.num_seeds > 1
-            self.writers = [
-                CheckpointWriter(*arguments)
-                for arguments in ([(self.run, self.config)] if several else []) + seed_folders
-            ]
+            self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.reporter = self.stack.enter_context(
@@ -312,34 +270,26 @@ class _Job:
         compiling.result()
         return opening
 
-    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog | Logs]:
-        if not hosts.is_leader():
-            return []
-        logs = [open_log(m.run, first_step, config=m.config) for m in self.members]
-        if self.options.wandb is None:
-            return logs
-        return [
-            Logs([log, WandbLog(m.run, self.options.wandb, m.config)])
-            for log, m in zip(logs, self.members, strict=True)
-        ]
+    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog]:
+        members = self.members if hosts.is_leader() else []
+        wandb = self.options.wandb
+        return [open_log(m.run, first_step, config=m.config, wandb=wandb) for m in members]
 
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
         for i, member in enumerate(self.members):
-            missing = member.progress.best_steps == self.steps > 0 and (
-                self.steps not in stored_checkpoints(member.run / CHECKPOINTS / "best")
-            )
+            best = member.run / folders.CHECKPOINTS / "best"
+            stored = self.steps in folders.stored_checkpoints(best)
+            missing = member.progress.best_steps == self.steps > 0 and not stored
             if self.resumed and missing:
                 # The process was killed after saving the latest checkpoint and before saving the
                 # best one.
                 self._save(best=[i])
         while not self._stopping():
-            if self._is_due():
-                if not self._evaluate():
-                    break
-            if self.steps >= self.config.total_steps:
+            if self._is_due() and not self._evaluate():
                 break
-            if self.config.stop_when_solved and self._is_solved():
+            solved = self.config.stop_when_solved and self._is_solved()
+            if solved or self.steps >= self.config.total_steps:
                 break
             self._run_block()
 
@@ -352,36 +302,18 @@ class _Job:
         stopping = self._stopping()
         if stopping and not self._evaluated():
             self._save(best=[])
-        _wait_until_saved(self.writers, self.reporter, self.stop)
-        self.clock.lap("save")
-        if stopping:
-            hosts.disconnect()
-            raise self._stopped(f"stopped after {self.steps:,} steps; {self._go_on}")
-        self._evaluate_best()
+        self._wait_until_saved()
+        evaluated = not stopping and self._evaluate_best()
         hosts.disconnect()
-
-    def _stopped(self, text: str) -> TrainingStopped:
-        return TrainingStopped(text, [member.run for member in self.members])
-
-    def outcomes(self) -> list[Outcome]:
-        """The outcome of each seed."""
-        return [
-            Outcome(
-                m.run,
-                m.config.seed,
-                m.report,
-                m.progress.best_steps,
-                m.progress.solved_steps,
-                m.progress.fault,
-                self.clock.seconds,
-            )
-            for m in self.members
-        ]
+        self.trainer.save_models([member.run for member in self.members])
+        if not evaluated:
+            where = "" if stopping else ", before the final evaluation"
+            raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self._go_on}")
 
     def _stopping(self) -> bool:
         return hosts.any_of(self.stop.requested)
 
-    def _healthy(self) -> list[_Member]:
+    def _healthy(self) -> list[SeedRun]:
         return [member for member in self.members if member.progress.fault is None]
 
     def _is_solved(self) -> bool:
@@ -415,36 +347,30 @@ class _Job:
         self._save(best, snapshot)
         return True
 
-    def _evaluate_best(self) -> None:
-        """Evaluates the best policies on fresh resets, and writes the results.
-
-        Raises:
-          TrainingStopped: a stop was requested meanwhile.
-        """
-        policies = [
-            member.best_policy or load_policy(best_checkpoint(member.run), member.config)
-            for member in self.members
-            if member.progress.best is not None
-        ]
+    def _evaluate_best(self) -> bool:
+        """Evaluates the best policies on fresh resets, and writes the results; returns False if a
+        stop was requested meanwhile."""
+        evaluated = [member for member in self.members if member.progress.best is not None]
+        for member in evaluated:
+            if member.best_policy is None:
+                member.best_policy = load_policy(folders.best_checkpoint(member.run), member.config)
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
-        filled = iter(policies)
-        policies = [
-            policies[0] if member.progress.best is None else next(filled) for member in self.members
-        ]
+        policies = [member.best_policy or evaluated[0].best_policy for member in self.members]
         policy = policies[0]
         if self.config.num_seeds > 1:
             policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
         reports = self._wait_for_reports(self.evaluators.final, policy)
         if reports is None:
-            hosts.disconnect()
-            raise self._stopped(
-                f"stopped after {self.steps:,} steps, before the final evaluation; {self._go_on}"
-            )
+            return False
         for member, report in zip(self.members, reports, strict=True):
             member.final = None if member.progress.best is None else report
         for writer, member in zip(self.writers[-len(self.members) :], self.members, strict=False):
             writer.save((), self.steps, member.best_policy, results=self._results(member))
+        self._wait_until_saved()
+        return True
+
+    def _wait_until_saved(self) -> None:
         _wait_until_saved(self.writers, self.reporter, self.stop)
         self.clock.lap("save")
 
@@ -510,10 +436,10 @@ class _Job:
             return
         for writer in self.writers:
             writer.problem()
-        try:
-            kept = f"the last good checkpoint is {latest_checkpoint(self.run).folder}"
-        except UserError:
-            kept = "no checkpoint had been saved yet"
+        latest = self._latest()
+        kept = "no checkpoint had been saved yet"
+        if latest is not None:
+            kept = f"the last good checkpoint is {latest.folder}"
         raise UserError(
             f"the training was stopped as it diverged: {self.members[-1].progress.fault}; {kept}; "
             "start a new run with a lower learning rate or other rewards"
@@ -552,7 +478,7 @@ class _Job:
         """One seed's part of a policy or a state."""
         return tree if self.config.num_seeds == 1 else jax.tree.map(lambda x: x[index], tree)
 
-    def _results(self, member: _Member) -> dict[str, Any] | None:
+    def _results(self, member: SeedRun) -> dict[str, Any] | None:
         """The content of the seed's results.json; None before its first evaluation."""
         if member.report is None:
             return None
@@ -566,7 +492,7 @@ class _Job:
         )
 
 
-def check_library(checkpoint: Checkpoint, library: str) -> None:
+def check_library(checkpoint: folders.Checkpoint, library: str) -> None:
     """Compares the library that began a run with the library that resumes it.
 
     Raises:
@@ -583,7 +509,7 @@ def check_library(checkpoint: Checkpoint, library: str) -> None:
         )
 
 
-def library_of(checkpoint: Checkpoint) -> str:
+def library_of(checkpoint: folders.Checkpoint) -> str:
     """The library that trained a checkpoint.
 
     Raises:
@@ -611,16 +537,7 @@ def _wait_until_saved(
     reporter.saving_problem(None)
 
 
-def _write_config(run: Path, config: TrainConfig) -> None:
-    try:
-        save_config(run, config)
-    except OSError as error:
-        raise UserError(
-            f"{run} cannot be written ({error.strerror}); make room there or make it writable"
-        ) from error
-
-
-def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> Progress:
+def _resumed_progress(run: Path, plain: dict[str, Any], latest: folders.Checkpoint) -> Progress:
     """The evaluations of a seed before it is resumed."""
     progress = Progress.from_dict(plain, latest.folder)
     if progress.best is not None and progress.best_steps == latest.steps:
@@ -629,7 +546,7 @@ def _resumed_progress(run: Path, plain: dict[str, Any], latest: Checkpoint) -> P
     # may be older or newer than the record in the latest checkpoint.
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
-        best = best_checkpoint(run)
+        best = folders.best_checkpoint(run)
         stored = Progress.from_dict(read_record(best).progress, best.folder)
         progress.best, progress.best_steps = stored.best, stored.best_steps
     return progress

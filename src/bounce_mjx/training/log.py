@@ -6,7 +6,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ def open_log(
     first_step: int | None = None,
     suffix: str = "",
     config: TrainConfig | None = None,
+    wandb: str | None = None,
 ) -> "TensorBoardLog":
     """Opens a TensorBoard log in a run's folder.
 
@@ -32,8 +33,9 @@ def open_log(
       first_step: the step from which a resumed run continues; TensorBoard drops all later points.
       suffix: suffix of the file's name; two logs opened in the same second need different suffixes.
       config: the run's config, to be logged as text.
+      wandb: project of Weights & Biases that receives the scalars too; needs the config.
     """
-    log = TensorBoardLog(run, suffix)
+    log = TensorBoardLog(run, suffix) if wandb is None else WandbLog(run, wandb, config)
     if first_step is not None:
         log.purge(first_step + 1)
     if config is not None:
@@ -94,15 +96,16 @@ class TensorBoardLog:
             self.flush()
 
 
-class WandbLog:
-    """A run of Weights & Biases, with the methods of `TensorBoardLog`. A resumed training
-    continues its run."""
+class WandbLog(TensorBoardLog):
+    """A TensorBoard log whose scalars go to a run of Weights & Biases too; the run has the config
+    and the results by itself. A resumed training continues its run."""
 
     def __init__(self, run: Path, project: str, config: TrainConfig):
         """
         Raises:
           UserError: Weights & Biases refuses the run, for example without an account.
         """
+        super().__init__(run)
         # Imported only when it is asked for; it is optional and takes seconds.
         import wandb
 
@@ -124,39 +127,12 @@ class WandbLog:
             ) from error
 
     def add_scalar(self, name: str, value: float, steps: int) -> None:
+        super().add_scalar(name, value, steps)
         self._run.log({name: value}, step=steps)
 
-    def add_text(self, name: str, text: str, steps: int) -> None:
-        """Text stays in TensorBoard; the config and the results are in the run already."""
-
-    def flush(self) -> None:
-        """Weights & Biases sends its data by itself."""
-
     def close(self) -> None:
+        super().close()
         self._run.finish()
-
-
-class Logs:
-    """Several logs that receive the same."""
-
-    def __init__(self, logs: Sequence[TensorBoardLog | WandbLog]):
-        self._logs = logs
-
-    def add_scalar(self, name: str, value: float, steps: int) -> None:
-        for log in self._logs:
-            log.add_scalar(name, value, steps)
-
-    def add_text(self, name: str, text: str, steps: int) -> None:
-        for log in self._logs:
-            log.add_text(name, text, steps)
-
-    def flush(self) -> None:
-        for log in self._logs:
-            log.flush()
-
-    def close(self) -> None:
-        for log in self._logs:
-            log.close()
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 DEFAULT_TIMEOUT = 300
 """Time after which a silent process counts as dead, s."""
@@ -24,14 +24,6 @@ _GRACE_SECONDS = 1.0
 _CONNECT_SECONDS = 30.0
 # Exit status of a process that ends because another one died.
 LOST_STATUS = 2
-
-
-class Address(NamedTuple):
-    """Network address on which process 0 listens."""
-
-    port: int
-    token: str
-    """A secret of this training: connections without it are dropped."""
 
 
 class Peers:
@@ -59,6 +51,7 @@ class Peers:
         """
         self._index, self._count, self._timeout = index, count, timeout
         self._advice, self._end_process = advice, end_process
+        self._token = secrets.token_hex(16)
         self._sockets: dict[int, socket.socket] = {}
         self._lines: dict[int, TextIO] = {}
         self._names: dict[int, str] = {}
@@ -67,15 +60,20 @@ class Peers:
         self._closed = threading.Event()
         self._leaving = threading.Lock()
 
-    def listen(self) -> tuple[Address, socket.socket]:
-        """Opens the port of process 0."""
+    def listen(self) -> tuple[str, socket.socket]:
+        """Opens the port of process 0.
+
+        Returns:
+          The port and a secret of this training in one word each, as `connect` takes them, and the
+          server; connections without the secret are dropped.
+        """
         if socket.has_dualstack_ipv6():
             server = socket.create_server(("", 0), family=socket.AF_INET6, dualstack_ipv6=True)
         else:
             server = socket.create_server(("", 0))
-        return Address(server.getsockname()[1], secrets.token_hex(16)), server
+        return f"{server.getsockname()[1]} {self._token}", server
 
-    def accept(self, server: socket.socket, token: str) -> None:
+    def accept(self, server: socket.socket) -> None:
         """Waits in process 0 until every other process is connected.
 
         Raises:
@@ -90,7 +88,7 @@ class Peers:
                 lines = connection.makefile("r")
                 try:
                     hello = json.loads(lines.readline(1000))
-                    if not secrets.compare_digest(hello["token"], token):
+                    if not secrets.compare_digest(hello["token"], self._token):
                         raise ValueError
                     index, name = int(hello["index"]), str(hello["host"])
                 except (OSError, ValueError, KeyError, TypeError):
@@ -102,16 +100,20 @@ class Peers:
                 self._lines[index] = lines
         self._start()
 
-    def connect(self, host: str, address: Address) -> None:
+    def connect(self, host: str, address: str) -> None:
         """Connects this process to process 0.
+
+        Args:
+          address: from `listen` in process 0.
 
         Raises:
           OSError: process 0 cannot be reached.
         """
-        connection = socket.create_connection((host, address.port), _CONNECT_SECONDS)
+        port, token = address.split()
+        connection = socket.create_connection((host, int(port)), _CONNECT_SECONDS)
         self._sockets[0], self._names[0] = connection, host
         self._lines[0] = connection.makefile("r")
-        hello = {"token": address.token, "index": self._index, "host": socket.gethostname()}
+        hello = {"token": token, "index": self._index, "host": socket.gethostname()}
         self._send(0, hello)
         self._start()
 

@@ -2,7 +2,8 @@
 
 import concurrent.futures
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -103,6 +104,9 @@ class PPOTrainer:
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
         return Snapshot(policy_of(state, self._observation_size), state)
+
+    def save_models(self, runs: Sequence[Path]) -> None:
+        """The checkpoint has everything."""
 
 
 def _iterations_at_once(config: TrainConfig, env: Env) -> int:

@@ -9,10 +9,18 @@ from pathlib import Path
 import jax
 
 from bounce_mjx.files import private_folder
+from bounce_mjx.training.loop_fusion import join_loops
+from bounce_mjx.world.config import WorldConfig
 
 
-def set_up_jax() -> None:
-    """Sets JAX up for a command; the user's environment variables have priority."""
+def set_up_jax(*configs: WorldConfig) -> None:
+    """Sets JAX up for a command; the user's environment variables have priority.
+
+    Args:
+      configs: the environments that the command simulates, for `join_loops`.
+    """
+    if configs:
+        join_loops(*configs)
     set_up_gpu()
     cache_compilations()
 
@@ -28,7 +36,10 @@ def cache_compilations() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
         try:
-            jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+            caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            # Compiled programs are code, which no other user may write.
+            folder = private_folder(private_folder(caches / "bounce_mjx") / "jax")
+            jax.config.update("jax_compilation_cache_dir", str(folder))
         except OSError as error:
             print(
                 f"warning: compiled programs are not kept, as {error.filename} cannot be used "
@@ -38,18 +49,6 @@ def cache_compilations() -> None:
         except RuntimeError:
             # No home.
             pass
-
-
-def cache_folder() -> Path:
-    """Folder of the compiled programs in the user's cache, which is made; compiled programs are
-    code, which no other user may write.
-
-    Raises:
-      OSError: the folder cannot be made, or is a link or another user's.
-      RuntimeError: the user has no home.
-    """
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return private_folder(private_folder(caches / "bounce_mjx") / "jax")
 
 
 def find_devices() -> None:

@@ -1,7 +1,8 @@
 """The interfaces between the job, an algorithm that trains policies, and an onlooker."""
 
 import concurrent.futures
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -67,6 +68,10 @@ class Trainer(Protocol):
 
     def snapshot(self) -> Snapshot:
         """The policy and the whole state."""
+
+    def save_models(self, runs: Sequence[Path]) -> None:
+        """Writes what its library needs beside the checkpoint into the folders of the seeds, at the
+        end of the training or when it is stopped."""
 
 
 class Watcher(Protocol):
