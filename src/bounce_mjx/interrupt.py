@@ -104,19 +104,26 @@ def run_interruptible(
       Interrupted: Ctrl-C came. The thread cannot be stopped: end the process with `leave`.
       BaseException: the function raised it.
     """
+    with StopRequest(signal.SIGINT) as stop:
+        future = in_daemon_thread(functools.partial(function, *args, **kwargs))
+        if not stop.wait_for(future):
+            raise Interrupted
+    return future.result()
+
+
+def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Future[Result]:
+    """Calls a function in a thread for which the end of the process does not wait, unlike for the
+    threads of an executor."""
     future: concurrent.futures.Future[Result] = concurrent.futures.Future()
 
     def run() -> None:
         try:
-            future.set_result(function(*args, **kwargs))
+            future.set_result(function())
         except BaseException as error:  # noqa: BLE001
             future.set_exception(error)
 
-    with StopRequest(signal.SIGINT) as stop:
-        threading.Thread(target=run, daemon=True).start()
-        if not stop.wait_for(future):
-            raise Interrupted
-    return future.result()
+    threading.Thread(target=run, daemon=True).start()
+    return future
 
 
 def interruptible(command: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -28,6 +28,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
 from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.interrupt import in_daemon_thread
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT, Peers
 
@@ -88,11 +89,10 @@ def join(
 
     try:
         # Ctrl-C cannot interrupt these functions, but it can interrupt the wait for a thread.
-        pool = concurrent.futures.ThreadPoolExecutor(1)
-        _peers = pool.submit(connect).result(timeout)
+        _peers = in_daemon_thread(connect).result(timeout)
         # Waits for the devices of all hosts. The processes must be connected before: nothing else
         # ends this wait if one of them has died.
-        pool.submit(jax.devices).result()
+        in_daemon_thread(jax.devices).result()
     except UserError:
         raise
     except concurrent.futures.TimeoutError as error:
