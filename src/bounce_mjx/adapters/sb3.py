@@ -23,7 +23,7 @@ from bounce_mjx.adapters.gymnasium.environments import (
     TaskEnv,
     checked_options,
 )
-from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures
 from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
@@ -64,9 +64,8 @@ class Sb3VecEnv(VecEnv):
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        check_render_mode(render_mode)
         self._batch = Batch(task, settings, num_envs, max_episode_steps)
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self._statistics = EpisodeStatistics(num_envs)
         self._actions: np.ndarray | None = None
         self.render_mode = render_mode
@@ -110,14 +109,11 @@ class Sb3VecEnv(VecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """Pictures of the first four environments, each [height, width, 3], uint8."""
-        if self._pictures is None:
-            return [None] * self.num_envs
-        return [self._picture(i) for i in range(min(self.num_envs, _SHOWN))]
+        return [self._pictures.draw(i) for i in range(min(self.num_envs, _SHOWN))]
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._pictures.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """A common attribute of the environments, once for each index."""
@@ -149,7 +145,7 @@ class Sb3VecEnv(VecEnv):
         """
         methods: dict[str, Callable[..., list[Any]]] = {
             "reset": self._reset_some,
-            "render": lambda chosen: [self._pictures and self._picture(i) for i in chosen],
+            "render": lambda chosen: list(map(self._pictures.draw, chosen)),
             "get_wrapper_attr": lambda chosen, name: self.get_attr(name, chosen),
         }
         if method_name not in methods:
@@ -183,6 +179,3 @@ class Sb3VecEnv(VecEnv):
         values = {name: np.array([one.get(name, np.nan) for one in given]) for name in commands}
         self._statistics.restart(mask)
         return self._batch.restart(seeds, np.random.default_rng(), mask, values)
-
-    def _picture(self, index: int) -> np.ndarray:
-        return self._pictures.draw(self.task, *self._batch.pose(index))

@@ -122,8 +122,11 @@ class Batch:
           The observations of all environments [B, N], float32.
         """
         self._check_process()
+        if mask is None:
+            mask = np.ones(self.num_envs, bool)
+        if not mask.all():
+            self._check_started()
         if self._episodes is None:
-            self._check_started(mask is None or bool(mask.all()))
             drawn = generator.integers(2**32, size=self.num_envs)
             seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
         seeded = np.array([s is not None for s in seeds])
@@ -133,12 +136,8 @@ class Batch:
             name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
             for name, value in given.items()
         }
-        keys = None if self._episodes is None else self._episodes.key
-        started = self._programs.start(keys, numbers, seeded, values)
-        if mask is not None and self._episodes is not None:
-            started = self._programs.choose(mask, started, self._episodes)
-        self._episodes = started
-        return np.array(started.env.obs.T, np.float32)
+        self._episodes = self._programs.start(self._episodes, mask, numbers, seeded, values)
+        return np.array(self._episodes.env.obs.T, np.float32)
 
     def step(
         self,
@@ -191,8 +190,8 @@ class Batch:
         self.__dict__.update(state)
         self._programs = _programs_for(self.config, self.num_envs)
 
-    def _check_started(self, started: bool | None = None) -> None:
-        if not (self._episodes is not None if started is None else started):
+    def _check_started(self) -> None:
+        if self._episodes is None:
             raise ResetNeeded("an environment was used before its reset; call reset() first")
 
     def _check_process(self) -> None:
@@ -222,7 +221,6 @@ class _Programs(NamedTuple):
 
     task: Env
     start: Any
-    choose: Any
     step: Any
 
 
@@ -240,25 +238,26 @@ def _programs(config: WorldConfig, num_envs: int, edited: int | None) -> _Progra
     return _Programs(
         task=task,
         start=jax.jit(functools.partial(_start, task)),
-        choose=jax.jit(_choose),
         step=jax.jit(functools.partial(_step, task), donate_argnums=0),
     )
 
 
 def _start(
     task: Env,
-    keys: jax.Array | None,
+    episodes: _Episodes | None,
+    mask: jax.Array,
     seeds: jax.Array,
     seeded: jax.Array,
     commands: dict[str, jax.Array],
 ) -> _Episodes:
-    """New episodes; `keys` [B, ...] is None before the first ones."""
-    new_keys = jax.vmap(jax.random.PRNGKey)(seeds)
-    if keys is not None:
-        new_keys = jnp.where(seeded[:, None], new_keys, keys)
-    keys, now = _split(new_keys)
+    """New episodes where the mask [B] is true; `episodes` is None before the first ones."""
+    keys = jax.vmap(jax.random.PRNGKey)(seeds)
+    if episodes is not None:
+        keys = jnp.where(seeded[:, None], keys, episodes.key)
+    keys, now = _split(keys)
     env = jax.vmap(functools.partial(_first_state, task), out_axes=-1)(now, commands)
-    return _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+    started = _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+    return started if episodes is None else _choose(mask, started, episodes)
 
 
 def _first_state(task: Env, key: jax.Array, commands: dict[str, jax.Array]) -> State:

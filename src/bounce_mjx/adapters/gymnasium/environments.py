@@ -24,7 +24,7 @@ from bounce_mjx.adapters.gymnasium.batch import (
     checked_commands,
     observation_space,
 )
-from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
@@ -63,14 +63,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        check_render_mode(render_mode)
         _prefer_forkserver()
         self._batch = Batch(task, settings, 1, None)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
         self.render_mode = render_mode
         self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
 
     @property
     def task(self) -> Env:
@@ -122,14 +121,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """A picture [height, width, 3], uint8; None without render_mode="rgb_array"."""
-        if self._pictures is None:
-            return None
-        return self._pictures.draw(self.task, *self._batch.pose(0))
+        return self._pictures.draw(0)
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._pictures.close()
 
 
 class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -165,7 +161,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
         """
-        check_render_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self._batch = Batch(task, settings, num_envs, max_episode_steps)
         self.metadata = self.metadata | {
@@ -180,7 +175,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self._ended = np.zeros(num_envs, bool)
         self._statistics = EpisodeStatistics(num_envs)
 
@@ -239,11 +234,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [height, width, 3], uint8, of each environment; None without a render mode."""
-        if self._pictures is None:
+        if self.render_mode is None:
             return None
-        return tuple(
-            self._pictures.draw(self.task, *self._batch.pose(i)) for i in range(self.num_envs)
-        )
+        return tuple(self._pictures.draw(i) for i in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """A common attribute of the environments, or the result of a method such as render, once
@@ -259,8 +252,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._pictures.close()
 
     def _info(self, result: StepArrays, skipped: np.ndarray) -> dict[str, Any]:
         """The info in the form of `VectorEnv._add_info`: each key has a mask [B], `_key`."""
