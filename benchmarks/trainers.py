@@ -90,7 +90,8 @@ def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
     steps, ended = 0, False
     while not ended:
         started = time.perf_counter()
-        learner.learn(iterations)
+        for _ in range(iterations):
+            learner.learn()
         # Reading the policy waits until the device has computed it.
         policy = jax.block_until_ready(learner.policy())
         seconds = time.perf_counter() - started

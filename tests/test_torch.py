@@ -74,7 +74,9 @@ def env(task) -> TorchVectorEnv:
 def learners(task):
     """A learner of each library after two iterations."""
     made = {library: make_learner(library, PPO, task, 0) for library in LIBRARIES}
-    return {library: (learner, learner.learn(2)) for library, learner in made.items()}
+    return {
+        library: (learner, [learner.learn() for _ in range(2)]) for library, learner in made.items()
+    }
 
 
 def random_actions(steps: int) -> torch.Tensor:
@@ -286,7 +288,7 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     assert after["policy"].shape == (NUM_ENVS, 29) and after["critic"].shape == (NUM_ENVS, 1)
     assert vec_env.get_observations() is after
     # In one step of 10 ms nothing moves far, but a reset draws another target height.
-    terminal = vec_env.terminal_observations()["policy"]
+    terminal = vec_env.result.final_observation
     torch.testing.assert_close(terminal[:, 28], before[:, 28])
     assert torch.equal(terminal[1:], after["policy"][1:])
     assert terminal[0, 28] != after["policy"][0, 28]
@@ -404,7 +406,7 @@ def test_skrl_bootstraps_time_outs_from_the_terminal_observations(learners):
     agent, at = learner.agent, learner.agent.memory.memory_index
     learner.vector.clock = torch.full((PPO.num_envs,), EPISODE_STEPS - 1, dtype=torch.int32)
     learner._step()
-    result = learner.env._result
+    result = learner.env.result
     _, states = learner.env.terminal_observations()
     with torch.no_grad():
         value, _ = agent.value.act({"states": agent._state_preprocessor(states)}, role="value")
@@ -575,5 +577,6 @@ def test_training_makes_episodes_longer(library):
         num_envs=256, rollout_length=24, num_minibatches=4, num_epochs=4, hidden_layers=(64, 64)
     )
     learner = make_learner(library, config, task, 0)
-    lengths = summarize(learner.learn(35), task.task.curves)["episode/length"]
+    metrics = [learner.learn() for _ in range(35)]
+    lengths = summarize(metrics, task.task.curves)["episode/length"]
     assert lengths[-5:].mean() > 1.3 * lengths[:5].mean()

@@ -45,38 +45,30 @@ class Learner(abc.ABC):
         self._random = _random_state(vector.device)
         _set_random_state(vector.device, outside)
 
-    def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`, or until the parameters are not finite, because the library
-        would then raise exceptions.
+    def learn(self) -> dict[str, np.ndarray]:
+        """Trains for an iteration, if the parameters are finite: the library would otherwise raise
+        exceptions.
 
-        Returns: The environment's metrics of each step [iterations, T], the losses [iterations],
-          and "fault" [iterations]: the number, from 1, of the first quantity of `CHECKED` that was
-          not finite; 0 if all were finite. In iterations that were not run, all other metrics are
-          NaN.
+        Returns: The environment's metrics of each step [T], the losses [], and "fault" []: the
+          number, from 1, of the first quantity of `CHECKED` that was not finite; 0 if all were
+          finite. Without an iteration, all other metrics are NaN.
         """
         outside = _random_state(self.vector.device)
         _set_random_state(self.vector.device, self._random)
         names = self.vector.metric_names
-        per_step = np.full((iterations, self.config.rollout_length, len(names)), np.nan, np.float32)
-        losses = {name: np.full(iterations, np.nan) for name in self.losses}
-        faults = np.full(iterations, len(CHECKED))
-        finite = self._is_finite()
-        for i in range(iterations):
-            if not finite:
-                break
-            rollout, loss = self._iterate()
+        per_step = np.full((self.config.rollout_length, len(names)), np.nan, np.float32)
+        losses, fault = dict.fromkeys(self.losses, np.nan), len(CHECKED)
+        if self._is_finite():
+            rollout, losses = self._iterate()
             self.iteration += 1
-            per_step[i] = rollout.cpu().numpy()
-            for name in losses:
-                losses[name][i] = loss[name]
-            finite = self._is_finite()
-            reward = per_step[i, :, names.index("reward")].mean()
-            checked = (reward, loss["loss/value"], loss["loss/policy"], 0.0 if finite else np.nan)
-            faults[i] = 0 if np.isfinite(checked).all() else np.argmin(np.isfinite(checked)) + 1
+            per_step = rollout.cpu().numpy()
+            reward = per_step[:, names.index("reward")].mean()
+            parameters = 0.0 if self._is_finite() else np.nan
+            finite = np.isfinite((reward, losses["loss/value"], losses["loss/policy"], parameters))
+            fault = 0 if finite.all() else np.argmin(finite) + 1
         self._random = _random_state(self.vector.device)
         _set_random_state(self.vector.device, outside)
-        metrics = {name: per_step[..., i] for i, name in enumerate(names)}
-        return metrics | losses | {"fault": faults}
+        return dict(zip(names, per_step.T, strict=True)) | losses | {"fault": fault}
 
     def state(self) -> State:
         """Everything that is needed to continue the training, as nested dictionaries of NumPy
@@ -142,9 +134,10 @@ class Learner(abc.ABC):
     def _modules(self) -> dict[str, nn.Module]:
         """Networks and statistics."""
 
-    @abc.abstractmethod
     def _set_learning_rate(self, rate: float) -> None:
         """Sets the learning rate in every place where the library stores it."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
 
     @abc.abstractmethod
     def _observed(self) -> dict[str, torch.Tensor]:

@@ -73,10 +73,10 @@ class TorchTrainer:
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         parts = []
         for _ in range(iterations):
-            parts.append([learner.learn(1) for learner in self.learners])
+            parts.append([learner.learn() for learner in self.learners])
             if stopping():
                 break
-        blocks = [summarize(_joined(metrics), self._curves) for metrics in zip(*parts, strict=True)]
+        blocks = [summarize(metrics, self._curves) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
@@ -114,19 +114,14 @@ def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
     )
 
 
-def summarize(metrics: Metrics, curves: Sequence[Curve]) -> Metrics:
-    """Metrics of each iteration [I] from a learner's metrics. The environment's metrics [I, T] are
-    summarised as in the JAX trainer, with the curves of the task; the learner's own [I] are
-    kept."""
+def summarize(iterations: Sequence[Metrics], curves: Sequence[Curve]) -> Metrics:
+    """Metrics [I] from those of I iterations of a learner. The environment's metrics [T] are
+    summarised as in the JAX trainer, with the curves of the task; the learner's own [] are kept."""
+    metrics = {name: np.stack([one[name] for one in iterations]) for name in iterations[0]}
     own = {name: values for name, values in metrics.items() if values.ndim == 1}
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}
     summary = jax.vmap(lambda steps: rollout_metrics(steps, curves))(steps)
     return own | {name: np.asarray(value) for name, value in summary.items()}
-
-
-def _joined(parts: Sequence[Metrics]) -> Metrics:
-    """The metrics of a learner's calls, one after another."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _learner_class(library: str) -> type[Learner]:

@@ -6,7 +6,7 @@ donated to the next step, so a step returns no view of it.
 """
 
 import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,15 +79,12 @@ class TorchVectorEnv:
         self.num_actions = self.env.action_size
         self.episode_steps = self.env.config.episode_steps
         self.device = _shared_device(None if device is None else torch.device(device))
-        self._dlpack_device = torch.empty(0, device=self.device).__dlpack_device__()
         self._reward_scale = reward_scale
         self._key = jax.random.PRNGKey(seed)
-        self._template = jax.eval_shape(
-            lambda key: vector.reset(self.env, key, num_envs), self._key
-        )
         if critic_metrics is None:
             critic_metrics = self.env.task.critic_metrics
-        self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
+        metrics = jax.eval_shape(self.env.reset, self._key).metrics
+        self.critic_metrics = matching_metrics(critic_metrics, metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
         _, result = jax.eval_shape(self._advance, carried, action)
@@ -132,9 +129,7 @@ class TorchVectorEnv:
             )
         if self._block is None:
             raise UserError("step was called before reset; call reset first")
-        shared = jax.dlpack.from_dlpack(
-            _Exported(action.detach().contiguous(), self._dlpack_device)
-        )
+        shared = jax.dlpack.from_dlpack(action.detach().contiguous())
         self._block, result = self._jit_step(self._block, shared)
         return self._result_layout.views(torch.from_dlpack(result))
 
@@ -204,10 +199,11 @@ class TorchVectorEnv:
     def _advance(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", StepResult]:
         """The next inputs, and the result as JAX's arrays; its metrics are a dictionary."""
         key, reset_key = jax.random.split(carried.key)
-        state = _whole(carried.vector, self._template)
         steps = None if carried.steps is None else carried.steps + 1
         ranges = vector.ranges_after(self.env, steps, self.num_envs)
-        state, result = vector.step(self.env, state, action, reset_key, self.episode_steps, ranges)
+        state, result = vector.step(
+            self.env, carried.vector, action, reset_key, self.episode_steps, ranges
+        )
         arrays = StepResult(
             observation=result.observation,
             critic_metrics=self._critic_metrics(state.env.metrics),
@@ -227,25 +223,6 @@ class TorchVectorEnv:
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((self.num_envs, 0))
 
 
-class _Exported:
-    """A tensor for `jax.dlpack.from_dlpack`, without the checks and look-ups of a tensor's own
-    methods, 10 us of Python at each step."""
-
-    def __init__(self, tensor: torch.Tensor, dlpack_device: tuple[int, int]):
-        self._tensor, self._dlpack_device = tensor, dlpack_device
-
-    def __dlpack_device__(self) -> tuple[int, int]:
-        return self._dlpack_device
-
-    def __dlpack__(self, *, stream: int | None = None) -> Any:
-        # On CUDA, JAX's stream must wait for the one that computes the tensor.
-        if stream is not None:
-            device = self._tensor.device
-            reader = torch.cuda.ExternalStream(stream, device)
-            reader.wait_stream(torch.cuda.current_stream(device))
-        return torch.utils.dlpack.to_dlpack(self._tensor)
-
-
 class _Carried(NamedTuple):
     """Inputs of the next step in addition to the action."""
 
@@ -258,15 +235,6 @@ class _Carried(NamedTuple):
 def _slim(state: vector.VectorState) -> vector.VectorState:
     """The state without the fields that no step reads."""
     return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
-
-
-def _whole(slim: vector.VectorState, template: Any) -> vector.VectorState:
-    """A slim state with zeros in the missing fields; the compiler removes these zeros."""
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template.env)
-    filled = slim.env.replace(
-        obs=zeros.obs, reward=zeros.reward, done=zeros.done, metrics=zeros.metrics
-    )
-    return slim._replace(env=filled)
 
 
 def _shared_device(wanted: torch.device | None) -> torch.device:
