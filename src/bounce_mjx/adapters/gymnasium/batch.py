@@ -107,23 +107,21 @@ class Batch:
         self,
         seeds: Sequence[int | None],
         generator: np.random.Generator,
-        mask: np.ndarray | None = None,
-        commands: dict[str, float | np.ndarray] | None = None,
+        mask: np.ndarray,
+        commands: dict[str, float | np.ndarray],
     ) -> np.ndarray:
         """Starts new episodes.
 
         Args:
           seeds: seed of each environment; None goes on with its random numbers.
           generator: seeds the environments that have neither a seed nor random numbers yet.
-          mask: environments to reset [B], bool; None for all.
+          mask: environments to reset [B], bool.
           commands: some commands, each [] or [B]; NaN draws it.
 
         Returns:
           The observations of all environments [B, N], float32.
         """
         self._check_process()
-        if mask is None:
-            mask = np.ones(self.num_envs, bool)
         if not mask.all():
             self._check_started()
         if self._episodes is None:
@@ -131,7 +129,7 @@ class Batch:
             seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
         seeded = np.array([s is not None for s in seeds])
         numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
-        given = dict.fromkeys(self.config.commands, np.nan) | (commands or {})
+        given = dict.fromkeys(self.config.commands, np.nan) | commands
         values = {
             name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
             for name, value in given.items()
@@ -261,23 +259,12 @@ def _start(
 
 
 def _first_state(task: Env, key: jax.Array, commands: dict[str, jax.Array]) -> State:
-    """The start of an episode with commands, each []; NaN keeps the drawn one."""
-    state = task.reset(key)
-    start = state.pipeline_state
-    start = start._replace(
-        command={
-            name: jnp.where(jnp.isnan(commands[name]), drawn, commands[name]).astype(drawn.dtype)
-            for name, drawn in start.command.items()
-        }
-    )
-    memory = start.memory
-    if memory is not None and memory.sensing is not None:
-        seen = dict(memory.sensing.seen)
-        for name in start.command.keys() & seen.keys():
-            seen[name] = jnp.full_like(seen[name], start.command[name])
-        memory = memory._replace(sensing=memory.sensing._replace(seen=seen))
-        start = start._replace(memory=memory)
-    return state.replace(pipeline_state=start, obs=task.observe(start))
+    """The start of an episode with commands, each []; NaN draws one."""
+    ranges = task.ranges()
+    for name, own in task.config.commands.items():
+        given = commands[name]
+        ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in (own.low, own.high))
+    return task.reset(key, ranges)
 
 
 def _step(
@@ -337,12 +324,25 @@ def _task_config(task: str | type[Task], settings: dict[str, Any]) -> WorldConfi
         raise UnexpectedArgument(f"{error} ({python})") from error
 
 
-def checked_commands(options: dict[str, Any], commands: dict[str, Command]) -> dict[str, float]:
+def checked_commands(
+    options: dict[str, Any] | None, commands: dict[str, Command], *others: str
+) -> dict[str, float]:
     """The commands among the options of a reset.
 
+    Args:
+      others: names of other options.
+
     Raises:
-      UserError: one is not a number within its limits.
+      UserError: a command is not a number within its limits, or an option is unknown, which is an
+        `UnexpectedArgument`.
     """
+    options, known = options or {}, (*commands, *others)
+    for name in options:
+        if name not in known:
+            raise UnexpectedArgument(
+                f"reset got an unexpected option {name!r}; known options are: "
+                f"{', '.join(known) or 'none'}"
+            )
     return {
         name: command.checked(options[name], f"the option {name}")
         for name, command in commands.items()

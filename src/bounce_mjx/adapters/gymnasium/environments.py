@@ -18,7 +18,6 @@ from gymnasium.vector import AutoresetMode
 from bounce_mjx.adapters.gymnasium.batch import (
     Batch,
     StepArrays,
-    UnexpectedArgument,
     action_space,
     checked_actions,
     checked_commands,
@@ -98,9 +97,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           The first observation [N] and an empty info.
         """
         super().reset(seed=seed)
-        commands = self._batch.config.commands
-        given = checked_commands(checked_options(options, *commands), commands)
-        return self._batch.restart([seed], self.np_random, commands=given)[0], {}
+        given = checked_commands(options, self._batch.config.commands)
+        return self._batch.restart([seed], self.np_random, np.ones(1, bool), given)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances one control step under the action [n].
@@ -197,17 +195,24 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         Returns:
           The observations of all environments [B, N] and an empty info.
         """
-        commands = self._batch.config.commands
-        options = checked_options(options, *commands, "reset_mask")
-        given = checked_commands(options, commands)
-        mask = _checked_mask(options.get("reset_mask"), self.num_envs)
+        given = checked_commands(options, self._batch.config.commands, "reset_mask")
+        mask = _checked_mask((options or {}).get("reset_mask"), self.num_envs)
         seeds = _seeds(seed, self.num_envs)
         super().reset(seed=seeds[0])
-        observation = self._batch.restart(seeds, self.np_random, mask, given)
-        chosen = slice(None) if mask is None else mask
-        self._ended[chosen] = False
-        self._statistics.restart(chosen)
-        return observation, {}
+        return self.restart(seeds, mask, given), {}
+
+    def restart(
+        self,
+        seeds: Sequence[int | None],
+        mask: np.ndarray,
+        commands: dict[str, float | np.ndarray],
+    ) -> np.ndarray:
+        """Starts new episodes where the mask [B] is true: the observations of all environments
+        [B, N]; the arguments are those of `Batch.restart`."""
+        observation = self._batch.restart(seeds, self.np_random, mask, commands)
+        self._ended[mask] = False
+        self._statistics.restart(mask)
+        return observation
 
     def step(
         self, actions: np.ndarray
@@ -302,21 +307,6 @@ class EpisodeStatistics:
         return statistics
 
 
-def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
-    """The options of a reset.
-
-    Raises:
-      UnexpectedArgument: an option is unknown.
-    """
-    unknown = [name for name in options or {} if name not in known]
-    if unknown:
-        raise UnexpectedArgument(
-            f"reset got an unexpected option {unknown[0]!r}; known options are: "
-            f"{', '.join(known) or 'none'}"
-        )
-    return options or {}
-
-
 def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     if not mask.any():
         return {}
@@ -335,10 +325,8 @@ def _seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int |
     return list(seed)
 
 
-def _checked_mask(mask: Any, num_envs: int) -> np.ndarray | None:
-    if mask is None:
-        return None
-    array = np.asarray(mask)
+def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+    array = np.ones(num_envs, bool) if mask is None else np.asarray(mask)
     if array.dtype != bool or array.shape != (num_envs,) or not array.any():
         raise UserError(
             f"the option reset_mask has the type {array.dtype} and the shape {array.shape}, but "

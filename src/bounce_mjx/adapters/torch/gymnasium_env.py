@@ -11,8 +11,11 @@ with needed("Gymnasium", "'bounce_mjx[gymnasium]'"):
     import gymnasium
     from gymnasium.vector import AutoresetMode
 
-from bounce_mjx.adapters.gymnasium.batch import action_space, observation_space
-from bounce_mjx.adapters.gymnasium.environments import checked_options
+from bounce_mjx.adapters.gymnasium.batch import (
+    action_space,
+    checked_commands,
+    observation_space,
+)
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
@@ -45,7 +48,7 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     ) -> tuple[torch.Tensor, dict[str, Any]]:
         """Starts a new episode in every environment: observations [B, N] and an empty info. There
         are no options."""
-        checked_options(options)
+        checked_commands(options, {})
         super().reset(seed=seed)
         observation, _ = self.env.reset(seed)
         return observation, {}
