@@ -303,15 +303,11 @@ class _Builder:
             for body in range(1, model.nbody)
             if body not in chain and model.body_parentid[body] in beyond
         ]
-        moved = {
-            j: int(model.jnt_bodyid[j])
-            for j in range(model.njnt)
-            if model.jnt_bodyid[j] not in chain
-        }
+        bodies = model.jnt_bodyid.tolist()
         beside = [
-            _name(model, joint)
-            for joint, body in moved.items()
-            if joint in actuators and not _is_below(model, body, branches)
+            _name(model, j)
+            for j in sorted(actuators)
+            if bodies[j] not in chain and not _is_below(model, bodies[j], branches)
         ]
         if beside:
             raise UserError(
@@ -319,26 +315,21 @@ class _Builder:
                 f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
                 "arm on a fixed base"
             )
-        return [b for b in branches if any(_is_below(model, m, [b]) for m in moved.values())]
+        return [b for b in branches if any(_is_below(model, body, [b]) for body in bodies)]
 
     def _check_loops(self, joints: list[int]) -> None:
-        model, bodies = self._model, set(self._model.jnt_bodyid[joints].tolist())
-        kinds = mujoco.mjtEq
-        for i in range(model.neq):
-            kind = mujoco.mjtEq(model.eq_type[i])
-            ends = {int(model.eq_obj1id[i]), int(model.eq_obj2id[i])}
-            coupled = kind == kinds.mjEQ_JOINT and ends & set(joints)
-            loop = (
-                kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)
-                and int(model.eq_objtype[i]) == mujoco.mjtObj.mjOBJ_BODY
-                and ends & bodies
+        model, kinds = self._model, mujoco.mjtEq
+        ends = np.stack([model.eq_obj1id, model.eq_obj2id])
+        of_joints = model.eq_type == kinds.mjEQ_JOINT
+        of_bodies = np.isin(model.eq_type, (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD))
+        of_bodies &= model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY
+        coupled = of_joints & np.any(np.isin(ends, joints), axis=0)
+        loops = of_bodies & np.any(np.isin(ends, model.jnt_bodyid[joints]), axis=0)
+        for i in np.flatnonzero(coupled | loops):
+            raise UserError(
+                f"the equality constraint {model.equality(i).name or f'number {i}'} on the arm, so "
+                "it is no serial chain; remove it, or give a serial arm"
             )
-            if coupled or loop:
-                name = model.equality(i).name or f"number {i}"
-                raise UserError(
-                    f"the equality constraint {name} on the arm, so it is no serial chain; remove "
-                    "it, or give a serial arm"
-                )
 
     def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
         """Gives the spec the numbers of the compiled model.
