@@ -56,7 +56,9 @@ class Sb3VecEnv(VecEnv):
         self.render_mode = self._envs.render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
         super().__init__(
-            num_envs, self._envs.single_observation_space, self._envs.single_action_space
+            self._envs.num_envs,
+            self._envs.single_observation_space,
+            self._envs.single_action_space,
         )
         self.metadata["render_fps"] = self._envs.metadata["render_fps"]
 

@@ -95,7 +95,6 @@ class Batch:
         if "episode_seconds" in settings:
             limits.append(self.config.episode_steps)
         self._limit = min(limits)
-        self._programs = _programs_for(self.config, self.num_envs)
         self._episodes: _Episodes | None = None
 
     @property
@@ -181,12 +180,16 @@ class Batch:
         command = {name: float(value[index]) for name, value in state.command.items()}
         return np.array(state.physics.qpos[:, index]), command
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_programs": None, "_episodes": jax.device_get(self._episodes)}
+    @functools.cached_property
+    def _programs(self) -> "_Programs":
+        # An edited file is another model.
+        mjcf = self.config.mjcf
+        edited = mjcf.stat().st_mtime_ns if mjcf and mjcf.exists() else None
+        return _programs(self.config, self.num_envs, edited)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._programs = _programs_for(self.config, self.num_envs)
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__ | {"_episodes": jax.device_get(self._episodes)}
+        return {name: value for name, value in state.items() if name != "_programs"}
 
     def _check_started(self) -> None:
         if self._episodes is None:
@@ -220,12 +223,6 @@ class _Programs(NamedTuple):
     task: Env
     start: Any
     step: Any
-
-
-def _programs_for(config: WorldConfig, num_envs: int) -> _Programs:
-    # An edited file is another model.
-    edited = None if config.mjcf is None or not config.mjcf.exists() else config.mjcf.stat()
-    return _programs(config, num_envs, edited and edited.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=32)

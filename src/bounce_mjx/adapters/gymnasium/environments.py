@@ -14,6 +14,7 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from bounce_mjx.adapters.gymnasium.batch import (
     Batch,
@@ -29,8 +30,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
 
-_FRAMES_PER_SECOND = 100
-
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment.
@@ -39,7 +38,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     `episode_seconds` limits them.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": _FRAMES_PER_SECOND}
+    metadata = {"render_modes": ["rgb_array"]}
 
     def __init__(
         self,
@@ -134,11 +133,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     has the entry `episode` of Gymnasium's `RecordEpisodeStatistics`.
     """
 
-    metadata = {
-        "render_modes": ["rgb_array"],
-        "render_fps": _FRAMES_PER_SECOND,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    metadata = {"render_modes": ["rgb_array"]}
 
     def __init__(
         self,
@@ -169,10 +164,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.render_mode = render_mode
         self.single_action_space = action_space(self.task)
         self.single_observation_space = observation_space(self.task)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.observation_space = gymnasium.vector.utils.batch_space(
-            self.single_observation_space, num_envs
-        )
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self._ended = np.zeros(num_envs, bool)
         self._statistics = EpisodeStatistics(num_envs)
@@ -269,13 +262,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             final_obs = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(self._ended):
                 final_obs[i] = result.final_observation[i]
-            final_info = _masked(result.metrics, self._ended)
-            final_info |= {
-                "episode": _masked(statistics, self._ended),
-                "_episode": self._ended.copy(),
+            ended = self._ended.copy()
+            final_info = _masked(result.metrics, ended) | {
+                "episode": _masked(statistics, ended),
+                "_episode": ended,
             }
-            for name, value in (("final_obs", final_obs), ("final_info", final_info)):
-                info |= {name: value, f"_{name}": self._ended.copy()}
+            info |= {"final_obs": final_obs, "_final_obs": ended}
+            info |= {"final_info": final_info, "_final_info": ended}
         return info
 
 
