@@ -128,7 +128,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     filtered, velocity = env.observation.is_filtered, env.observation.velocity
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
-    limited = m.actuator_forcelimited[servos]
+    torques, limited = m.actuator_forcerange[servos, 1] * gear, m.actuator_forcelimited[servos]
     return Metadata(
         format=FORMAT,
         steps=steps,
@@ -149,10 +149,8 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
         torque_limits=tuple(
-            float(high * g) if is_limited else None
-            for high, g, is_limited in zip(
-                m.actuator_forcerange[servos, 1], gear, limited, strict=True
-            )
+            torque if is_limited else None
+            for torque, is_limited in zip(torques.tolist(), limited, strict=True)
         ),
         default_joint_angles=env.default_joint_angles,
         commands={
