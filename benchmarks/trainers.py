@@ -70,9 +70,9 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the PyTorch adapter."""
-    from bounce_mjx.adapters.torch.trainer import make_learner
+    from bounce_mjx.adapters.torch.trainer import TorchTrainer
 
-    learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
+    (learner,) = TorchTrainer(library, config, BounceBall(config.env)).learners
     _train_learner(learner, config, on_block)
 
 

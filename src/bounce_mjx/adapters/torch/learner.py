@@ -73,41 +73,34 @@ class Learner(abc.ABC):
     def state(self) -> State:
         """Everything that is needed to continue the training, as nested dictionaries of NumPy
         arrays."""
-        return {
-            "modules": {
-                name: {key: _to_array(tensor) for key, tensor in module.state_dict().items()}
-                for name, module in self._modules().items()
-            },
-            "adam": {
-                str(i): {key: _to_array(moment) for key, moment in self._moments(parameter).items()}
-                for i, parameter in enumerate(self._parameters())
-            },
-            "learning_rate": _split_words(np.float64(self.optimizer.param_groups[0]["lr"])),
-            "iteration": np.int32(self.iteration),
-            "env": self.vector.state,
-            "observed": {name: _to_array(tensor) for name, tensor in self._observed().items()},
-            "random": {name: _to_array(tensor) for name, tensor in self._random.items()},
-        }
+        return jax.tree.map(_to_array, self._tensors()) | {"env": self.vector.state}
 
     def restore(self, state: State) -> None:
         """Continues from a `state`."""
+        current = self._tensors()
+        given = {name: state[name] for name in current}
+        tensors = jax.tree.map(_to_tensor, given, current)
         for name, module in self._modules().items():
-            current = module.state_dict()
-            module.load_state_dict(
-                {key: _to_tensor(x, current[key]) for key, x in state["modules"][name].items()}
-            )
+            module.load_state_dict(tensors["modules"][name])
         for i, parameter in enumerate(self._parameters()):
-            self.optimizer.state[parameter] = {
-                key: _to_tensor(state["adam"][str(i)][key], moment)
-                for key, moment in self._moments(parameter).items()
-            }
-        rate = np.asarray(state["learning_rate"])
-        self._set_learning_rate(float(rate.view(np.float64)[0]))
-        self.iteration = int(state["iteration"])
+            self.optimizer.state[parameter] = tensors["adam"][str(i)]
+        self._set_learning_rate(tensors["learning_rate"].item())
+        self.iteration = tensors["iteration"].item()
         self.vector.state = state["env"]
-        observed = self._observed().items()
-        self._observe(**{n: _to_tensor(state["observed"][n], tensor) for n, tensor in observed})
-        self._random = {name: torch.from_numpy(np.array(x)) for name, x in state["random"].items()}
+        self._observe(**tensors["observed"])
+        self._random = tensors["random"]
+
+    def _tensors(self) -> State:
+        """The state without the environments."""
+        rate = self.optimizer.param_groups[0]["lr"]
+        return {
+            "modules": {name: dict(m.state_dict()) for name, m in self._modules().items()},
+            "adam": {str(i): self._moments(p) for i, p in enumerate(self._parameters())},
+            "learning_rate": torch.tensor(rate, dtype=torch.float64),
+            "iteration": torch.tensor(self.iteration, dtype=torch.int32),
+            "observed": self._observed(),
+            "random": self._random,
+        }
 
     def save_model(self, path: Path) -> None:
         """Writes networks, optimizer and iteration in the format of rsl_rl's runner, whose `load`
@@ -176,20 +169,15 @@ def _set_random_state(device: torch.device, states: dict[str, torch.Tensor]) -> 
 
 
 def _to_array(tensor: torch.Tensor) -> np.ndarray:
-    """A copy, because the training reuses the tensor's memory."""
-    return _split_words(tensor.detach().cpu().numpy().copy())
-
-
-def _split_words(array: np.ndarray) -> np.ndarray:
-    """64-bit numbers as pairs of words [..., 2], because JAX reads checkpoints in 32 bits."""
-    array = np.asarray(array)
+    """A copy, because the training reuses the tensor's memory. 64-bit numbers become pairs of words
+    [..., 2], because JAX reads checkpoints in 32 bits."""
+    array = tensor.detach().cpu().numpy().copy()
     return array[..., None].view(np.uint32) if array.dtype.itemsize == 8 else array
 
 
 def _to_tensor(array: jax.Array | np.ndarray, like: torch.Tensor) -> torch.Tensor:
     """The inverse of `_to_array`: a tensor with the type and the device of `like`."""
-    array = np.array(array)
-    wanted = like.detach().cpu().numpy().dtype
-    if wanted.itemsize == 8:
-        array = array.view(wanted)[..., 0]
-    return torch.from_numpy(np.array(array)).to(like.device)
+    tensor = torch.from_numpy(np.array(array))
+    if like.dtype.itemsize == 8:
+        tensor = tensor.view(like.dtype)[..., 0]
+    return tensor.to(like.device)

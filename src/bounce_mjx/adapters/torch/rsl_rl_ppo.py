@@ -66,7 +66,7 @@ class RslRlVecEnv(VecEnv):
         self._seed: int | None = None
         self._observations = self._groups(*env.reset())
         self.result: StepResult | None = None
-        """Result of the last step, if it is not a reset's."""
+        """Result of the last step."""
 
     @property
     def unwrapped(self) -> "RslRlVecEnv":
@@ -92,7 +92,7 @@ class RslRlVecEnv(VecEnv):
     def reset(self) -> tuple[TensorDict, dict[str, Any]]:
         """Starts a new episode in every environment: observations and empty extras."""
         self._observations = self._groups(*self.env.reset(self._seed))
-        self._seed, self.result = None, None
+        self._seed = None
         return self._observations, {}
 
     def close(self) -> None:
@@ -110,11 +110,6 @@ class RslRlVecEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """The current observations."""
         return self._observations
-
-    def set_observations(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> None:
-        """Replaces the current observations [B, N] and critic metrics [B, K], after a new
-        `TorchVectorEnv.state`."""
-        self._observations = self._groups(observation, critic_metrics)
 
     def step(
         self, actions: torch.Tensor
@@ -208,11 +203,10 @@ class RslRlLearner(Learner):
         self.algorithm.learning_rate = rate
 
     def _observed(self) -> dict[str, torch.Tensor]:
-        observations = self.env.get_observations()
-        return {name: observations[name] for name in ("policy", "critic")}
+        return dict(self.env.get_observations().items())
 
-    def _observe(self, policy: torch.Tensor, critic: torch.Tensor) -> None:
-        self.env.set_observations(policy, critic)
+    def _observe(self, **observed: torch.Tensor) -> None:
+        self.env.get_observations().update(observed)
 
 
 def algorithm_config(config: PPOConfig) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class TorchTrainer:
         self.learners: list[Learner] = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             vector = first.sibling(seed) if self.learners else first
-            self.learners.append(_learner_class(library)(config.ppo, vector, seed))
+            self.learners.append(make_learner(library, config.ppo, vector, seed))
 
     def state_template(self) -> Any:
         one = jax.tree.map(np.asarray, self.learners[0].state())
@@ -94,13 +94,14 @@ class TorchTrainer:
             learner.save_model(run / MODEL_FILE)
 
 
-def make_learner(library: str, config: PPOConfig, env: Env, seed: int) -> Learner:
+def make_learner(library: str, config: PPOConfig, vector: TorchVectorEnv, seed: int) -> Learner:
     """The PPO of a library.
 
     Raises:
       UserError: the library is not installed.
     """
-    return _learner_class(library)(config, make_vector_env(config, env, seed), seed)
+    module = importlib.import_module(f"bounce_mjx.adapters.torch.{library}_ppo")
+    return getattr(module, _LEARNERS[library])(config, vector, seed)
 
 
 def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
@@ -122,8 +123,3 @@ def summarize(iterations: Sequence[Metrics], curves: Sequence[Curve]) -> Metrics
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}
     summary = jax.vmap(lambda steps: rollout_metrics(steps, curves))(steps)
     return own | {name: np.asarray(value) for name, value in summary.items()}
-
-
-def _learner_class(library: str) -> type[Learner]:
-    module = importlib.import_module(f"bounce_mjx.adapters.torch.{library}_ppo")
-    return getattr(module, _LEARNERS[library])

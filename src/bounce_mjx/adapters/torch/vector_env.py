@@ -58,7 +58,6 @@ class TorchVectorEnv:
         seed: int = 0,
         critic_metrics: tuple[str, ...] | None = None,
         reward_scale: float = 1.0,
-        device: torch.device | str | None = None,
     ):
         """Compiles nothing; the first calls of `reset` and `step` do.
 
@@ -68,17 +67,16 @@ class TorchVectorEnv:
           critic_metrics: names of the metrics that are additional inputs of the value network;
             a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
-          device: the device of the tensors, which must be JAX's default device; None accepts it.
 
         Raises:
-          UserError: torch cannot use JAX's device, `device` is another one, or a metric is unknown.
+          UserError: torch cannot use JAX's device, or a metric is unknown.
         """
         self.env = env or Env(task_config(DEFAULT)())
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size
         self.episode_steps = self.env.config.episode_steps
-        self.device = _shared_device(None if device is None else torch.device(device))
+        self.device = _shared_device()
         self._reward_scale = reward_scale
         self._key = jax.random.PRNGKey(seed)
         if critic_metrics is None:
@@ -159,21 +157,21 @@ class TorchVectorEnv:
     def clock(self) -> torch.Tensor:
         """Steps of each episode that count towards its time limit [B], int32; a copy. Assign
         different values to spread the time-outs of episodes that began together."""
-        if self._block is None:
-            self.reset()
         # A copy, because the next step reuses the state's memory.
-        carried = self._carried_layout.unpack(self._block)
-        return torch.from_dlpack(jnp.copy(carried.vector.clock))
+        return torch.from_dlpack(jnp.copy(self._carried().vector.clock))
 
     @clock.setter
     def clock(self, value: torch.Tensor) -> None:
-        if self._block is None:
-            self.reset()
         clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32).contiguous())
-        carried = self._carried_layout.unpack(self._block)
+        carried = self._carried()
         self._block = self._carried_layout.pack(
             carried._replace(vector=carried.vector._replace(clock=clock))
         )
+
+    def _carried(self) -> "_Carried":
+        if self._block is None:
+            self.reset()
+        return self._carried_layout.unpack(self._block)
 
     def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
@@ -237,7 +235,7 @@ def _slim(state: vector.VectorState) -> vector.VectorState:
     return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
 
 
-def _shared_device(wanted: torch.device | None) -> torch.device:
+def _shared_device() -> torch.device:
     """The torch device of JAX's default device."""
     device = jax.devices()[0]
     if device.platform == "gpu" and not torch.cuda.is_available():
@@ -246,16 +244,9 @@ def _shared_device(wanted: torch.device | None) -> torch.device:
             "PyTorch with CUDA, or start with JAX_PLATFORMS=cpu"
         )
     try:
-        shared = torch.from_dlpack(jnp.zeros(1)).device
+        return torch.from_dlpack(jnp.zeros(1)).device
     except Exception as error:
         raise UserError(
             f"PyTorch cannot use the memory of JAX's {device.platform} device "
             f"({str(error).splitlines()[0]}); start with JAX_PLATFORMS=cpu"
         ) from error
-    same = wanted is None or (wanted.type == shared.type and wanted.index in (None, shared.index))
-    if not same:
-        raise UserError(
-            f"device is {wanted}, but JAX's arrays lie on {shared}; omit it, or choose JAX's "
-            "device with JAX_PLATFORMS"
-        )
-    return shared
