@@ -103,40 +103,39 @@ class SkrlJaxLearner:
         self._states = add_metrics(vector.observe(self._env_state), self._env_state.env.metrics)
         self._iteration = 0
 
-    def learn(self, iterations: int) -> None:
-        """Trains for `iterations`."""
+    def learn(self) -> None:
+        """Trains for an iteration."""
         clock = {"timestep": 0, "timesteps": 0}
-        for _ in range(iterations):
-            schedule = KLAdaptiveLR(**self._schedule(self._iteration))
-            self.agent.policy_scheduler = self.agent.value_scheduler = schedule
-            self._iteration += 1
-            self.agent.tracking_data.clear()
-            for _ in range(self.config.rollout_length):
-                n = self._observation_size
-                states = self._states
-                actions, _ = self.agent.act(states[:, :n], states, **clock)
-                (
-                    self._env_state,
-                    self._key,
-                    self._states,
-                    final_states,
-                    rewards,
-                    terminated,
-                    truncated,
-                ) = self._step_env(self._env_state, actions, self._key)
-                self.agent.record_transition(
-                    observations=states[:, :n],
-                    states=states,
-                    actions=actions,
-                    rewards=rewards,
-                    next_observations=final_states[:, :n],
-                    next_states=final_states,
-                    terminated=terminated,
-                    truncated=truncated,
-                    infos={},
-                    **clock,
-                )
-                self.agent.post_interaction(**clock)
+        schedule = KLAdaptiveLR(**self._schedule(self._iteration))
+        self.agent.policy_scheduler = self.agent.value_scheduler = schedule
+        self._iteration += 1
+        self.agent.tracking_data.clear()
+        for _ in range(self.config.rollout_length):
+            n = self._observation_size
+            states = self._states
+            actions, _ = self.agent.act(states[:, :n], states, **clock)
+            (
+                self._env_state,
+                self._key,
+                self._states,
+                final_states,
+                rewards,
+                terminated,
+                truncated,
+            ) = self._step_env(self._env_state, actions, self._key)
+            self.agent.record_transition(
+                observations=states[:, :n],
+                states=states,
+                actions=actions,
+                rewards=rewards,
+                next_observations=final_states[:, :n],
+                next_states=final_states,
+                terminated=terminated,
+                truncated=truncated,
+                infos={},
+                **clock,
+            )
+            self.agent.post_interaction(**clock)
 
     def policy(self) -> Policy:
         """The current policy, without action noise."""

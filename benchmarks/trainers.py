@@ -70,9 +70,9 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
     """A PyTorch library on the PyTorch adapter."""
-    from bounce_mjx.adapters.torch.trainer import make_learner
+    from bounce_mjx.adapters.torch.trainer import TorchTrainer
 
-    learner = make_learner(library, config.ppo, BounceBall(config.env), config.seed)
+    (learner,) = TorchTrainer(library, config, BounceBall(config.env)).learners
     _train_learner(learner, config, on_block)
 
 
@@ -90,7 +90,8 @@ def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
     steps, ended = 0, False
     while not ended:
         started = time.perf_counter()
-        learner.learn(iterations)
+        for _ in range(iterations):
+            learner.learn()
         # Reading the policy waits until the device has computed it.
         policy = jax.block_until_ready(learner.policy())
         seconds = time.perf_counter() - started

@@ -487,9 +487,7 @@ def test_paddle_position_is_that_of_mujoco(edited: bool, tmp_path: Path) -> None
         angles = rng.uniform(-2.0, 2.0, 6)
         data.qpos[:6] = angles
         mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(
-            chain.paddle_position(angles), data.geom("blocker").xpos, atol=1e-12
-        )
+        np.testing.assert_allclose(chain.paddle(angles)[0], data.geom("blocker").xpos, atol=1e-12)
 
 
 def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
@@ -558,7 +556,7 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     policy = load_policy(make_run(tmp_path / "run", {"observation": lengths}))
     chain, times = Chain(policy.metadata), np.arange(200) * env.control_dt
     angles = np.array(env.default_joint_angles) + 0.05 * np.sin(times[:, None] * np.arange(3, 9))
-    paddle = np.array([chain.paddle_position(a) for a in angles])
+    paddle = np.array([chain.paddle(a)[0] for a in angles])
     ball = paddle + rng.normal(scale=0.01, size=paddle.shape)
     ball[:, 2] += 0.4 * np.abs(np.sin(5.0 * times)) + 0.02
     truth = Kinematics(

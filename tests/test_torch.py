@@ -33,7 +33,7 @@ from bounce_mjx.adapters.torch.networks import (
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
 from bounce_mjx.adapters.torch.skrl_ppo import SkrlEnv
-from bounce_mjx.adapters.torch.trainer import make_learner, summarize
+from bounce_mjx.adapters.torch.trainer import make_learner, make_vector_env, summarize
 from bounce_mjx.env import vector
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
@@ -73,8 +73,13 @@ def env(task) -> TorchVectorEnv:
 @pytest.fixture(scope="module")
 def learners(task):
     """A learner of each library after two iterations."""
-    made = {library: make_learner(library, PPO, task, 0) for library in LIBRARIES}
-    return {library: (learner, learner.learn(2)) for library, learner in made.items()}
+    made = {
+        library: make_learner(library, PPO, make_vector_env(PPO, task, 0), 0)
+        for library in LIBRARIES
+    }
+    return {
+        library: (learner, [learner.learn() for _ in range(2)]) for library, learner in made.items()
+    }
 
 
 def random_actions(steps: int) -> torch.Tensor:
@@ -244,8 +249,6 @@ def test_wrong_action_is_refused(env, action, given, advice):
 
 
 def test_wrong_environment_is_refused(task):
-    with pytest.raises(UserError, match="device is meta, but JAX's arrays lie on"):
-        TorchVectorEnv(task, NUM_ENVS, device="meta")
     with pytest.raises(
         UserError, match="bounces, which the environment .* choose from .*n_bounces"
     ):
@@ -286,7 +289,7 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     assert after["policy"].shape == (NUM_ENVS, 29) and after["critic"].shape == (NUM_ENVS, 1)
     assert vec_env.get_observations() is after
     # In one step of 10 ms nothing moves far, but a reset draws another target height.
-    terminal = vec_env.terminal_observations()["policy"]
+    terminal = vec_env.result.final_observation
     torch.testing.assert_close(terminal[:, 28], before[:, 28])
     assert torch.equal(terminal[1:], after["policy"][1:])
     assert terminal[0, 28] != after["policy"][0, 28]
@@ -404,7 +407,7 @@ def test_skrl_bootstraps_time_outs_from_the_terminal_observations(learners):
     agent, at = learner.agent, learner.agent.memory.memory_index
     learner.vector.clock = torch.full((PPO.num_envs,), EPISODE_STEPS - 1, dtype=torch.int32)
     learner._step()
-    result = learner.env._result
+    result = learner.env.result
     _, states = learner.env.terminal_observations()
     with torch.no_grad():
         value, _ = agent.value.act({"states": agent._state_preprocessor(states)}, role="value")
@@ -574,6 +577,7 @@ def test_training_makes_episodes_longer(library):
     config = PPOConfig(
         num_envs=256, rollout_length=24, num_minibatches=4, num_epochs=4, hidden_layers=(64, 64)
     )
-    learner = make_learner(library, config, task, 0)
-    lengths = summarize(learner.learn(35), task.task.curves)["episode/length"]
+    learner = make_learner(library, config, make_vector_env(config, task, 0), 0)
+    metrics = [learner.learn() for _ in range(35)]
+    lengths = summarize(metrics, task.task.curves)["episode/length"]
     assert lengths[-5:].mean() > 1.3 * lengths[:5].mean()

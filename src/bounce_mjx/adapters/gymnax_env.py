@@ -48,6 +48,9 @@ class Box:
 class GymnaxBounceBall:
     """One environment in the form of gymnax 1.x; an ended episode is reset within the step."""
 
+    name = "BounceBall"
+    """Name of the environment."""
+
     def __init__(self, task: str | type[Task] = DEFAULT, **settings: Any):
         """Makes the environment.
 
@@ -59,21 +62,10 @@ class GymnaxBounceBall:
           UserError: a setting is wrong.
         """
         self.task = Env(validate(task_config(task), settings, self.name))
-
-    @property
-    def name(self) -> str:
-        """Name of the environment."""
-        return "BounceBall"
-
-    @property
-    def default_params(self) -> EnvParams:
+        self.default_params = EnvParams(self.task.config.episode_steps)
         """The time limit of the settings."""
-        return EnvParams(self.task.config.episode_steps)
-
-    @property
-    def num_actions(self) -> int:
+        self.num_actions = self.task.action_size
         """Length of the action vector."""
-        return self.task.action_size
 
     def action_space(self, params: EnvParams | None = None) -> Box:
         """The space of the actions."""

@@ -19,7 +19,7 @@ The friction and the solref of the two geoms act as in a contact without a pair.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from bounce_mjx.physics.parameters import (
     to_direct_solref,
 )
 from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.numbers import DERIVED_FIELDS
 from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
 
 Fields = dict[str, Any]
@@ -95,29 +96,40 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     Raises:
       UserError: a changed field does not correspond to a parameter.
     """
-    changed = _changed_fields(base, model)
-    batches, base_fields = _batches(changed), dict(_fields_of(base))
+    before = dict(_fields_of(base))
+    changed = {
+        name: value
+        for name, value in _fields_of(model)
+        if value is not before[name] and not _equal(value, before[name])
+    }
+    batches = _batches(changed)
     varied = {
-        name: np.any(batch != np.asarray(base_fields[name]), axis=0)
-        for name, batch in batches.items()
+        name: np.any(batch != np.asarray(before[name]), axis=0) for name, batch in batches.items()
     }
     varied = {name: mask for name, mask in varied.items() if mask.any()}
-    if not varied:
-        return PhysicsParameters()
-    contact = [name for name in varied if name in _CONTACT_FIELDS]
+    contact = sorted(varied.keys() & _CONTACT_FIELDS)
     if len({name.split("_")[1] for name in contact}) < len(contact):
         raise UserError(
             f"randomization_fn changes {' and '.join(contact)}, and only the pair's value would "
             "act; change one of them"
         )
-    for name in sorted(varied.keys() - _FIELDS - _DERIVED):
+    sources = _sources(mj_model, contact_pair(mj_model) if contact else None)
+    known = {source.field for source in sources}
+    for name in sorted(varied.keys() - known - DERIVED_FIELDS):
         raise UserError(
             f"randomization_fn changes {name}, which this physics cannot vary between "
-            f"environments; leave it out, or change {', '.join(sorted(_FIELDS))}"
+            f"environments; leave it out, or change {', '.join(sorted(known))}"
         )
-    _check_acting(mj_model, varied)
-    _check_effect(mj_model, base_fields, batches, varied)
-    return _read(mj_model, changed, varied)
+    acting = [s for s in sources if s.field in varied and varied[s.field][s.index].any()]
+    _check_effect(mj_model, before, batches, varied, acting)
+    # Entries of these fields may change without an effect in MuJoCo too.
+    silent = varied.keys() & {*_CONTACT_FIELDS, "body_mass"}
+    for name in sorted(silent - {source.field for source in acting}):
+        raise UserError(
+            f"randomization_fn changes {name}, but not the entries of the ball, the paddle or the "
+            "links, so it would have no effect; change those, or leave it out"
+        )
+    return _read(acting, changed, jnp)
 
 
 def randomized_task(task: Env, mj_model: mujoco.MjModel, base: Any, model: Any) -> Env:
@@ -131,130 +143,77 @@ def randomized_task(task: Env, mj_model: mujoco.MjModel, base: Any, model: Any) 
     return Env(task.config, randomize=lambda key: parameters)
 
 
-def _check_acting(mj_model: mujoco.MjModel, varied: Fields) -> None:
-    """Checks that each field changes an entry with an effect.
-
-    Raises:
-      UserError: only the torsion, or only objects that touch nothing, change in a field.
-    """
-    addresses = find_addresses(mj_model)
-    geoms = [addresses.ball_geom, addresses.paddle_geom]
-    acting = {
-        "geom_friction": (geoms, 0),
-        "geom_solref": (geoms,),
-        "body_mass": (slice(1, None),),
-    }
-    if "pair_friction" in varied or "pair_solref" in varied:
-        pair = contact_pair(mj_model)
-        acting |= {"pair_friction": (pair, slice(0, 2)), "pair_solref": (pair,)}
-    for name, index in acting.items():
-        if name in varied and not varied[name][index].any():
-            raise UserError(
-                f"randomization_fn changes {name}, but not the entries of the ball, the paddle or "
-                "the links, so it would have no effect; change those, or leave it out"
-            )
-
-
 class _Source(NamedTuple):
-    """The entries of a field that hold a parameter."""
+    """The entries of a field that hold parameters."""
 
     field: str
     index: Any
-    sign: float = 1.0
+    read: Callable[[Any, ModuleType], Fields]
+    """(entries, numpy or jax.numpy) -> parameters by name."""
 
 
-_FIELDS = frozenset(
-    (
-        "actuator_biasprm",
-        "actuator_forcerange",
-        "actuator_gainprm",
-        "body_mass",
-        "dof_armature",
-        "dof_damping",
-        "dof_frictionloss",
-        "geom_friction",
-        "geom_pos",
-        "geom_quat",
-        "geom_size",
-        "geom_solref",
-        "opt.gravity",
-        "pair_friction",
-        "pair_solref",
-    )
-)
-_CONTACT_FIELDS = ("geom_friction", "geom_solref", "pair_friction", "pair_solref")
-# Fields that follow from others, which a randomization_fn may keep consistent.
-_DERIVED = frozenset(
-    (
-        "body_inertia",
-        "body_invweight0",
-        "body_subtreemass",
-        "dof_M0",
-        "geom_aabb",
-        "geom_rbound",
-    )
-)
+_CONTACT_FIELDS = {"geom_friction", "geom_solref", "pair_friction", "pair_solref"}
 
 
-def _sources(mj_model: mujoco.MjModel) -> dict[str, _Source]:
-    addresses = find_addresses(mj_model)
+def _sources(mj_model: mujoco.MjModel, pair: int | None) -> list[_Source]:
+    """Every source of a parameter; `pair` is the contact pair, if a contact field varies."""
+    m, addresses = mj_model, find_addresses(mj_model)
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
-    paddle = addresses.paddle_geom
-    return {
-        "ball_mass": _Source("body_mass", addresses.ball_body),
-        "ball_radius": _Source("geom_size", (addresses.ball_geom, 0)),
-        "servo_gain": _Source("actuator_gainprm", (servos, 0)),
-        "servo_damping": _Source("actuator_biasprm", (servos, 2), -1.0),
-        "force_limit": _Source("actuator_forcerange", (servos, 1)),
-        "armature": _Source("dof_armature", dofs),
-        "damping": _Source("dof_damping", dofs),
-        "frictionloss": _Source("dof_frictionloss", dofs),
-        "paddle_position": _Source("geom_pos", paddle),
-        "paddle_rotation": _Source("geom_quat", paddle),
-        "gravity": _Source("opt.gravity", slice(None)),
-    }
+    paddle, geoms = addresses.paddle_geom, [addresses.ball_geom, addresses.paddle_geom]
+    links = link_bodies(m)
+    ends = np.cumsum([len(bodies) for bodies in links])[:-1]
+
+    def alone(parameter: str) -> Callable[[Any, ModuleType], Fields]:
+        return lambda x, xp: {parameter: x}
+
+    def contact(solref: Any, xp: ModuleType) -> Fields:
+        direct = to_direct_solref(solref, m.opt.timestep, xp)
+        return dict(zip(("contact_stiffness", "contact_damping"), direct, strict=True))
+
+    return [
+        _Source("body_mass", addresses.ball_body, alone("ball_mass")),
+        _Source("geom_size", (addresses.ball_geom, 0), alone("ball_radius")),
+        _Source("actuator_gainprm", (servos, 0), alone("servo_gain")),
+        _Source("actuator_biasprm", (servos, 2), lambda x, xp: {"servo_damping": -x}),
+        _Source("actuator_forcerange", (servos, 1), alone("force_limit")),
+        _Source("dof_armature", dofs, alone("armature")),
+        _Source("dof_damping", dofs, alone("damping")),
+        _Source("dof_frictionloss", dofs, alone("frictionloss")),
+        _Source("geom_pos", paddle, alone("paddle_position")),
+        _Source("geom_quat", paddle, alone("paddle_rotation")),
+        _Source("opt.gravity", slice(None), alone("gravity")),
+        _Source(
+            "body_mass",
+            np.concatenate(links),
+            lambda x, xp: {"link_mass": xp.stack([part.sum() for part in xp.split(x, ends)])},
+        ),
+        _Source("pair_friction", (pair, slice(0, 2)), lambda x, xp: {"contact_friction": x[0]}),
+        _Source(
+            "geom_friction",
+            (geoms, 0),
+            lambda x, xp: {"contact_friction": _combined(m, geoms, x)},
+        ),
+        _Source("pair_solref", pair, contact),
+        _Source("geom_solref", geoms, lambda x, xp: contact(mixed_solref(m, geoms, *x, xp), xp)),
+    ]
 
 
-def _read(
-    mj_model: mujoco.MjModel, changed: Fields, varied: Fields, xp: ModuleType = jnp
-) -> PhysicsParameters:
-    """The parameters of one environment.
+def _read(sources: Sequence[_Source], fields: Fields, xp: ModuleType) -> PhysicsParameters:
+    """The parameters of one environment from the fields of its model.
 
     Args:
-      changed: fields of its model.
-      xp: numpy or jax.numpy, for the arrays in `changed`.
-      varied: mask of the entries of each field that differ between environments.
+      xp: numpy or jax.numpy, for the arrays.
     """
-    given = {
-        parameter: source.sign * xp.asarray(changed[source.field])[source.index]
-        for parameter, source in _sources(mj_model).items()
-        if source.field in varied and varied[source.field][source.index].any()
-    }
-    addresses, links = find_addresses(mj_model), link_bodies(mj_model)
-    geoms = addresses.ball_geom, addresses.paddle_geom
-    if "body_mass" in varied and varied["body_mass"][np.concatenate(links)].any():
-        mass = xp.asarray(changed["body_mass"])
-        given["link_mass"] = xp.stack([mass[np.asarray(bodies)].sum() for bodies in links])
-    if "pair_friction" in varied:
-        given["contact_friction"] = changed["pair_friction"][contact_pair(mj_model), 0]
-    if "geom_friction" in varied and varied["geom_friction"][geoms, 0].any():
-        values = xp.asarray(changed["geom_friction"])[geoms, 0]
-        given["contact_friction"] = _combined(mj_model, geoms, values)
-    solref = None
-    if "pair_solref" in varied:
-        solref = changed["pair_solref"][contact_pair(mj_model)]
-    if "geom_solref" in varied and varied["geom_solref"][geoms, :].any():
-        solref = mixed_solref(mj_model, geoms, *xp.asarray(changed["geom_solref"])[geoms, :], xp)
-    if solref is not None:
-        direct = to_direct_solref(solref, mj_model.opt.timestep, xp)
-        given["contact_stiffness"], given["contact_damping"] = direct
+    given = {}
+    for source in sources:
+        given |= source.read(xp.asarray(fields[source.field])[source.index], xp)
     return PhysicsParameters(**given)
 
 
-def _combined(mj_model: mujoco.MjModel, geoms: tuple[int, int], values: jax.Array) -> jax.Array:
+def _combined(mj_model: mujoco.MjModel, geoms: list[int], values: jax.Array) -> jax.Array:
     """Friction [] of a contact of two geoms with the frictions [2]: the larger value, or the value
     of the geom with the higher priority."""
-    first, second = mj_model.geom_priority[list(geoms)]
+    first, second = mj_model.geom_priority[geoms]
     if first == second:
         return values.max()
     return values[0] if first > second else values[1]
@@ -262,7 +221,7 @@ def _combined(mj_model: mujoco.MjModel, geoms: tuple[int, int], values: jax.Arra
 
 def mixed_solref(
     mj_model: mujoco.MjModel,
-    geoms: tuple[int, int],
+    geoms: Sequence[int],
     first: jax.Array,
     second: jax.Array,
     xp: ModuleType = jnp,
@@ -279,37 +238,44 @@ def mixed_solref(
     return xp.where((first[0] > 0.0) & (second[0] > 0.0), mean, xp.minimum(first, second))
 
 
-def _check_effect(mj_model: mujoco.MjModel, base: Fields, batches: Fields, varied: Fields) -> None:
+def _check_effect(
+    mj_model: mujoco.MjModel,
+    base: Fields,
+    batches: Fields,
+    varied: Fields,
+    acting: Sequence[_Source],
+) -> None:
     """Checks that the parameters give each changed entry its new value.
+
+    Args:
+      base: fields of the environment's model.
+      batches: the changed fields with a batch axis, which may have the length 1.
+      varied: masks of the changed entries.
+      acting: sources of the parameters that change.
 
     Raises:
       UserError: an entry with an effect in MuJoCo would have none here.
     """
-
     names = list(varied)
     if "actuator_gainprm" in varied and "actuator_biasprm" not in varied:
         # A position servo needs kp in both.
         names.append("actuator_biasprm")
-
-    def effect(index: int) -> Fields:
-        fields = {name: batches[name][min(index, len(batches[name]) - 1)] for name in varied}
-        edited, options = edited_fields(mj_model, _read(mj_model, fields, varied, np))
+    silent = {name: _without_effect(mj_model, name) for name in names}
+    for i in range(max(map(len, batches.values()), default=0)):
+        fields = {name: batches[name][min(i, len(batches[name]) - 1)] for name in varied}
+        edited, options = edited_fields(mj_model, _read(acting, fields, np))
         edited |= {f"opt.{name}": value for name, value in options.items()}
-        return {name: edited.get(name, np.asarray(base[name])) for name in names}
-
-    each = [effect(i) for i in range(max(len(batches[name]) for name in varied))]
-    effects = {name: np.stack([one[name] for one in each]) for name in names}
-    for name in names:
-        wanted, given = batches.get(name, np.asarray(base[name])), effects[name]
-        wrong = np.any(np.abs(wanted - given) > 1e-4 * np.abs(wanted) + 1e-9, axis=0)
-        wrong &= ~_without_effect(mj_model, name)
-        if wrong.any():
-            index = tuple(int(i) for i in np.argwhere(wrong)[0])
-            raise UserError(
-                f"randomization_fn changes {name}{list(index)}{_owner(mj_model, name, index)} in "
-                "a way that no parameter of this physics expresses; leave it out, or see the "
-                "table in docs/jax.md"
-            )
+        for name in names:
+            wanted = fields.get(name, np.asarray(base[name]))
+            given = edited.get(name, np.asarray(base[name]))
+            differs = np.abs(wanted - given) > 1e-4 * np.abs(wanted) + 1e-9
+            wrong = differs & ~silent[name]
+            if wrong.any():
+                raise UserError(
+                    f"randomization_fn changes {name}{np.argwhere(wrong)[0].tolist()} in a way "
+                    "that no parameter of this physics expresses; leave it out, or see the table "
+                    "in docs/jax.md"
+                )
 
 
 def _without_effect(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
@@ -330,17 +296,6 @@ def _without_effect(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
     return mask
 
 
-def _owner(mj_model: mujoco.MjModel, name: str, index: tuple[int, ...]) -> str:
-    """The name of the object to which an entry belongs, in brackets."""
-    kind = name.split("_")[0]
-    if kind == "dof":
-        kind, index = "joint", (int(mj_model.dof_jntid[index[0]]),)
-    if kind not in ("actuator", "body", "geom", "joint", "pair"):
-        return ""
-    owner = getattr(mj_model, kind)(index[0]).name
-    return f" ({owner})" if owner else ""
-
-
 def _fields_of(model: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Names and values of a model's fields, and of the structures in it."""
     for field in dataclasses.fields(model):
@@ -349,20 +304,6 @@ def _fields_of(model: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from _fields_of(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value
-
-
-def _changed_fields(base: Any, model: Any) -> Fields:
-    """The fields of a model that differ from those of `base`, or may differ in a batch."""
-    before = dict(_fields_of(base))
-    changed = {}
-    for name, value in _fields_of(model):
-        old = before.get(name)
-        same = value is old
-        if not same and not isinstance(value, jax.core.Tracer):
-            same = _equal(value, old)
-        if not same:
-            changed[name] = value
-    return changed
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -1,6 +1,6 @@
 """Stable-Baselines3's `VecEnv` over a whole batch; SBX uses it too. It needs the extra `sb3`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -9,24 +9,13 @@ from bounce_mjx.errors import UserError, needed
 
 with needed("Stable-Baselines3", "'bounce_mjx[sb3]'"):
     import gymnasium
+    from gymnasium.vector import AutoresetMode
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecEnv
 
-from bounce_mjx.adapters.gymnasium.batch import (
-    Batch,
-    action_space,
-    checked_commands,
-    observation_space,
-)
-from bounce_mjx.adapters.gymnasium.environments import (
-    EpisodeStatistics,
-    TaskEnv,
-    checked_options,
-)
-from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.adapters.gymnasium.batch import checked_commands
+from bounce_mjx.adapters.gymnasium.environments import TaskEnv, TaskVectorEnv
 from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
-from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
 
 _SHOWN = 4
 
@@ -42,39 +31,36 @@ class Sb3VecEnv(VecEnv):
     def __init__(
         self,
         num_envs: int = 256,
-        task: str | type[Task] = DEFAULT,
-        render_mode: str | None = None,
         max_episode_steps: int | None = MAX_EPISODE_STEPS,
-        width: int = WIDTH,
-        height: int = HEIGHT,
-        camera: str | None = None,
         **settings: Any,
     ):
         """Makes the environments; the first reset compiles them.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS.
-          render_mode: "rgb_array" for pictures, in which the first four environments are tiled.
           max_episode_steps: time limit of an episode in steps.
-          width: of an environment's picture, in pixels, as is `height`.
-          camera: name of a camera of the model; None for the overview.
-          settings: fields of the task's config, such as episode_seconds=30.
+          settings: other arguments of `TaskVectorEnv`, such as episode_seconds=30. Of pictures, the
+            first four environments are tiled.
 
         Raises:
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        check_render_mode(render_mode)
-        self._batch = Batch(task, settings, num_envs, max_episode_steps)
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
-        self._statistics = EpisodeStatistics(num_envs)
+        self._envs = TaskVectorEnv(
+            num_envs=num_envs,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+            **settings,
+        )
+        self._batch = self._envs._batch
         self._actions: np.ndarray | None = None
-        self.render_mode = render_mode
+        self.render_mode = self._envs.render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
         super().__init__(
-            self._batch.num_envs, observation_space(self.task), action_space(self.task)
+            self._envs.num_envs,
+            self._envs.single_observation_space,
+            self._envs.single_action_space,
         )
-        self.metadata["render_fps"] = round(1.0 / self.dt)
+        self.metadata["render_fps"] = self._envs.metadata["render_fps"]
 
     task, dt, mj_model = TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
 
@@ -96,28 +82,23 @@ class Sb3VecEnv(VecEnv):
         Returns:
           Observations [B, N], rewards [B], dones [B], and an info of each environment.
         """
-        result = self._batch.step(self._actions, reset_after=True)
-        ended = result.terminated | result.truncated
-        statistics = self._statistics.step(result.reward, ended)
+        observation, reward, terminated, truncated, info = self._envs.step(self._actions)
+        ended = terminated | truncated
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in ended]
         for i in np.flatnonzero(ended):
-            infos[i] = {name: float(value[i]) for name, value in result.metrics.items()} | {
-                "TimeLimit.truncated": bool(result.truncated[i] and not result.terminated[i]),
-                "terminal_observation": result.final_observation[i],
-                "episode": {name: value[i].item() for name, value in statistics.items()},
+            infos[i] = _row(info["final_info"], i) | {
+                "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
+                "terminal_observation": info["final_obs"][i],
             }
-        return result.observation, result.reward.astype(np.float32), ended, infos
+        return observation, reward.astype(np.float32), ended, infos
 
     def get_images(self) -> list[np.ndarray | None]:
         """Pictures of the first four environments, each [height, width, 3], uint8."""
-        if self._pictures is None:
-            return [None] * self.num_envs
-        return [self._picture(i) for i in range(min(self.num_envs, _SHOWN))]
+        return self._drawn(range(min(self.num_envs, _SHOWN)))
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """A common attribute of the environments, once for each index."""
@@ -149,7 +130,7 @@ class Sb3VecEnv(VecEnv):
         """
         methods: dict[str, Callable[..., list[Any]]] = {
             "reset": self._reset_some,
-            "render": lambda chosen: [self._pictures and self._picture(i) for i in chosen],
+            "render": self._drawn,
             "get_wrapper_attr": lambda chosen, name: self.get_attr(name, chosen),
         }
         if method_name not in methods:
@@ -179,10 +160,18 @@ class Sb3VecEnv(VecEnv):
     ) -> np.ndarray:
         mask = np.isin(np.arange(self.num_envs), chosen)
         commands = self._batch.config.commands
-        given = [checked_commands(checked_options(o, *commands), commands) for o in options]
+        given = [checked_commands(one, commands) for one in options]
         values = {name: np.array([one.get(name, np.nan) for one in given]) for name in commands}
-        self._statistics.restart(mask)
-        return self._batch.restart(seeds, np.random.default_rng(), mask, values)
+        return self._envs.restart(seeds, mask, values)
 
-    def _picture(self, index: int) -> np.ndarray:
-        return self._pictures.draw(self.task, *self._batch.pose(index))
+    def _drawn(self, chosen: Iterable[int]) -> list[np.ndarray | None]:
+        return [self._envs._pictures.draw(i) for i in chosen]
+
+
+def _row(info: dict[str, Any], index: int) -> dict[str, Any]:
+    """One environment's part of a vector's info, in which masks start with an underscore."""
+    return {
+        name: _row(value, index) if isinstance(value, dict) else value[index].item()
+        for name, value in info.items()
+        if not name.startswith("_")
+    }

@@ -20,10 +20,6 @@ class Chain:
         self._sine_term = self._fixed @ cross
         self._cosine_term = self._sine_term @ cross
 
-    def paddle_position(self, joint_angles: np.ndarray) -> np.ndarray:
-        """World position [3] of the paddle's centre at joint angles [J] (rad), m."""
-        return self.paddle(joint_angles)[0]
-
     def paddle(self, joint_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World position [3] (m) of the paddle's centre, and upward unit normal [3] of the paddle,
         at joint angles [J] (rad)."""

@@ -128,7 +128,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     filtered, velocity = env.observation.is_filtered, env.observation.velocity
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
-    limited = m.actuator_forcelimited[servos]
+    torques, limited = m.actuator_forcerange[servos, 1] * gear, m.actuator_forcelimited[servos]
     return Metadata(
         format=FORMAT,
         steps=steps,
@@ -149,10 +149,8 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
         torque_limits=tuple(
-            float(high * g) if is_limited else None
-            for high, g, is_limited in zip(
-                m.actuator_forcerange[servos, 1], gear, limited, strict=True
-            )
+            torque if is_limited else None
+            for torque, is_limited in zip(torques.tolist(), limited, strict=True)
         ),
         default_joint_angles=env.default_joint_angles,
         commands={
@@ -178,50 +176,39 @@ def _hinges(
     m: mujoco.MjModel, default_joint_angles: Sequence[float]
 ) -> tuple[tuple[Hinge, ...], tuple[float, ...], tuple[float, ...]]:
     """Hinges from the world to the paddle, and in the last hinge's frame the paddle's centre and
-    the normal of the face that is the upper one at the default joint angles."""
-    addresses = find_addresses(m)
+    the normal of the face that is the upper one at the default joint angles.
+
+    With the joints at their references, every hinge's frame has the axes of the world.
+    """
+    addresses, data = find_addresses(m), mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
     body = m.geom_bodyid[addresses.paddle_geom]
-    bodies = [body]
-    while body := m.body_parentid[body]:
-        bodies.append(body)
-    position, quaternion, links = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), []
-    for body in reversed(bodies):
-        position = position + _rotated(m.body_pos[body], quaternion)
-        quaternion = _product(quaternion, m.body_quat[body])
-        first = m.body_jntadr[body]
-        for joint in range(first, first + m.body_jntnum[body]):
-            is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-            if joint not in addresses.arm_joints or not is_hinge:
-                raise UserError(
-                    f"the paddle hangs on the joint {joint_name(m, joint)!r}, and a policy can be "
-                    "exported for hinges with servos only; remove the joint from the MJCF"
-                )
-            anchor = m.jnt_pos[joint]
-            links.append(
-                Hinge(
-                    joint=addresses.arm_joints.index(joint),
-                    position=tuple((position + _rotated(anchor, quaternion)).tolist()),
-                    quaternion=tuple(quaternion.tolist()),
-                    axis=tuple(m.jnt_axis[joint].tolist()),
-                    reference=float(m.qpos0[m.jnt_qposadr[joint]]),
-                )
+    moving = m.body_weldid[body]
+    dof, joints = m.body_dofadr[moving] + m.body_dofnum[moving] - 1, []
+    while dof >= 0:
+        joints.append(int(m.dof_jntid[dof]))
+        dof = m.dof_parentid[dof]
+    anchor, links = np.zeros(3), []
+    for joint in reversed(joints):
+        is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        if joint not in addresses.arm_joints or not is_hinge:
+            raise UserError(
+                f"the paddle hangs on the joint {joint_name(m, joint)!r}, and a policy can be "
+                "exported for hinges with servos only; remove the joint from the MJCF"
             )
-            position, quaternion = -anchor, np.array([1.0, 0.0, 0.0, 0.0])
-    centre = position + _rotated(m.geom_pos[addresses.paddle_geom], quaternion)
-    normal = _rotated(paddle_normal(m, default_joint_angles), quaternion)
+        links.append(
+            Hinge(
+                joint=addresses.arm_joints.index(joint),
+                position=tuple((data.xanchor[joint] - anchor).tolist()),
+                quaternion=(1.0, 0.0, 0.0, 0.0),
+                axis=tuple(data.xaxis[joint].tolist()),
+                reference=float(m.qpos0[m.jnt_qposadr[joint]]),
+            )
+        )
+        anchor = data.xanchor[joint]
+    centre = data.geom_xpos[addresses.paddle_geom] - anchor
+    normal = data.xmat[body].reshape(3, 3) @ paddle_normal(m, default_joint_angles)
     return tuple(links), tuple(centre.tolist()), tuple(normal.tolist())
-
-
-def _rotated(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    result = np.zeros(3)
-    mujoco.mju_rotVecQuat(result, vector, quaternion)
-    return result
-
-
-def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    result = np.zeros(4)
-    mujoco.mju_mulQuat(result, p, q)
-    return result
 
 
 def _network(config: TrainConfig, policy: Policy) -> Callable[[dict[str, jax.Array]], jax.Array]:

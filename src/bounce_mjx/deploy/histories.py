@@ -68,7 +68,7 @@ class Histories:
         return {
             "action": action,
             "past_actions": action,
-            "paddle_position": self._chain.paddle_position(angles),
+            "paddle_position": self._chain.paddle(angles)[0],
             "ball_picture": measured.get("ball_position", self._ball),
         } | measured
 

@@ -162,16 +162,15 @@ class DeployedPolicy:
 
     def _needs(self) -> tuple[str, ...]:
         reads = self._network.reads
-        users = {name: {name} for name in ("joint_angles", "joint_velocities", "ball_age")}
+        optional = ("ball_quaternion", "ball_angular_velocity")
+        users = {name: {name} for name in self.units if name not in optional}
         users["joint_angles"].add("paddle_position")
-        users["ball_position"] = {"ball_position", "ball_picture"}
-        users["ball_velocity"] = {"ball_velocity"}
+        users["ball_position"].add("ball_picture")
         if self.metadata.velocity != "measured":
             users["ball_position"] |= users.pop("ball_velocity")
         if self.metadata.estimator is not None:
             users["joint_angles"] |= users["ball_position"]
-        users |= {name: {name} for name in self.metadata.commands}
-        return tuple(name for name in self.units if users.get(name, set()) & reads)
+        return tuple(name for name in users if users[name] & reads)
 
     def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
         """Copies of the measurements as arrays, with defaults for optional ones."""

@@ -1,6 +1,5 @@
 """Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import Arm, Servo, build_arm, compile_spec, locate
-from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, named
 from bounce_mjx.robot.pose import Mount, Pose, find_pose, mounts
 
@@ -51,34 +50,24 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
       UserError: the arm cannot do the task.
     """
     path = locate(mjcf)
-    config = config.model_copy(
-        update={"servo_stiffness": None, "servo_damping": None, "servo_force_limit": None}
-    )
+    config = config.model_copy(update={f"servo_{name}": None for name in Servo._fields})
     try:
         arm = build_arm(path, config)
         arm.spec.compiler.discardvisual = True
+        # So the paddle keeps a body of its own, which the search turns.
+        arm.spec.compiler.fusestatic = False
         model = compile_spec(arm.spec, path)
         asked = Mount(config.paddle.position, config.paddle.quaternion)
         pose = find_pose(model, arm.force_limits, (asked,) if is_mount_given else mounts())
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
-        paddle = config.paddle.model_copy(
-            update={"position": pose.position, "quaternion": pose.quaternion}
-        )
-        adopted = _with_servos(config, paddle, None if are_kept else servos)
+        update = {"paddle": config.paddle.model_copy(update=pose.mount._asdict())}
+        if not are_kept:
+            columns = zip(Servo._fields, zip(*servos, strict=True), strict=True)
+            update |= {f"servo_{name}": column for name, column in columns}
+        adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
         return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
     except UserError as error:
         raise named(path, error) from error
-
-
-def _with_servos(
-    config: RobotConfig, paddle: PaddleConfig, servos: Sequence[Servo] | None
-) -> RobotConfig:
-    update: dict = {"paddle": paddle}
-    if servos is not None:
-        update["servo_stiffness"] = tuple(servo.stiffness for servo in servos)
-        update["servo_damping"] = tuple(servo.damping for servo in servos)
-        update["servo_force_limit"] = tuple(servo.force_limit for servo in servos)
-    return RobotConfig.model_validate(config.model_copy(update=update).model_dump())
 
 
 def _servos(

@@ -28,8 +28,7 @@ MIN_JOINTS = 3
 _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 _HIDDEN_GROUP = 3
-_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball")
-_RESERVED += ("paddle_home",)
+_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -213,14 +212,15 @@ class _Builder:
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, actuators[j]) for j in joints)
         limits = tuple(_force_limit(model, actuators[j], j) for j in joints)
-        names = self._name(joints, end)
-        gripper = self._check_other_joints(chain, joints)
+        names, holder = self._name(joints, end)
+        gripper = self._gripper(chain, joints, actuators)
         self._check_loops(joints)
         self._freeze(joints, actuators)
         self._strip(joints, gripper, actuators)
-        scene = self._attach(names, end, position, quaternion)
-        replaced = self._replace_servos(scene, names, servos)
-        return Arm(scene, names, servos, limits, (*self._changes, *replaced))
+        self._disable_contacts_and_limits(joints)
+        scene = self._attach(holder, position, quaternion)
+        self._replace_servos(scene, names)
+        return Arm(scene, names, servos, limits, tuple(self._changes))
 
     def _chain(self, end: int) -> list[int]:
         """Bodies from the base to the paddle's."""
@@ -230,31 +230,26 @@ class _Builder:
         return chain[::-1]
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
-        model, wanted = self._model, self._config.joints
+        model, given = self._model, self._config.joints
         on_chain = [j for body in chain for j in _joints_of(model, body)]
-        for joint in on_chain:
-            kind = mujoco.mjtJoint(model.jnt_type[joint])
-            if kind == mujoco.mjtJoint.mjJNT_BALL:
-                raise UserError(
-                    f"the ball joint {_name(model, joint)} in the arm; give an arm of hinges and "
-                    "slides"
-                )
-        hinges = [j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)]
+        balls = [j for j in on_chain if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL]
+        if balls:
+            raise UserError(
+                f"the ball joint {_name(model, balls[0])} in the arm; give an arm of hinges and "
+                "slides"
+            )
+        names = {_name(model, j): j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)}
         site = shorten(self._config.site)
-        if wanted is None:
-            acting = hinges
-        else:
-            names = {_name(model, j): j for j in hinges}
-            for name in wanted:
-                if name not in names:
-                    raise UserError(
-                        f"no joint {shorten(name)} on the way to {site}; the joints there are "
-                        f"{_listed(names)}"
-                    )
-            acting = [j for j in hinges if _name(model, j) in wanted]
+        for name in given or ():
+            if name not in names:
+                raise UserError(
+                    f"no joint {shorten(name)} on the way to {site}; the joints there are "
+                    f"{_listed(names)}"
+                )
+        acting = [j for name, j in names.items() if given is None or name in given]
         if len(acting) < MIN_JOINTS:
             have = _listed(_name(model, j) for j in acting) if acting else "none"
-            remedy = _other_sites(model) if wanted is None else "name more with --joints"
+            remedy = _other_sites(model) if given is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
                 f"the way to {site}, where at least {MIN_JOINTS} must act; {remedy}"
@@ -262,22 +257,16 @@ class _Builder:
         return acting
 
     def _actuators(self, joints: list[int]) -> dict[int, list[int]]:
-        """Actuators of each acting joint."""
-        model = self._model
+        """Actuators of each joint that has some, and so of each acting joint."""
+        model, actuators = self._model, {}
         if model.nactuator == 0:
             raise UserError(
                 "no actuators; add a <position> or <motor> with a force limit for each joint"
             )
-        actuators = {
-            joint: [
-                a
-                for a in range(model.nactuator)
-                if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
-                and model.actuator_trnid[a, 0] == joint
-            ]
-            for joint in joints
-        }
-        idle = [_name(model, joint) for joint, own in actuators.items() if not own]
+        for a in range(model.nactuator):
+            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
+                actuators.setdefault(int(model.actuator_trnid[a, 0]), []).append(a)
+        idle = [_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
                 f"no actuator of its own on {_listed(idle)}; add one, or name the acting joints "
@@ -285,8 +274,9 @@ class _Builder:
             )
         return actuators
 
-    def _name(self, joints: list[int], end: int) -> tuple[str, ...]:
-        """Gives the arm's parts names, and names that the scene does not use."""
+    def _name(self, joints: list[int], end: int) -> tuple[tuple[str, ...], str]:
+        """Gives the arm's parts names that the scene does not use; those of the acting joints, and
+        of the body that holds the paddle."""
         arm = self._arm
         for elements in (arm.bodies[1:], arm.geoms, arm.joints, arm.sites):
             for element in elements:
@@ -294,60 +284,52 @@ class _Builder:
                     element.name += "_of_arm"
         for joint in joints:
             arm.joints[joint].name = arm.joints[joint].name or f"joint{joint}"
-        arm.bodies[end].name = arm.bodies[end].name or "end_effector"
-        return tuple(arm.joints[joint].name for joint in joints)
+        holder = arm.bodies[end]
+        holder.name = holder.name or "end_effector"
+        return tuple(arm.joints[joint].name for joint in joints), holder.name
 
-    def _check_other_joints(self, chain: list[int], joints: list[int]) -> list[int]:
-        """Bodies beyond the last acting joint that have joints of their own: a gripper.
+    def _gripper(
+        self, chain: list[int], joints: list[int], actuators: dict[int, list[int]]
+    ) -> list[int]:
+        """Bodies on the links beyond the last acting joint that joints move.
 
         Raises:
           UserError: the model has driven joints beside the arm.
         """
         model = self._model
-        last = int(model.jnt_bodyid[joints[-1]])
-        driven = {
-            int(model.actuator_trnid[a, 0])
-            for a in range(model.nactuator)
-            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS
-        }
-        beside, gripper = [], []
-        for joint in range(model.njnt):
-            body = int(model.jnt_bodyid[joint])
-            if body in chain:
-                continue
-            branch = body
-            while (parent := int(model.body_parentid[branch])) not in chain and parent:
-                branch = parent
-            if parent in chain[chain.index(last) :]:
-                gripper.append(branch)
-            elif joint in driven:
-                beside.append(_name(model, joint))
+        beyond = chain[chain.index(model.jnt_bodyid[joints[-1]]) :]
+        branches = [
+            body
+            for body in range(1, model.nbody)
+            if body not in chain and model.body_parentid[body] in beyond
+        ]
+        bodies = model.jnt_bodyid.tolist()
+        beside = [
+            _name(model, j)
+            for j in sorted(actuators)
+            if bodies[j] not in chain and not _is_below(model, bodies[j], branches)
+        ]
         if beside:
             raise UserError(
                 f"{len(beside)} driven joints ({_listed(beside)}) beside the arm "
                 f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
                 "arm on a fixed base"
             )
-        return sorted(set(gripper))
+        return [b for b in branches if any(_is_below(model, body, [b]) for body in bodies)]
 
     def _check_loops(self, joints: list[int]) -> None:
-        model, bodies = self._model, set(self._model.jnt_bodyid[joints].tolist())
-        kinds = mujoco.mjtEq
-        for i in range(model.neq):
-            kind = mujoco.mjtEq(model.eq_type[i])
-            ends = {int(model.eq_obj1id[i]), int(model.eq_obj2id[i])}
-            coupled = kind == kinds.mjEQ_JOINT and ends & set(joints)
-            loop = (
-                kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)
-                and int(model.eq_objtype[i]) == mujoco.mjtObj.mjOBJ_BODY
-                and ends & bodies
+        model, kinds = self._model, mujoco.mjtEq
+        ends = np.stack([model.eq_obj1id, model.eq_obj2id])
+        of_joints = model.eq_type == kinds.mjEQ_JOINT
+        of_bodies = np.isin(model.eq_type, (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD))
+        of_bodies &= model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY
+        coupled = of_joints & np.any(np.isin(ends, joints), axis=0)
+        loops = of_bodies & np.any(np.isin(ends, model.jnt_bodyid[joints]), axis=0)
+        for i in np.flatnonzero(coupled | loops):
+            raise UserError(
+                f"the equality constraint {model.equality(i).name or f'number {i}'} on the arm, so "
+                "it is no serial chain; remove it, or give a serial arm"
             )
-            if coupled or loop:
-                name = model.equality(i).name or f"number {i}"
-                raise UserError(
-                    f"the equality constraint {name} on the arm, so it is no serial chain; remove "
-                    "it, or give a serial arm"
-                )
 
     def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
         """Gives the spec the numbers of the compiled model.
@@ -392,7 +374,7 @@ class _Builder:
     ) -> None:
         """Removes all but the arm."""
         arm, model = self._arm, self._model
-        own = {a for actuators_of_joint in actuators.values() for a in actuators_of_joint}
+        own = {a for joint in joints for a in actuators[joint]}
         others = [a for i, a in enumerate(arm.actuators) if i not in own]
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         self._remove("keyframes", arm.keys)
@@ -404,34 +386,27 @@ class _Builder:
         self._remove("lights and cameras", [*arm.lights, *arm.cameras])
         self._remove("floors", [g for g in arm.geoms if g.type in floors])
         bodies, parts = list(arm.bodies), list(arm.joints)
-        loose = {
-            int(model.jnt_bodyid[j]): j
-            for j in range(model.njnt)
-            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
-        }
-        base = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
-        objects = [body for body in loose if model.body_rootid[body] != base]
-        removed = {body for body in range(model.nbody) if _is_below(model, body, gripper + objects)}
-        if gripper:
-            names = _listed(model.body(b).name or f"body {b}" for b in gripper)
-            self._changes.append(f"removed the gripper beyond the last joint: {names}")
-        if objects:
-            names = _listed(model.body(b).name or f"body {b}" for b in objects)
-            self._changes.append(f"removed the loose objects {names}")
+        base = model.body_rootid[model.jnt_bodyid[joints[0]]]
+        # A free joint belongs to a child of the world.
+        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        objects = [int(body) for body in model.jnt_bodyid[is_free] if body != base]
+        for words, removed in (
+            ("removed the gripper beyond the last joint: ", gripper),
+            ("removed the loose objects ", objects),
+        ):
+            if removed:
+                names = _listed(model.body(b).name or f"body {b}" for b in removed)
+                self._changes.append(words + names)
         fixed = [
             j
-            for j in range(model.njnt)
-            if j not in joints and int(model.jnt_bodyid[j]) not in removed
+            for j, body in enumerate(model.jnt_bodyid)
+            if j not in joints and not _is_below(model, int(body), gripper + objects)
         ]
         if fixed:
             names = _listed(_name(model, j) for j in fixed)
             self._changes.append(f"fixed the joints that do not act: {names}")
-        for joint in fixed:
-            arm.delete(parts[joint])
-        for body in (*gripper, *objects):
-            if not _is_below(model, int(model.body_parentid[body]), gripper + objects):
-                arm.delete(bodies[body])
-        self._disable_contacts_and_limits(joints)
+        for element in [parts[j] for j in fixed] + [bodies[b] for b in gripper + objects]:
+            arm.delete(element)
 
     def _remove(self, nouns: str, elements: Iterable) -> None:
         elements = list(elements)
@@ -447,27 +422,19 @@ class _Builder:
         touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
         if touching:
             self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
-        self._hide_contact_shapes()
-        for geom in self._arm.geoms:
-            geom.contype = geom.conaffinity = 0
+        for i, body in enumerate(self._arm.bodies):
+            touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
+            for geom, touches in zip(body.geoms, touching, strict=True):
+                # Where a link has both kinds of shapes, the others are its picture.
+                if touches and i > 0 and not all(touching):
+                    geom.group = _HIDDEN_GROUP
+                geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
 
-    def _hide_contact_shapes(self) -> None:
-        """Leaves only the pictured geoms of a body visible, where it has both kinds."""
-        for body in self._arm.bodies[1:]:
-            touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
-            if any(touching) and not all(touching):
-                for geom, touches in zip(body.geoms, touching, strict=True):
-                    geom.group = _HIDDEN_GROUP if touches else geom.group
-
-    def _attach(
-        self, names: tuple[str, ...], end: int, position: np.ndarray, quaternion: np.ndarray
-    ) -> mujoco.MjSpec:
-        """The scene with the arm, the paddle, and their contact pair."""
+    def _attach(self, holder: str, position: np.ndarray, quaternion: np.ndarray) -> mujoco.MjSpec:
+        """The scene with the arm, the paddle on the body `holder`, and their contact pair."""
         config, arm = self._config, self._arm
-        end_name = self._model.body(end).name or "end_effector"
-        end_name = f"{end_name}_of_arm" if end_name in _RESERVED else end_name
         scene = read_spec(resource_path("mjcf/scene.xml"))
         differing = _differing_options(self._model.opt, scene.option)
         if differing:
@@ -477,8 +444,7 @@ class _Builder:
         arm.option = scene.option
         with _silent():
             scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
-        holder = scene.body(end_name)
-        paddle = holder.add_body(name=_PADDLE_BODY_NAME, pos=position, quat=quaternion)
+        paddle = scene.body(holder).add_body(name=_PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config, scene.default)
         ball = scene.geom("ball")
         ball.size[0], ball.mass = config.ball.radius, config.ball.mass
@@ -496,13 +462,11 @@ class _Builder:
         )
         return scene
 
-    def _replace_servos(
-        self, scene: mujoco.MjSpec, names: tuple[str, ...], servos: tuple[Servo | None, ...]
-    ) -> list[str]:
-        """Replaces the actuators if the config has servos; the changes."""
+    def _replace_servos(self, scene: mujoco.MjSpec, names: tuple[str, ...]) -> None:
+        """Replaces the actuators if the config has servos."""
         config = self._config
         if config.servo_stiffness is None:
-            return []
+            return
         if len(config.servo_stiffness) != len(names):
             raise UserError(
                 f"{len(names)} acting joints ({_listed(names)}), but servo_stiffness has "
@@ -511,27 +475,23 @@ class _Builder:
         for actuator in list(scene.actuators):
             scene.delete(actuator)
         given = zip(
-            config.servo_stiffness, config.servo_damping, config.servo_force_limit, strict=True
+            names,
+            config.servo_stiffness,
+            config.servo_damping,
+            config.servo_force_limit,
+            strict=True,
         )
-        changes = []
-        for name, (stiffness, damping, limit) in zip(names, given, strict=True):
-            actuator = scene.add_actuator(
-                name=f"servo/{name}",
-                target=name,
-                trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            )
-            actuator.gainprm[0] = stiffness
-            actuator.biasprm[:3] = 0.0, -stiffness, -damping
+        for name, stiffness, damping, limit in given:
+            joint = mujoco.mjtTrn.mjTRN_JOINT
+            actuator = scene.add_actuator(name=f"servo/{name}", target=name, trntype=joint)
+            actuator.set_to_position(kp=stiffness, kv=damping)
             if limit is not None:
                 actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
                 actuator.forcerange = [-limit, limit]
-            changes.append(
+            self._changes.append(
                 f"replaced the actuator of {name} by a position servo: kp {stiffness:.4g}, "
                 f"kv {damping:.4g}, {limit_words(limit)}"
             )
-        return changes
 
 
 def _add_paddle(

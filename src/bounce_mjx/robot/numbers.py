@@ -5,8 +5,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 
-# Fields that MuJoCo's compiler can compute from others.
-_DERIVED_FIELDS = frozenset(
+DERIVED_FIELDS = frozenset(
     (
         "actuator_acc0",
         "actuator_length0",
@@ -20,6 +19,7 @@ _DERIVED_FIELDS = frozenset(
         "geom_rbound",
     )
 )
+"""Fields that MuJoCo's compiler can compute from others."""
 
 
 def check_numbers(mj_model: mujoco.MjModel) -> None:
@@ -39,7 +39,7 @@ def check_numbers(mj_model: mujoco.MjModel) -> None:
     fields = [(mj_model, name) for name in physical_fields(mj_model)]
     fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
     # Derived fields come last: the message must name a number that is in the file.
-    for owner, name in sorted(fields, key=lambda field: field[1] in _DERIVED_FIELDS):
+    for owner, name in sorted(fields, key=lambda field: field[1] in DERIVED_FIELDS):
         values = np.asarray(getattr(owner, name))
         if np.issubdtype(values.dtype, np.floating) and not np.all(np.isfinite(values)):
             value = values[~np.isfinite(values)][0]

@@ -38,6 +38,13 @@ _LOWEST = 0.1
 _HEADROOM = 1.0
 
 
+class Mount(NamedTuple):
+    """A way to hold the paddle, in the frame of the site."""
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
 class Pose(NamedTuple):
     """A start pose, with a level paddle."""
 
@@ -45,10 +52,7 @@ class Pose(NamedTuple):
     """Positions of the acting joints, rad; of a slide, m."""
     paddle: tuple[float, float, float]
     """Centre of the paddle, m."""
-    quaternion: tuple[float, float, float, float]
-    """Orientation of the paddle in its site's frame, as searched."""
-    position: tuple[float, float, float]
-    """Position of the paddle in its site's frame, m."""
+    mount: Mount
     manipulability: float
     """Smallest singular value of the scaled Jacobian of the task directions."""
     acceleration: float
@@ -62,14 +66,7 @@ class Pose(NamedTuple):
     score: float
 
 
-class Mount(NamedTuple):
-    """A way to hold the paddle, in the frame of the site."""
-
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-
-
-def mounts(length: float = 0.19) -> tuple[Mount, ...]:
+def mounts() -> tuple[Mount, ...]:
     """Paddles held by a handle along the site's z, in four turns about it, and one that lies flat
     on the site."""
     half = math.sqrt(0.5)
@@ -79,7 +76,7 @@ def mounts(length: float = 0.19) -> tuple[Mount, ...]:
         quaternion = np.zeros(4)
         about_z = np.array([math.cos(angle), 0.0, 0.0, math.sin(angle)])
         mujoco.mju_mulQuat(quaternion, about_z, np.array([half, 0.0, -half, 0.0]))
-        held.append(Mount((0.0, 0.0, length), tuple(quaternion.tolist())))
+        held.append(Mount((0.0, 0.0, 0.19), tuple(quaternion.tolist())))
     return (*held, Mount((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)))
 
 
@@ -87,63 +84,53 @@ def find_pose(
     model: mujoco.MjModel,
     force_limits: Sequence[float | None],
     choices: Sequence[Mount],
-    seed: int = 0,
 ) -> Pose:
     """The best start pose of an arm in the task's scene.
 
     Args:
-      model: the compiled scene, with the paddle mounted as in the first choice.
+      model: the compiled scene; its paddle is moved.
       force_limits: largest force of each acting joint, N m or N; None for no limit.
       choices: mounts of the paddle to try.
-      seed: seed of the random first guesses.
 
     Raises:
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
     limits = np.array([np.inf if limit is None else limit for limit in force_limits])
-    search = _Search(model, limits, np.random.default_rng(seed))
-    return search.best(choices)
+    return _Search(model, limits).best(choices)
 
 
 class _Search:
-    def __init__(self, model: mujoco.MjModel, limits: np.ndarray, rng: np.random.Generator):
-        self._model, self._limits, self._rng = model, limits, rng
+    def __init__(self, model: mujoco.MjModel, limits: np.ndarray):
+        self._model, self._limits, self._rng = model, limits, np.random.default_rng(0)
         self._data = mujoco.MjData(model)
         self._at: Addresses = find_addresses(model)
         self._qpos, self._dofs = np.array(self._at.arm_qpos), np.array(self._at.arm_qvel)
         self._joints = np.array(self._at.arm_joints)
-        self._body = int(model.geom_bodyid[self._at.paddle_geom])
+        # The last link, to which the paddle's own body is welded.
+        self._body = int(model.body_weldid[model.geom_bodyid[self._at.paddle_geom]])
         low, high = model.jnt_range[self._joints].T
         free = low >= high
-        hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        wide = np.where(hinge, np.pi, 0.5)
-        centre = model.qpos0[self._qpos]
-        # A joint without limits, or with more than a turn, is searched within half a turn.
-        self._low = np.where(free, centre - wide, np.maximum(low, centre - wide))
-        self._high = np.where(free, centre + wide, np.minimum(high, centre + wide))
-        outside = self._low >= self._high
-        self._low, self._high = (
-            np.where(outside, low, self._low),
-            np.where(outside, high, self._high),
-        )
-        self._limited = ~free
         self._range = np.where(free, -np.inf, low), np.where(free, np.inf, high)
+        # A joint without limits, or with more than a turn, is searched within half a turn.
+        self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
+        wide, centre = np.where(self._hinge, np.pi, 0.5), model.qpos0[self._qpos]
+        self._low = np.maximum(self._range[0], centre - wide)
+        self._high = np.minimum(self._range[1], centre + wide)
+        outside = self._low >= self._high
+        self._low[outside], self._high[outside] = low[outside], high[outside]
         # A servo whose joint is at its limit could move it one way only.
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
         self._inside = self._range[0] + margin, self._range[1] - margin
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        self._mounted = (
-            model.geom_pos[self._at.paddle_geom].copy(),
-            model.geom_quat[self._at.paddle_geom].copy(),
-        )
-        self._base = self._anchor()
+        mujoco.mj_kinematics(model, self._data)
+        self._base = self._data.xanchor[self._joints[0]].copy()
 
     def best(self, choices: Sequence[Mount]) -> Pose:
         reach = self._reach()
         poses, level = [], 0
         for choice in choices:
-            self._mount(choices[0], choice)
+            self._mount(choice)
             for angles in self._level_poses(reach):
                 level += 1
                 pose = self._judged(angles, choice, reach)
@@ -178,22 +165,11 @@ class _Search:
     def _names(self) -> str:
         return ", ".join(joint_name(self._model, j) for j in self._at.arm_joints)
 
-    def _mount(self, first: Mount, choice: Mount) -> None:
-        """Moves the paddle from its mount in the model to another one."""
-        turn, back = np.zeros(4), np.zeros(4)
-        mujoco.mju_negQuat(back, np.array(first.quaternion))
-        position, quaternion = self._mounted
-        site = np.zeros(4)
-        mujoco.mju_mulQuat(site, quaternion, back)
-        mujoco.mju_mulQuat(turn, site, np.array(choice.quaternion))
-        moved = np.zeros(3)
-        mujoco.mju_rotVecQuat(moved, np.array(choice.position) - np.array(first.position), site)
-        self._model.geom_quat[self._at.paddle_geom] = turn
-        self._model.geom_pos[self._at.paddle_geom] = position + moved
-
-    def _anchor(self) -> np.ndarray:
-        mujoco.mj_kinematics(self._model, self._data)
-        return self._data.xanchor[self._joints[0]].copy()
+    def _mount(self, choice: Mount) -> None:
+        """Moves the paddle, whose body has the frame of the site."""
+        quaternion = np.array(choice.quaternion)
+        self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
+        self._model.geom_pos[self._at.paddle_geom] = choice.position
 
     def _random(self) -> np.ndarray:
         return self._rng.uniform(self._low, self._high)
@@ -264,11 +240,10 @@ class _Search:
 
     def _wrapped(self, angles: np.ndarray) -> np.ndarray:
         """The same pose with each free hinge within half a turn of its middle."""
-        hinge = self._model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
         low, high = self._inside
-        middle = np.where(self._limited, 0.5 * (self._low + self._high), 0.0)
+        middle = 0.5 * (self._low + self._high)
         turned = angles - 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
-        inside = hinge & (turned >= low) & (turned <= high)
+        inside = self._hinge & (turned >= low) & (turned <= high)
         return np.where(inside, turned, angles)
 
     def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> Pose | None:
@@ -277,26 +252,26 @@ class _Search:
         if not self._is_clear(paddle):
             return None
         jacobian = self._jacobian(paddle)
-        task = jacobian if len(angles) >= 5 else jacobian[2:]
         lifting = jacobian[2:]
+        task = jacobian if len(angles) >= 5 else lifting
         smallest = float(np.linalg.svd(task, compute_uv=False)[-1])
-        if len(angles) < 3 or np.linalg.matrix_rank(lifting, tol=1e-3) < 3:
+        if np.linalg.matrix_rank(lifting, tol=1e-3) < 3:
             smallest = 0.0
-        acceleration, inertia, holding = self._strength(task, smallest)
-        margin = self._margin(angles)
+        mass, holding = self._dynamics()
+        acceleration = -np.inf
+        if smallest >= _LEAST_MANIPULABILITY and np.all(np.abs(holding) <= self._limits):
+            acceleration = self._acceleration(mass @ np.linalg.pinv(task)[:, -3], holding)
         strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
-        score = smallest * margin * strong
         return Pose(
             tuple(angles.tolist()),
             tuple(paddle.tolist()),
-            choice.quaternion,
-            choice.position,
+            choice,
             smallest,
             acceleration,
-            inertia,
-            holding,
+            tuple(np.diag(mass).tolist()),
+            tuple(holding.tolist()),
             reach,
-            score,
+            score=smallest * self._margin(angles) * strong,
         )
 
     def _margin(self, angles: np.ndarray) -> float:
@@ -320,25 +295,19 @@ class _Search:
                 return False
         return True
 
-    def _strength(self, task: np.ndarray, smallest: float) -> tuple[float, tuple, tuple]:
-        """Largest upward acceleration of the paddle, the reflected inertias, and the forces that
-        hold the arm."""
+    def _dynamics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mass matrix [n, n] of the acting joints, and the forces [n] that hold the arm."""
         model, data = self._model, self._data
         data.qvel[:] = 0.0
         mujoco.mj_forward(model, data)
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        mass = full[np.ix_(self._dofs, self._dofs)]
-        inertia = tuple(np.diag(mass).tolist())
         hold = (data.qfrc_bias - data.qfrc_passive)[self._dofs]
-        if smallest < _LEAST_MANIPULABILITY:
-            return -np.inf, inertia, tuple(hold.tolist())
-        up = np.zeros(len(task))
-        up[-3] = 1.0
-        force = mass @ (np.linalg.pinv(task) @ up)
-        spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
-        if np.any(np.abs(hold) > self._limits):
-            return -np.inf, inertia, tuple(hold.tolist())
+        return full[np.ix_(self._dofs, self._dofs)], hold
+
+    def _acceleration(self, force: np.ndarray, hold: np.ndarray) -> float:
+        """Largest upward acceleration of the paddle, of which 1 m/s^2 takes the forces [n]."""
         needed = np.abs(force)
-        ratios = spare[needed > 1e-9] / needed[needed > 1e-9]
-        return float(np.min(ratios, initial=np.inf)), inertia, tuple(hold.tolist())
+        spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
+        moved = needed > 1e-9
+        return float(np.min(spare[moved] / needed[moved], initial=np.inf))

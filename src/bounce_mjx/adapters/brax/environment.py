@@ -96,7 +96,9 @@ class BraxBounceBall(brax.envs.Env):
         given = {} if config is None else config.model_dump()
         kind = task_config(task) if config is None else type(config)
         self.task = Env(validate(kind, given | settings, ENV_NAME))
-        self._model = _Model(self.task.mj_model)
+        self.dt, self.mj_model = self.task.dt, self.task.mj_model
+        """Time of one control step, s, and MuJoCo's model."""
+        self._model = _Model(self.mj_model)
         self._base: brax.base.System | None = None
         self._sys: brax.base.System | None = None
 
@@ -149,16 +151,6 @@ class BraxBounceBall(brax.envs.Env):
     def backend(self) -> str:
         """Name of the physics engine."""
         return self.task.backend
-
-    @property
-    def dt(self) -> float:
-        """Time of one control step, s."""
-        return self.task.dt
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """The model."""
-        return self.task.mj_model
 
     def render(
         self,

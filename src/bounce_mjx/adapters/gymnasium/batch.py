@@ -95,7 +95,6 @@ class Batch:
         if "episode_seconds" in settings:
             limits.append(self.config.episode_steps)
         self._limit = min(limits)
-        self._programs = _programs_for(self.config, self.num_envs)
         self._episodes: _Episodes | None = None
 
     @property
@@ -107,38 +106,35 @@ class Batch:
         self,
         seeds: Sequence[int | None],
         generator: np.random.Generator,
-        mask: np.ndarray | None = None,
-        commands: dict[str, float | np.ndarray] | None = None,
+        mask: np.ndarray,
+        commands: dict[str, float | np.ndarray],
     ) -> np.ndarray:
         """Starts new episodes.
 
         Args:
           seeds: seed of each environment; None goes on with its random numbers.
           generator: seeds the environments that have neither a seed nor random numbers yet.
-          mask: environments to reset [B], bool; None for all.
+          mask: environments to reset [B], bool.
           commands: some commands, each [] or [B]; NaN draws it.
 
         Returns:
           The observations of all environments [B, N], float32.
         """
         self._check_process()
+        if not mask.all():
+            self._check_started()
         if self._episodes is None:
-            self._check_started(mask is None or bool(mask.all()))
             drawn = generator.integers(2**32, size=self.num_envs)
             seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
         seeded = np.array([s is not None for s in seeds])
         numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
-        given = dict.fromkeys(self.config.commands, np.nan) | (commands or {})
+        given = dict.fromkeys(self.config.commands, np.nan) | commands
         values = {
             name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
             for name, value in given.items()
         }
-        keys = None if self._episodes is None else self._episodes.key
-        started = self._programs.start(keys, numbers, seeded, values)
-        if mask is not None and self._episodes is not None:
-            started = self._programs.choose(mask, started, self._episodes)
-        self._episodes = started
-        return np.array(started.env.obs.T, np.float32)
+        self._episodes = self._programs.start(self._episodes, mask, numbers, seeded, values)
+        return np.array(self._episodes.env.obs.T, np.float32)
 
     def step(
         self,
@@ -184,15 +180,19 @@ class Batch:
         command = {name: float(value[index]) for name, value in state.command.items()}
         return np.array(state.physics.qpos[:, index]), command
 
+    @functools.cached_property
+    def _programs(self) -> "_Programs":
+        # An edited file is another model.
+        mjcf = self.config.mjcf
+        edited = mjcf.stat().st_mtime_ns if mjcf and mjcf.exists() else None
+        return _programs(self.config, self.num_envs, edited)
+
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_programs": None, "_episodes": jax.device_get(self._episodes)}
+        state = self.__dict__ | {"_episodes": jax.device_get(self._episodes)}
+        return {name: value for name, value in state.items() if name != "_programs"}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._programs = _programs_for(self.config, self.num_envs)
-
-    def _check_started(self, started: bool | None = None) -> None:
-        if not (self._episodes is not None if started is None else started):
+    def _check_started(self) -> None:
+        if self._episodes is None:
             raise ResetNeeded("an environment was used before its reset; call reset() first")
 
     def _check_process(self) -> None:
@@ -222,14 +222,7 @@ class _Programs(NamedTuple):
 
     task: Env
     start: Any
-    choose: Any
     step: Any
-
-
-def _programs_for(config: WorldConfig, num_envs: int) -> _Programs:
-    # An edited file is another model.
-    edited = None if config.mjcf is None or not config.mjcf.exists() else config.mjcf.stat()
-    return _programs(config, num_envs, edited and edited.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=32)
@@ -240,45 +233,35 @@ def _programs(config: WorldConfig, num_envs: int, edited: int | None) -> _Progra
     return _Programs(
         task=task,
         start=jax.jit(functools.partial(_start, task)),
-        choose=jax.jit(_choose),
         step=jax.jit(functools.partial(_step, task), donate_argnums=0),
     )
 
 
 def _start(
     task: Env,
-    keys: jax.Array | None,
+    episodes: _Episodes | None,
+    mask: jax.Array,
     seeds: jax.Array,
     seeded: jax.Array,
     commands: dict[str, jax.Array],
 ) -> _Episodes:
-    """New episodes; `keys` [B, ...] is None before the first ones."""
-    new_keys = jax.vmap(jax.random.PRNGKey)(seeds)
-    if keys is not None:
-        new_keys = jnp.where(seeded[:, None], new_keys, keys)
-    keys, now = _split(new_keys)
+    """New episodes where the mask [B] is true; `episodes` is None before the first ones."""
+    keys = jax.vmap(jax.random.PRNGKey)(seeds)
+    if episodes is not None:
+        keys = jnp.where(seeded[:, None], keys, episodes.key)
+    keys, now = _split(keys)
     env = jax.vmap(functools.partial(_first_state, task), out_axes=-1)(now, commands)
-    return _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+    started = _Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+    return started if episodes is None else _choose(mask, started, episodes)
 
 
 def _first_state(task: Env, key: jax.Array, commands: dict[str, jax.Array]) -> State:
-    """The start of an episode with commands, each []; NaN keeps the drawn one."""
-    state = task.reset(key)
-    start = state.pipeline_state
-    start = start._replace(
-        command={
-            name: jnp.where(jnp.isnan(commands[name]), drawn, commands[name]).astype(drawn.dtype)
-            for name, drawn in start.command.items()
-        }
-    )
-    memory = start.memory
-    if memory is not None and memory.sensing is not None:
-        seen = dict(memory.sensing.seen)
-        for name in start.command.keys() & seen.keys():
-            seen[name] = jnp.full_like(seen[name], start.command[name])
-        memory = memory._replace(sensing=memory.sensing._replace(seen=seen))
-        start = start._replace(memory=memory)
-    return state.replace(pipeline_state=start, obs=task.observe(start))
+    """The start of an episode with commands, each []; NaN draws one."""
+    ranges = task.ranges()
+    for name, own in task.config.commands.items():
+        given = commands[name]
+        ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in (own.low, own.high))
+    return task.reset(key, ranges)
 
 
 def _step(
@@ -338,12 +321,25 @@ def _task_config(task: str | type[Task], settings: dict[str, Any]) -> WorldConfi
         raise UnexpectedArgument(f"{error} ({python})") from error
 
 
-def checked_commands(options: dict[str, Any], commands: dict[str, Command]) -> dict[str, float]:
+def checked_commands(
+    options: dict[str, Any] | None, commands: dict[str, Command], *others: str
+) -> dict[str, float]:
     """The commands among the options of a reset.
 
+    Args:
+      others: names of other options.
+
     Raises:
-      UserError: one is not a number within its limits.
+      UserError: a command is not a number within its limits, or an option is unknown, which is an
+        `UnexpectedArgument`.
     """
+    options, known = options or {}, (*commands, *others)
+    for name in options:
+        if name not in known:
+            raise UnexpectedArgument(
+                f"reset got an unexpected option {name!r}; known options are: "
+                f"{', '.join(known) or 'none'}"
+            )
     return {
         name: command.checked(options[name], f"the option {name}")
         for name, command in commands.items()

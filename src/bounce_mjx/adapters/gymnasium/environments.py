@@ -14,23 +14,21 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from bounce_mjx.adapters.gymnasium.batch import (
     Batch,
     StepArrays,
-    UnexpectedArgument,
     action_space,
     checked_actions,
     checked_commands,
     observation_space,
 )
-from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures, check_render_mode
+from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
-
-_FRAMES_PER_SECOND = 100
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -40,7 +38,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     `episode_seconds` limits them.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": _FRAMES_PER_SECOND}
+    metadata = {"render_modes": ["rgb_array"]}
 
     def __init__(
         self,
@@ -63,14 +61,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        check_render_mode(render_mode)
         _prefer_forkserver()
         self._batch = Batch(task, settings, 1, None)
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
         self.render_mode = render_mode
         self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
 
     @property
     def task(self) -> Env:
@@ -99,9 +96,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           The first observation [N] and an empty info.
         """
         super().reset(seed=seed)
-        commands = self._batch.config.commands
-        given = checked_commands(checked_options(options, *commands), commands)
-        return self._batch.restart([seed], self.np_random, commands=given)[0], {}
+        given = checked_commands(options, self._batch.config.commands)
+        return self._batch.restart([seed], self.np_random, np.ones(1, bool), given)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances one control step under the action [n].
@@ -122,14 +118,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """A picture [height, width, 3], uint8; None without render_mode="rgb_array"."""
-        if self._pictures is None:
-            return None
-        return self._pictures.draw(self.task, *self._batch.pose(0))
+        return self._pictures.draw(0)
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._pictures.close()
 
 
 class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -140,11 +133,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     has the entry `episode` of Gymnasium's `RecordEpisodeStatistics`.
     """
 
-    metadata = {
-        "render_modes": ["rgb_array"],
-        "render_fps": _FRAMES_PER_SECOND,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    metadata = {"render_modes": ["rgb_array"]}
 
     def __init__(
         self,
@@ -165,7 +154,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
         """
-        check_render_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self._batch = Batch(task, settings, num_envs, max_episode_steps)
         self.metadata = self.metadata | {
@@ -176,11 +164,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.render_mode = render_mode
         self.single_action_space = action_space(self.task)
         self.single_observation_space = observation_space(self.task)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.observation_space = gymnasium.vector.utils.batch_space(
-            self.single_observation_space, num_envs
-        )
-        self._pictures = Pictures(self.task, width, height, camera) if render_mode else None
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self._ended = np.zeros(num_envs, bool)
         self._statistics = EpisodeStatistics(num_envs)
 
@@ -202,17 +188,24 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         Returns:
           The observations of all environments [B, N] and an empty info.
         """
-        commands = self._batch.config.commands
-        options = checked_options(options, *commands, "reset_mask")
-        given = checked_commands(options, commands)
-        mask = _checked_mask(options.get("reset_mask"), self.num_envs)
+        given = checked_commands(options, self._batch.config.commands, "reset_mask")
+        mask = _checked_mask((options or {}).get("reset_mask"), self.num_envs)
         seeds = _seeds(seed, self.num_envs)
         super().reset(seed=seeds[0])
-        observation = self._batch.restart(seeds, self.np_random, mask, given)
-        chosen = slice(None) if mask is None else mask
-        self._ended[chosen] = False
-        self._statistics.restart(chosen)
-        return observation, {}
+        return self.restart(seeds, mask, given), {}
+
+    def restart(
+        self,
+        seeds: Sequence[int | None],
+        mask: np.ndarray,
+        commands: dict[str, float | np.ndarray],
+    ) -> np.ndarray:
+        """Starts new episodes where the mask [B] is true: the observations of all environments
+        [B, N]; the arguments are those of `Batch.restart`."""
+        observation = self._batch.restart(seeds, self.np_random, mask, commands)
+        self._ended[mask] = False
+        self._statistics.restart(mask)
+        return observation
 
     def step(
         self, actions: np.ndarray
@@ -239,11 +232,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [height, width, 3], uint8, of each environment; None without a render mode."""
-        if self._pictures is None:
+        if self.render_mode is None:
             return None
-        return tuple(
-            self._pictures.draw(self.task, *self._batch.pose(i)) for i in range(self.num_envs)
-        )
+        return tuple(self._pictures.draw(i) for i in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """A common attribute of the environments, or the result of a method such as render, once
@@ -259,8 +250,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
-        if self._pictures is not None:
-            self._pictures.close()
+        self._pictures.close()
 
     def _info(self, result: StepArrays, skipped: np.ndarray) -> dict[str, Any]:
         """The info in the form of `VectorEnv._add_info`: each key has a mask [B], `_key`."""
@@ -272,13 +262,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             final_obs = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(self._ended):
                 final_obs[i] = result.final_observation[i]
-            final_info = _masked(result.metrics, self._ended)
-            final_info |= {
-                "episode": _masked(statistics, self._ended),
-                "_episode": self._ended.copy(),
+            ended = self._ended.copy()
+            final_info = _masked(result.metrics, ended) | {
+                "episode": _masked(statistics, ended),
+                "_episode": ended,
             }
-            for name, value in (("final_obs", final_obs), ("final_info", final_info)):
-                info |= {name: value, f"_{name}": self._ended.copy()}
+            info |= {"final_obs": final_obs, "_final_obs": ended}
+            info |= {"final_info": final_info, "_final_info": ended}
         return info
 
 
@@ -310,21 +300,6 @@ class EpisodeStatistics:
         return statistics
 
 
-def checked_options(options: dict[str, Any] | None, *known: str) -> dict[str, Any]:
-    """The options of a reset.
-
-    Raises:
-      UnexpectedArgument: an option is unknown.
-    """
-    unknown = [name for name in options or {} if name not in known]
-    if unknown:
-        raise UnexpectedArgument(
-            f"reset got an unexpected option {unknown[0]!r}; known options are: "
-            f"{', '.join(known) or 'none'}"
-        )
-    return options or {}
-
-
 def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     if not mask.any():
         return {}
@@ -343,10 +318,8 @@ def _seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int |
     return list(seed)
 
 
-def _checked_mask(mask: Any, num_envs: int) -> np.ndarray | None:
-    if mask is None:
-        return None
-    array = np.asarray(mask)
+def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+    array = np.ones(num_envs, bool) if mask is None else np.asarray(mask)
     if array.dtype != bool or array.shape != (num_envs,) or not array.any():
         raise UserError(
             f"the option reset_mask has the type {array.dtype} and the shape {array.shape}, but "

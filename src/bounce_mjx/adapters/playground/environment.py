@@ -103,61 +103,33 @@ class PlaygroundBounceBall(MjxEnv):
             own = self._own_mjx_model
             task = randomized_task(task, self.mj_model, own, self._randomized)
         state = task.reset(rng)
-        m, (qpos, qvel, act) = self.mj_model, state.pipeline_state.physics
-        dtype = qpos.dtype
+        m, physics = self.mj_model, state.pipeline_state.physics
+        dtype = physics.qpos.dtype
         data = TaskData(
-            qpos=qpos,
-            qvel=qvel,
-            act=act,
+            **physics._asdict(),
             time=jnp.zeros((), dtype),
-            ctrl=self.task.servo_targets(
-                state.pipeline_state.physics, jnp.zeros(self.action_size, dtype)
-            ),
+            ctrl=self.task.servo_targets(physics, jnp.zeros(self.action_size, dtype)),
             mocap_pos=jnp.zeros((m.nmocap, 3), dtype),
             mocap_quat=jnp.zeros((m.nmocap, 4), dtype),
             xfrc_applied=jnp.zeros((m.nbody, 6), dtype),
             task=state.pipeline_state._replace(physics=None),
         )
-        return State(
-            data=data,
-            obs=state.obs,
-            reward=state.reward,
-            done=state.done,
-            metrics=state.metrics,
-            info=state.info,
-        )
+        return State(data=data, **_common(state))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
         data = state.data
         physics = PhysicsState(data.qpos, data.qvel, data.act)
-        before = core.State(
-            pipeline_state=data.task._replace(physics=physics),
-            obs=state.obs,
-            reward=state.reward,
-            done=state.done,
-            metrics=state.metrics,
-            info=state.info,
-        )
+        before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
-        moved = after.pipeline_state.physics
-        return state.replace(
-            data=data.replace(
-                qpos=moved.qpos,
-                qvel=moved.qvel,
-                act=moved.act,
-                time=data.time + self.task.dt,
-                ctrl=self.task.servo_targets(
-                    physics, jnp.clip(action, -1.0, 1.0), last=data.task.ctrl
-                ),
-                task=after.pipeline_state._replace(physics=None),
-            ),
-            obs=after.obs,
-            reward=after.reward,
-            done=after.done,
-            metrics=after.metrics,
-            info=after.info,
+        ctrl = self.task.servo_targets(physics, jnp.clip(action, -1.0, 1.0), last=data.task.ctrl)
+        data = data.replace(
+            **after.pipeline_state.physics._asdict(),
+            time=data.time + self.task.dt,
+            ctrl=ctrl,
+            task=after.pipeline_state._replace(physics=None),
         )
+        return state.replace(data=data, **_common(after))
 
     @property
     def xml_path(self) -> str:
@@ -204,3 +176,8 @@ class PlaygroundBounceBall(MjxEnv):
         """
         choose_opengl()
         return super().render(trajectory, *args, **kwargs)
+
+
+def _common(state: State | core.State) -> dict[str, Any]:
+    """The fields that Playground's states and this project's have in common."""
+    return {name: getattr(state, name) for name in ("obs", "reward", "done", "metrics", "info")}

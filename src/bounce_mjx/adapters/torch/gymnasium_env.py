@@ -10,9 +10,14 @@ from bounce_mjx.errors import needed
 with needed("Gymnasium", "'bounce_mjx[gymnasium]'"):
     import gymnasium
     from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import batch_space
 
-from bounce_mjx.adapters.gymnasium.batch import action_space, observation_space
-from bounce_mjx.adapters.gymnasium.environments import checked_options
+from bounce_mjx.adapters.gymnasium.batch import (
+    action_space,
+    checked_commands,
+    observation_space,
+)
+from bounce_mjx.adapters.gymnasium.environments import TaskVectorEnv
 from bounce_mjx.adapters.torch.vector_env import TorchVectorEnv
 
 
@@ -33,19 +38,15 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
         self.device = env.device
         self.single_action_space = action_space(env.env)
         self.single_observation_space = observation_space(env.env)
-        self.action_space = gymnasium.vector.utils.batch_space(
-            self.single_action_space, env.num_envs
-        )
-        self.observation_space = gymnasium.vector.utils.batch_space(
-            self.single_observation_space, env.num_envs
-        )
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[torch.Tensor, dict[str, Any]]:
         """Starts a new episode in every environment: observations [B, N] and an empty info. There
         are no options."""
-        checked_options(options)
+        checked_commands(options, {})
         super().reset(seed=seed)
         observation, _ = self.env.reset(seed)
         return observation, {}
@@ -64,11 +65,7 @@ class TorchGymnasiumVectorEnv(gymnasium.vector.VectorEnv[torch.Tensor, torch.Ten
     def render(self) -> None:
         """Does nothing, as there is no render mode; skrl's trainers call it at every step."""
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """A common attribute of the environments, or the result of a method such as render, once
-        for each environment [B]."""
-        value = getattr(self, name)
-        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+    call = TaskVectorEnv.call
 
 
 class _Operand(torch.Tensor):

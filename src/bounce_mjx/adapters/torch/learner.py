@@ -45,77 +45,62 @@ class Learner(abc.ABC):
         self._random = _random_state(vector.device)
         _set_random_state(vector.device, outside)
 
-    def learn(self, iterations: int) -> dict[str, np.ndarray]:
-        """Trains for `iterations`, or until the parameters are not finite, because the library
-        would then raise exceptions.
+    def learn(self) -> dict[str, np.ndarray]:
+        """Trains for an iteration, if the parameters are finite: the library would otherwise raise
+        exceptions.
 
-        Returns: The environment's metrics of each step [iterations, T], the losses [iterations],
-          and "fault" [iterations]: the number, from 1, of the first quantity of `CHECKED` that was
-          not finite; 0 if all were finite. In iterations that were not run, all other metrics are
-          NaN.
+        Returns: The environment's metrics of each step [T], the losses [], and "fault" []: the
+          number, from 1, of the first quantity of `CHECKED` that was not finite; 0 if all were
+          finite. Without an iteration, all other metrics are NaN.
         """
         outside = _random_state(self.vector.device)
         _set_random_state(self.vector.device, self._random)
         names = self.vector.metric_names
-        per_step = np.full((iterations, self.config.rollout_length, len(names)), np.nan, np.float32)
-        losses = {name: np.full(iterations, np.nan) for name in self.losses}
-        faults = np.full(iterations, len(CHECKED))
-        finite = self._is_finite()
-        for i in range(iterations):
-            if not finite:
-                break
-            rollout, loss = self._iterate()
+        per_step = np.full((self.config.rollout_length, len(names)), np.nan, np.float32)
+        losses, fault = dict.fromkeys(self.losses, np.nan), len(CHECKED)
+        if self._is_finite():
+            rollout, losses = self._iterate()
             self.iteration += 1
-            per_step[i] = rollout.cpu().numpy()
-            for name in losses:
-                losses[name][i] = loss[name]
-            finite = self._is_finite()
-            reward = per_step[i, :, names.index("reward")].mean()
-            checked = (reward, loss["loss/value"], loss["loss/policy"], 0.0 if finite else np.nan)
-            faults[i] = 0 if np.isfinite(checked).all() else np.argmin(np.isfinite(checked)) + 1
+            per_step = rollout.cpu().numpy()
+            reward = per_step[:, names.index("reward")].mean()
+            parameters = 0.0 if self._is_finite() else np.nan
+            finite = np.isfinite((reward, losses["loss/value"], losses["loss/policy"], parameters))
+            fault = 0 if finite.all() else np.argmin(finite) + 1
         self._random = _random_state(self.vector.device)
         _set_random_state(self.vector.device, outside)
-        metrics = {name: per_step[..., i] for i, name in enumerate(names)}
-        return metrics | losses | {"fault": faults}
+        return dict(zip(names, per_step.T, strict=True)) | losses | {"fault": fault}
 
     def state(self) -> State:
         """Everything that is needed to continue the training, as nested dictionaries of NumPy
         arrays."""
-        return {
-            "modules": {
-                name: {key: _to_array(tensor) for key, tensor in module.state_dict().items()}
-                for name, module in self._modules().items()
-            },
-            "adam": {
-                str(i): {key: _to_array(moment) for key, moment in self._moments(parameter).items()}
-                for i, parameter in enumerate(self._parameters())
-            },
-            "learning_rate": _split_words(np.float64(self.optimizer.param_groups[0]["lr"])),
-            "iteration": np.int32(self.iteration),
-            "env": self.vector.state,
-            "observed": {name: _to_array(tensor) for name, tensor in self._observed().items()},
-            "random": {name: _to_array(tensor) for name, tensor in self._random.items()},
-        }
+        return jax.tree.map(_to_array, self._tensors()) | {"env": self.vector.state}
 
     def restore(self, state: State) -> None:
         """Continues from a `state`."""
+        current = self._tensors()
+        given = {name: state[name] for name in current}
+        tensors = jax.tree.map(_to_tensor, given, current)
         for name, module in self._modules().items():
-            current = module.state_dict()
-            module.load_state_dict(
-                {key: _to_tensor(x, current[key]) for key, x in state["modules"][name].items()}
-            )
+            module.load_state_dict(tensors["modules"][name])
         for i, parameter in enumerate(self._parameters()):
-            self.optimizer.state[parameter] = {
-                key: _to_tensor(state["adam"][str(i)][key], moment)
-                for key, moment in self._moments(parameter).items()
-            }
-        rate = np.asarray(state["learning_rate"])
-        self._set_learning_rate(float(rate.view(np.float64)[0]))
-        self.iteration = int(state["iteration"])
+            self.optimizer.state[parameter] = tensors["adam"][str(i)]
+        self._set_learning_rate(tensors["learning_rate"].item())
+        self.iteration = tensors["iteration"].item()
         self.vector.state = state["env"]
-        observed = self._observed().items()
-        self._observe(**{n: _to_tensor(state["observed"][n], tensor) for n, tensor in observed})
-        self._random = {name: torch.from_numpy(np.array(x)) for name, x in state["random"].items()}
+        self._observe(**tensors["observed"])
+        self._random = tensors["random"]
+
+    def _tensors(self) -> State:
+        """The state without the environments."""
+        rate = self.optimizer.param_groups[0]["lr"]
+        return {
+            "modules": {name: dict(m.state_dict()) for name, m in self._modules().items()},
+            "adam": {str(i): self._moments(p) for i, p in enumerate(self._parameters())},
+            "learning_rate": torch.tensor(rate, dtype=torch.float64),
+            "iteration": torch.tensor(self.iteration, dtype=torch.int32),
+            "observed": self._observed(),
+            "random": self._random,
+        }
 
     def save_model(self, path: Path) -> None:
         """Writes networks, optimizer and iteration in the format of rsl_rl's runner, whose `load`
@@ -142,9 +127,10 @@ class Learner(abc.ABC):
     def _modules(self) -> dict[str, nn.Module]:
         """Networks and statistics."""
 
-    @abc.abstractmethod
     def _set_learning_rate(self, rate: float) -> None:
         """Sets the learning rate in every place where the library stores it."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
 
     @abc.abstractmethod
     def _observed(self) -> dict[str, torch.Tensor]:
@@ -183,20 +169,15 @@ def _set_random_state(device: torch.device, states: dict[str, torch.Tensor]) -> 
 
 
 def _to_array(tensor: torch.Tensor) -> np.ndarray:
-    """A copy, because the training reuses the tensor's memory."""
-    return _split_words(tensor.detach().cpu().numpy().copy())
-
-
-def _split_words(array: np.ndarray) -> np.ndarray:
-    """64-bit numbers as pairs of words [..., 2], because JAX reads checkpoints in 32 bits."""
-    array = np.asarray(array)
+    """A copy, because the training reuses the tensor's memory. 64-bit numbers become pairs of words
+    [..., 2], because JAX reads checkpoints in 32 bits."""
+    array = tensor.detach().cpu().numpy().copy()
     return array[..., None].view(np.uint32) if array.dtype.itemsize == 8 else array
 
 
 def _to_tensor(array: jax.Array | np.ndarray, like: torch.Tensor) -> torch.Tensor:
     """The inverse of `_to_array`: a tensor with the type and the device of `like`."""
-    array = np.array(array)
-    wanted = like.detach().cpu().numpy().dtype
-    if wanted.itemsize == 8:
-        array = array.view(wanted)[..., 0]
-    return torch.from_numpy(np.array(array)).to(like.device)
+    tensor = torch.from_numpy(np.array(array))
+    if like.dtype.itemsize == 8:
+        tensor = tensor.view(like.dtype)[..., 0]
+    return tensor.to(like.device)

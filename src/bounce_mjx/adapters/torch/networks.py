@@ -32,7 +32,10 @@ class Normalizer(nn.Module):
         self.register_buffer("mean", torch.zeros(size, device=device))
         self.register_buffer("summed_variance", torch.zeros(size, device=device))
         self.register_buffer("std", torch.ones(size, device=device))
+        # TorchScript knows no constants of a module.
+        self.max_normalized, self.min_std = float(MAX_NORMALIZED), float(MIN_STD)
 
+    @torch.jit.unused
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
         """Adds observations [..., N] to the statistics (Chan, Golub and LeVeque 1979)."""
@@ -46,38 +49,13 @@ class Normalizer(nn.Module):
         self.summed_variance += delta.square() * (old_count * batch.shape[0] / self.count)
         self.std = torch.sqrt(self.summed_variance / self.count + MIN_VARIANCE)
 
-    def forward(self, observation: torch.Tensor | None, train: bool = False) -> torch.Tensor | None:
+    def forward(self, observation: torch.Tensor, train: bool = False) -> torch.Tensor:
         """Normalises observations [..., N]; `train` adds them to the statistics first."""
-        if observation is None:
-            return None
         if train:
             self.update(observation)
-        return _standardized(observation, self.mean, self.std, MAX_NORMALIZED, MIN_STD)
-
-
-class FixedNormalizer(nn.Module):
-    """The normalisation with the present statistics of a `Normalizer`, for TorchScript and ONNX."""
-
-    def __init__(self, normalizer: Normalizer):
-        super().__init__()
-        self.register_buffer("mean", normalizer.mean.clone())
-        self.register_buffer("std", normalizer.std.clone())
-        self.max_normalized, self.min_std = float(MAX_NORMALIZED), float(MIN_STD)
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Normalises observations [..., N]."""
-        return _standardized(observation, self.mean, self.std, self.max_normalized, self.min_std)
-
-
-def _standardized(
-    observation: torch.Tensor,
-    mean: torch.Tensor,
-    std: torch.Tensor,
-    max_normalized: float,
-    min_std: float,
-) -> torch.Tensor:
-    clipped = ((observation - mean) / std).clamp(-max_normalized, max_normalized)
-    return torch.where(std > min_std, clipped, torch.zeros_like(clipped))
+        limit = self.max_normalized
+        clipped = ((observation - self.mean) / self.std).clamp(-limit, limit)
+        return torch.where(self.std > self.min_std, clipped, torch.zeros_like(clipped))
 
 
 def make_mlp(config: PPOConfig, num_inputs: int, num_outputs: int) -> nn.Sequential:

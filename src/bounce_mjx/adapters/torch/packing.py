@@ -13,13 +13,6 @@ import jax
 import jax.numpy as jnp
 import torch
 
-_TORCH_TYPES = {
-    "float32": torch.float32,
-    "int32": torch.int32,
-    "uint32": torch.uint32,
-    "bool": torch.bool,
-}
-
 
 class _Part(NamedTuple):
     """Position of one array in the block."""
@@ -30,23 +23,6 @@ class _Part(NamedTuple):
     """First word."""
     stop: int
     """Word after the last."""
-
-
-class _View(NamedTuple):
-    """Position of one array in PyTorch's terms, made in advance because a step makes each view
-    anew."""
-
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-    start: int
-    """First element, counted in elements of this type."""
-
-    @classmethod
-    def of(cls, part: _Part) -> "_View":
-        strides = torch.empty(part.shape, device="meta").stride()
-        start = 4 * part.start // part.dtype.itemsize
-        return cls(_TORCH_TYPES[part.dtype.name], part.shape, strides, start)
 
 
 class Layout:
@@ -63,8 +39,18 @@ class Layout:
             dtype = jnp.dtype(leaf.dtype)
             start, stop = stop, stop + -(-math.prod(leaf.shape) * dtype.itemsize // 4)
             self._parts.append(_Part(tuple(leaf.shape), dtype, start, stop))
-        self._views = [_View.of(part) for part in self._parts]
-        self._types = {view.dtype for view in self._views}
+        # Made in advance, because a step makes each view anew: PyTorch's type, shape, strides and
+        # the first element, counted in elements of this type.
+        self._views = [
+            (
+                getattr(torch, part.dtype.name),
+                part.shape,
+                torch.empty(part.shape, device="meta").stride(),
+                4 * part.start // part.dtype.itemsize,
+            )
+            for part in self._parts
+        ]
+        self._types = {dtype for dtype, *_ in self._views}
 
     def pack(self, arrays: Any) -> jax.Array:
         """The block [W] of a pytree of such arrays."""
@@ -80,7 +66,7 @@ class Layout:
         with memory of its own."""
         typed = {dtype: block.view(dtype) for dtype in self._types}
         return self._tree.unflatten(
-            [typed[x.dtype].as_strided(x.shape, x.strides, x.start) for x in self._views]
+            [typed[dtype].as_strided(*position) for dtype, *position in self._views]
         )
 
 

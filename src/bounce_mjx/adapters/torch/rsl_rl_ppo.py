@@ -28,7 +28,6 @@ from torch import nn
 
 from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.networks import (
-    FixedNormalizer,
     Normalizer,
     init_weights,
     linears_of,
@@ -61,29 +60,18 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.episode_steps
         self.device = env.device
         self.cfg = env.env.config
+        self.step_dt, self.physics_dt = env.env.dt, self.cfg.physics_dt
+        self.render_mode = None
+        self.action_space = spaces.Box(-1.0, 1.0, (self.num_envs, self.num_actions), np.float32)
         self._seed: int | None = None
         self._observations = self._groups(*env.reset())
-        self._result: StepResult | None = None
+        self.result: StepResult | None = None
+        """Result of the last step."""
 
     @property
     def unwrapped(self) -> "RslRlVecEnv":
         """The environments themselves, as there is no wrapper around them."""
         return self
-
-    @property
-    def step_dt(self) -> float:
-        """Time of one control step, s."""
-        return self.env.env.dt
-
-    @property
-    def physics_dt(self) -> float:
-        """Time of one physics step, s."""
-        return self.cfg.physics_dt
-
-    @property
-    def render_mode(self) -> None:
-        """The environments draw no pictures; `bounce-mjx play` does."""
-        return None
 
     @property
     def observation_space(self) -> spaces.Dict:
@@ -95,11 +83,6 @@ class RslRlVecEnv(VecEnv):
             }
         )
 
-    @property
-    def action_space(self) -> spaces.Box:
-        """The actions [B, A] of all environments."""
-        return spaces.Box(-1.0, 1.0, (self.num_envs, self.num_actions), np.float32)
-
     def seed(self, seed: int = -1) -> int:
         """Sets the seed of the next `reset`; with -1, the next reset goes on with the present
         random numbers."""
@@ -109,7 +92,7 @@ class RslRlVecEnv(VecEnv):
     def reset(self) -> tuple[TensorDict, dict[str, Any]]:
         """Starts a new episode in every environment: observations and empty extras."""
         self._observations = self._groups(*self.env.reset(self._seed))
-        self._seed, self._result = None, None
+        self._seed = None
         return self._observations, {}
 
     def close(self) -> None:
@@ -128,11 +111,6 @@ class RslRlVecEnv(VecEnv):
         """The current observations."""
         return self._observations
 
-    def set_observations(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> None:
-        """Replaces the current observations [B, N] and critic metrics [B, K], after a new
-        `TorchVectorEnv.state`."""
-        self._observations = self._groups(observation, critic_metrics)
-
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -141,21 +119,12 @@ class RslRlVecEnv(VecEnv):
         Returns:
           Observations, rewards [B], dones [B] (bool) and extras.
         """
-        result = self._result = self.env.step(actions)
+        result = self.result = self.env.step(actions)
         self._observations = self._groups(result.observation, result.critic_metrics)
         means = zip(self.env.metric_names, result.metrics.unbind(), strict=True)
         log = {f"task/{name}": mean for name, mean in means if not name.startswith(SUM)}
         extras = {"time_outs": result.truncated, "log": log}
         return self._observations, result.reward, result.done, extras
-
-    def terminal_observations(self) -> TensorDict:
-        """Observations after the last step, before any reset; at the end of an episode, its last
-        observation."""
-        return self._groups(self._result.final_observation, self._result.final_critic_metrics)
-
-    def step_metrics(self) -> torch.Tensor:
-        """Metrics of the last step [M], named by `TorchVectorEnv.metric_names`."""
-        return self._result.metrics
 
     def _groups(self, observation: torch.Tensor, critic_metrics: torch.Tensor) -> TensorDict:
         # Built on the device, because a conversion would wait for it; without TensorDict's checks,
@@ -175,18 +144,6 @@ class Network(MLPModel):
         self.obs_normalization = True
         self.obs_normalizer = Normalizer(self.obs_dim)
         init_weights(self.mlp, output_gain=2**0.5 if self.distribution is None else 0.01)
-
-    def as_jit(self) -> nn.Module:
-        """The policy for TorchScript."""
-        return self._exportable(super().as_jit())
-
-    def as_onnx(self, verbose: bool) -> nn.Module:
-        """The policy for ONNX."""
-        return self._exportable(super().as_onnx(verbose))
-
-    def _exportable(self, model: nn.Module) -> nn.Module:
-        model.obs_normalizer = FixedNormalizer(self.obs_normalizer)
-        return model
 
 
 class RslRlLearner(Learner):
@@ -228,7 +185,7 @@ class RslRlLearner(Learner):
                 actions = self.algorithm.act(self.env.get_observations())
                 observations, rewards, dones, extras = self.env.step(actions)
                 self.algorithm.process_env_step(observations, rewards, dones, extras)
-                steps.append(self.env.step_metrics())
+                steps.append(self.env.result.metrics)
             self.algorithm.compute_returns(observations)
         loss = self.algorithm.update()
         return torch.stack(steps), {
@@ -242,16 +199,14 @@ class RslRlLearner(Learner):
         return {"actor": self.algorithm.actor, "critic": self.algorithm.critic}
 
     def _set_learning_rate(self, rate: float) -> None:
+        super()._set_learning_rate(rate)
         self.algorithm.learning_rate = rate
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
 
     def _observed(self) -> dict[str, torch.Tensor]:
-        observations = self.env.get_observations()
-        return {name: observations[name] for name in ("policy", "critic")}
+        return dict(self.env.get_observations().items())
 
-    def _observe(self, policy: torch.Tensor, critic: torch.Tensor) -> None:
-        self.env.set_observations(policy, critic)
+    def _observe(self, **observed: torch.Tensor) -> None:
+        self.env.get_observations().update(observed)
 
 
 def algorithm_config(config: PPOConfig) -> dict[str, Any]:

@@ -51,26 +51,19 @@ class SkrlEnv(Wrapper):
     observation and the critic metrics [B, N + K].
     """
 
+    # skrl's properties would ask the environment that is wrapped.
+    observation_space: gymnasium.Space = None
+    state_space: gymnasium.Space = None
+    action_space: gymnasium.Space = None
+
     def __init__(self, env: TorchVectorEnv):
         super().__init__(env)
-        num_states = env.num_observations + len(env.critic_metrics)
-        self._observation_space = _unbounded(env.num_observations)
-        self._state_space = _unbounded(num_states)
-        self._action_space = gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,))
+        self.observation_space = _unbounded(env.num_observations)
+        self.state_space = _unbounded(env.num_observations + len(env.critic_metrics))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,))
         self._states: torch.Tensor | None = None
-        self._result: StepResult | None = None
-
-    @property
-    def observation_space(self) -> gymnasium.Space:
-        return self._observation_space
-
-    @property
-    def state_space(self) -> gymnasium.Space:
-        return self._state_space
-
-    @property
-    def action_space(self) -> gymnasium.Space:
-        return self._action_space
+        self.result: StepResult | None = None
+        """Result of the last step."""
 
     def reset(self) -> tuple[torch.Tensor, dict[str, Any]]:
         """Starts a new episode in every environment."""
@@ -82,7 +75,7 @@ class SkrlEnv(Wrapper):
         self, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advances every environment under the actions [B, A]."""
-        result = self._result = self._env.step(actions)
+        result = self.result = self._env.step(actions)
         self._states = torch.cat([result.observation, result.critic_metrics], dim=-1)
         return (
             result.observation,
@@ -99,7 +92,7 @@ class SkrlEnv(Wrapper):
     def terminal_observations(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Observations and states after the last step, before any reset; at the end of an episode,
         its last ones."""
-        result = self._result
+        result = self.result
         states = torch.cat([result.final_observation, result.final_critic_metrics], dim=-1)
         return result.final_observation, states
 
@@ -142,11 +135,8 @@ class SkrlLearner(Learner):
                 num_envs=self.config.num_envs,
                 device=self.env.device,
             ),
-            observation_space=self.env.observation_space,
-            state_space=self.env.state_space,
-            action_space=self.env.action_space,
-            device=self.env.device,
             cfg=agent_config(self.config, self.env),
+            **_spaces(self.env),
         )
         self.agent.init()
         self.agent.enable_training_mode(True)
@@ -179,11 +169,6 @@ class SkrlLearner(Learner):
             "state_statistics": self.agent._state_preprocessor,
         }
 
-    def _set_learning_rate(self, rate: float) -> None:
-        # The scheduler reads it from here.
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-
     def _observed(self) -> dict[str, torch.Tensor]:
         return {"observations": self._observations, "states": self._states}
 
@@ -214,12 +199,11 @@ class SkrlLearner(Learner):
             )
         self.agent.post_interaction(**clock)
         self._observations, self._states = following, self.env.state()
-        return self.env._result.metrics
+        return self.env.result.metrics
 
 
 def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
     """The config in the form that skrl's agent expects."""
-    adaptive = config.target_kl > 0.0
     return PPO_CFG(
         rollouts=config.rollout_length,
         learning_epochs=config.num_epochs,
@@ -227,16 +211,12 @@ def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
         discount_factor=config.discount,
         gae_lambda=config.gae_lambda,
         learning_rate=config.learning_rate,
-        learning_rate_scheduler=KLAdaptiveLR if adaptive else None,
-        learning_rate_scheduler_kwargs=(
-            {
-                "kl_threshold": config.target_kl,
-                "min_lr": config.min_learning_rate,
-                "max_lr": config.max_learning_rate,
-            }
-            if adaptive
-            else {}
-        ),
+        learning_rate_scheduler=KLAdaptiveLR if config.target_kl > 0.0 else None,
+        learning_rate_scheduler_kwargs={
+            "kl_threshold": config.target_kl,
+            "min_lr": config.min_learning_rate,
+            "max_lr": config.max_learning_rate,
+        },
         observation_preprocessor=Normalizer,
         observation_preprocessor_kwargs={
             "size": env.observation_space.shape[0],
@@ -254,7 +234,7 @@ def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
     )
 
 
-def _model_arguments(env: SkrlEnv) -> dict[str, Any]:
+def _spaces(env: SkrlEnv) -> dict[str, Any]:
     return {
         "observation_space": env.observation_space,
         "state_space": env.state_space,
@@ -265,7 +245,7 @@ def _model_arguments(env: SkrlEnv) -> dict[str, Any]:
 
 class _Actor(GaussianMixin, Model):
     def __init__(self, config: PPOConfig, env: SkrlEnv):
-        Model.__init__(self, **_model_arguments(env))
+        Model.__init__(self, **_spaces(env))
         GaussianMixin.__init__(self)
         self.mlp = make_mlp(config, self.num_observations, self.num_actions)
         init_weights(self.mlp, output_gain=0.01)
@@ -281,7 +261,7 @@ class _Actor(GaussianMixin, Model):
 
 class _Critic(DeterministicMixin, Model):
     def __init__(self, config: PPOConfig, env: SkrlEnv):
-        Model.__init__(self, **_model_arguments(env))
+        Model.__init__(self, **_spaces(env))
         DeterministicMixin.__init__(self)
         self.mlp = make_mlp(config, self.num_states, 1)
         init_weights(self.mlp, output_gain=2**0.5)

@@ -48,7 +48,7 @@ class TorchTrainer:
         self.learners: list[Learner] = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             vector = first.sibling(seed) if self.learners else first
-            self.learners.append(_learner_class(library)(config.ppo, vector, seed))
+            self.learners.append(make_learner(library, config.ppo, vector, seed))
 
     def state_template(self) -> Any:
         one = jax.tree.map(np.asarray, self.learners[0].state())
@@ -73,10 +73,10 @@ class TorchTrainer:
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         parts = []
         for _ in range(iterations):
-            parts.append([learner.learn(1) for learner in self.learners])
+            parts.append([learner.learn() for learner in self.learners])
             if stopping():
                 break
-        blocks = [summarize(_joined(metrics), self._curves) for metrics in zip(*parts, strict=True)]
+        blocks = [summarize(metrics, self._curves) for metrics in zip(*parts, strict=True)]
         return {name: np.stack([block[name] for block in blocks]) for name in blocks[0]}
 
     def snapshot(self) -> Snapshot:
@@ -94,13 +94,14 @@ class TorchTrainer:
             learner.save_model(run / MODEL_FILE)
 
 
-def make_learner(library: str, config: PPOConfig, env: Env, seed: int) -> Learner:
+def make_learner(library: str, config: PPOConfig, vector: TorchVectorEnv, seed: int) -> Learner:
     """The PPO of a library.
 
     Raises:
       UserError: the library is not installed.
     """
-    return _learner_class(library)(config, make_vector_env(config, env, seed), seed)
+    module = importlib.import_module(f"bounce_mjx.adapters.torch.{library}_ppo")
+    return getattr(module, _LEARNERS[library])(config, vector, seed)
 
 
 def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
@@ -114,21 +115,11 @@ def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
     )
 
 
-def summarize(metrics: Metrics, curves: Sequence[Curve]) -> Metrics:
-    """Metrics of each iteration [I] from a learner's metrics. The environment's metrics [I, T] are
-    summarised as in the JAX trainer, with the curves of the task; the learner's own [I] are
-    kept."""
+def summarize(iterations: Sequence[Metrics], curves: Sequence[Curve]) -> Metrics:
+    """Metrics [I] from those of I iterations of a learner. The environment's metrics [T] are
+    summarised as in the JAX trainer, with the curves of the task; the learner's own [] are kept."""
+    metrics = {name: np.stack([one[name] for one in iterations]) for name in iterations[0]}
     own = {name: values for name, values in metrics.items() if values.ndim == 1}
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}
     summary = jax.vmap(lambda steps: rollout_metrics(steps, curves))(steps)
     return own | {name: np.asarray(value) for name, value in summary.items()}
-
-
-def _joined(parts: Sequence[Metrics]) -> Metrics:
-    """The metrics of a learner's calls, one after another."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _learner_class(library: str) -> type[Learner]:
-    module = importlib.import_module(f"bounce_mjx.adapters.torch.{library}_ppo")
-    return getattr(module, _LEARNERS[library])

@@ -6,7 +6,7 @@ donated to the next step, so a step returns no view of it.
 """
 
 import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,6 @@ class TorchVectorEnv:
         seed: int = 0,
         critic_metrics: tuple[str, ...] | None = None,
         reward_scale: float = 1.0,
-        device: torch.device | str | None = None,
     ):
         """Compiles nothing; the first calls of `reset` and `step` do.
 
@@ -68,26 +67,22 @@ class TorchVectorEnv:
           critic_metrics: names of the metrics that are additional inputs of the value network;
             a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
-          device: the device of the tensors, which must be JAX's default device; None accepts it.
 
         Raises:
-          UserError: torch cannot use JAX's device, `device` is another one, or a metric is unknown.
+          UserError: torch cannot use JAX's device, or a metric is unknown.
         """
         self.env = env or Env(task_config(DEFAULT)())
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size
         self.episode_steps = self.env.config.episode_steps
-        self.device = _shared_device(None if device is None else torch.device(device))
-        self._dlpack_device = torch.empty(0, device=self.device).__dlpack_device__()
+        self.device = _shared_device()
         self._reward_scale = reward_scale
         self._key = jax.random.PRNGKey(seed)
-        self._template = jax.eval_shape(
-            lambda key: vector.reset(self.env, key, num_envs), self._key
-        )
         if critic_metrics is None:
             critic_metrics = self.env.task.critic_metrics
-        self.critic_metrics = matching_metrics(critic_metrics, self._template.env.metrics)
+        metrics = jax.eval_shape(self.env.reset, self._key).metrics
+        self.critic_metrics = matching_metrics(critic_metrics, metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried = jax.eval_shape(self._start, self._key)[0]
         _, result = jax.eval_shape(self._advance, carried, action)
@@ -132,9 +127,7 @@ class TorchVectorEnv:
             )
         if self._block is None:
             raise UserError("step was called before reset; call reset first")
-        shared = jax.dlpack.from_dlpack(
-            _Exported(action.detach().contiguous(), self._dlpack_device)
-        )
+        shared = jax.dlpack.from_dlpack(action.detach().contiguous())
         self._block, result = self._jit_step(self._block, shared)
         return self._result_layout.views(torch.from_dlpack(result))
 
@@ -164,21 +157,21 @@ class TorchVectorEnv:
     def clock(self) -> torch.Tensor:
         """Steps of each episode that count towards its time limit [B], int32; a copy. Assign
         different values to spread the time-outs of episodes that began together."""
-        if self._block is None:
-            self.reset()
         # A copy, because the next step reuses the state's memory.
-        carried = self._carried_layout.unpack(self._block)
-        return torch.from_dlpack(jnp.copy(carried.vector.clock))
+        return torch.from_dlpack(jnp.copy(self._carried().vector.clock))
 
     @clock.setter
     def clock(self, value: torch.Tensor) -> None:
-        if self._block is None:
-            self.reset()
         clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32).contiguous())
-        carried = self._carried_layout.unpack(self._block)
+        carried = self._carried()
         self._block = self._carried_layout.pack(
             carried._replace(vector=carried.vector._replace(clock=clock))
         )
+
+    def _carried(self) -> "_Carried":
+        if self._block is None:
+            self.reset()
+        return self._carried_layout.unpack(self._block)
 
     def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
@@ -204,10 +197,11 @@ class TorchVectorEnv:
     def _advance(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", StepResult]:
         """The next inputs, and the result as JAX's arrays; its metrics are a dictionary."""
         key, reset_key = jax.random.split(carried.key)
-        state = _whole(carried.vector, self._template)
         steps = None if carried.steps is None else carried.steps + 1
         ranges = vector.ranges_after(self.env, steps, self.num_envs)
-        state, result = vector.step(self.env, state, action, reset_key, self.episode_steps, ranges)
+        state, result = vector.step(
+            self.env, carried.vector, action, reset_key, self.episode_steps, ranges
+        )
         arrays = StepResult(
             observation=result.observation,
             critic_metrics=self._critic_metrics(state.env.metrics),
@@ -227,25 +221,6 @@ class TorchVectorEnv:
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((self.num_envs, 0))
 
 
-class _Exported:
-    """A tensor for `jax.dlpack.from_dlpack`, without the checks and look-ups of a tensor's own
-    methods, 10 us of Python at each step."""
-
-    def __init__(self, tensor: torch.Tensor, dlpack_device: tuple[int, int]):
-        self._tensor, self._dlpack_device = tensor, dlpack_device
-
-    def __dlpack_device__(self) -> tuple[int, int]:
-        return self._dlpack_device
-
-    def __dlpack__(self, *, stream: int | None = None) -> Any:
-        # On CUDA, JAX's stream must wait for the one that computes the tensor.
-        if stream is not None:
-            device = self._tensor.device
-            reader = torch.cuda.ExternalStream(stream, device)
-            reader.wait_stream(torch.cuda.current_stream(device))
-        return torch.utils.dlpack.to_dlpack(self._tensor)
-
-
 class _Carried(NamedTuple):
     """Inputs of the next step in addition to the action."""
 
@@ -260,16 +235,7 @@ def _slim(state: vector.VectorState) -> vector.VectorState:
     return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
 
 
-def _whole(slim: vector.VectorState, template: Any) -> vector.VectorState:
-    """A slim state with zeros in the missing fields; the compiler removes these zeros."""
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template.env)
-    filled = slim.env.replace(
-        obs=zeros.obs, reward=zeros.reward, done=zeros.done, metrics=zeros.metrics
-    )
-    return slim._replace(env=filled)
-
-
-def _shared_device(wanted: torch.device | None) -> torch.device:
+def _shared_device() -> torch.device:
     """The torch device of JAX's default device."""
     device = jax.devices()[0]
     if device.platform == "gpu" and not torch.cuda.is_available():
@@ -278,16 +244,9 @@ def _shared_device(wanted: torch.device | None) -> torch.device:
             "PyTorch with CUDA, or start with JAX_PLATFORMS=cpu"
         )
     try:
-        shared = torch.from_dlpack(jnp.zeros(1)).device
+        return torch.from_dlpack(jnp.zeros(1)).device
     except Exception as error:
         raise UserError(
             f"PyTorch cannot use the memory of JAX's {device.platform} device "
             f"({str(error).splitlines()[0]}); start with JAX_PLATFORMS=cpu"
         ) from error
-    same = wanted is None or (wanted.type == shared.type and wanted.index in (None, shared.index))
-    if not same:
-        raise UserError(
-            f"device is {wanted}, but JAX's arrays lie on {shared}; omit it, or choose JAX's "
-            "device with JAX_PLATFORMS"
-        )
-    return shared
