@@ -30,7 +30,7 @@ from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 
 # Minimum share of environments that keep the ball up throughout.
 MIN_SHARE = 0.99
@@ -59,7 +59,7 @@ def measure(command: Command) -> list[dict]:
     config = load_run_config(checkpoint.run)
     env = BounceBall(config.env)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
     steps = round(60.0 / env.dt)
 
     @jax.jit

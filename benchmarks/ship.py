@@ -29,7 +29,7 @@ from bounce_mjx.runs.folders import (
     save_config,
 )
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.setup import set_up_jax
 
@@ -75,7 +75,7 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
             f"{checkpoint.run} was trained with --mjcf {trained_with.env.mjcf}, which is not "
             "part of the package; give a run of the package's own arm"
         )
-    policy = load_policy(checkpoint, trained_with)
+    policy = read_policy(checkpoint, trained_with)
     report, physics, _ = run_interruptible(
         evaluate_policy,
         policy,

@@ -362,14 +362,14 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.learning.policy import act, make_networks
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
-    from bounce_mjx.runs.reading import load_policy
+    from bounce_mjx.runs.reading import read_policy
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
     layout = EnvConfig().layout
     networks = make_networks(config.ppo, layout.size, 6)
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
     changes = {"observation": observation or {}, "randomization": randomization or {}}
     env = BounceBall(EnvConfig(target_height_range=(target, target), **changes))
 

@@ -27,7 +27,7 @@ from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
 from bounce_mjx.runs import files, writing
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
-from bounce_mjx.runs.reading import load_policy, load_training_state
+from bounce_mjx.runs.reading import load_training_state, read_policy
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
@@ -75,7 +75,7 @@ def step_of(run: Path) -> Path:
 def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
     """Loads the policy like `eval`, and the whole state like `--resume`."""
     checkpoint = find_checkpoint(run)
-    policy = load_policy(checkpoint, load_run_config(run))
+    policy = read_policy(checkpoint, load_run_config(run))
     template = jax.eval_shape(lambda: state)
     return policy, load_training_state(checkpoint, template)[0]
 
@@ -103,7 +103,7 @@ def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -
     writer.save(["best"], 64, policy_of(state, OBSERVATION.size))
     writer.close()
     checkpoint = find_checkpoint(run)
-    assert_identical(load_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
+    assert_identical(read_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
     with pytest.raises(UserError, match="holds no training state to go on from"):
         load_training_state(checkpoint, state)
 
@@ -125,7 +125,7 @@ def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state
     writer.close()
     name = "in params." if part == "weight" else f"in normalizer.{part};"
     for reads in (
-        lambda: load_policy(find_checkpoint(run), CONFIG),
+        lambda: read_policy(find_checkpoint(run), CONFIG),
         lambda: export_onnx(find_checkpoint(run)),
         lambda: bounce_mjx.load_policy(run),
     ):

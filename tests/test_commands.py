@@ -25,7 +25,7 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.training.setup import set_up_jax
@@ -514,7 +514,7 @@ def test_eval_on_mujoco_agrees(trained: Path, tmp_path: Path) -> None:
 
 def test_policy_is_read_as_orbax_reads_it(trained: Path) -> None:
     checkpoint = find_checkpoint(trained / "checkpoints/latest")
-    ours = load_policy(checkpoint, load_run_config(trained))
+    ours = read_policy(checkpoint, load_run_config(trained))
     with ocp.StandardCheckpointer() as checkpointer:
         theirs = checkpointer.restore(checkpoint.folder.absolute() / "policy")
     assert isinstance(ours, Policy)

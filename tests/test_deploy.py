@@ -208,7 +208,7 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
     """1,000 inputs of a policy's network by the names of the quantities, and the actions of JAX."""
     checkpoint = find_checkpoint(runs[name])
     config = load_run_config(checkpoint.run)
-    policy = reading.load_policy(checkpoint, config)
+    policy = reading.read_policy(checkpoint, config)
     layout, counts = config.env.layout, config.env.observation.seen()
     rng = np.random.default_rng(3)
     # Some observations are beyond the clipping range of the normaliser.
@@ -388,7 +388,7 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
         shape = -1, *[1] * (np.ndim(new) - 1)
         values = np.where(is_first.reshape(shape), new, old)
         np.testing.assert_allclose(results[f"next/{name}"], values, rtol=1e-6, atol=1e-6)
-    network = network_of(config, reading.load_policy(checkpoint, config))
+    network = network_of(config, reading.read_policy(checkpoint, config))
     np.testing.assert_allclose(results["action"], network(inputs | seen), rtol=0.0, atol=2e-5)
 
 

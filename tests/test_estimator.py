@@ -61,7 +61,7 @@ def watched(env: BounceBall) -> Watched:
     """The package's policy bounces the balls by their true states; all in float64."""
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    policy = reading.load_policy(checkpoint, config)
+    policy = reading.read_policy(checkpoint, config)
     networks = make_networks(config.ppo, OBSERVATION.size, 6)
 
     def step(state, _):

@@ -226,7 +226,7 @@ def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
     script = """
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.commands.train import read_command
 import jax
@@ -247,13 +247,13 @@ from bounce_mjx import BounceBall, load_policy as load_deployed
 from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
 config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)
 state = env.reset(jax.random.PRNGKey(0))
 networks = make_networks(config.ppo, env.observation_size, env.action_size)
-action = act(networks, load_policy(checkpoint, config), state.obs)
+action = act(networks, read_policy(checkpoint, config), state.obs)
 print(checkpoint.run)
 print(*action.shape, bool((abs(action) > 0.0).any()))
 print(len(load_deployed("pretrained").needs))

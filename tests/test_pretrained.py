@@ -21,7 +21,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128
@@ -40,7 +40,7 @@ def measured() -> Report:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
     return evaluate_policy(
-        load_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(EPISODES)
+        read_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(EPISODES)
     ).report
 
 
@@ -143,7 +143,7 @@ def test_shipping_keeps_the_policy(tmp_path: Path, ship, measure, shipped: dict)
     assert list(tmp_path.iterdir()) == [out]
     config = load_run_config(out)
     assert config == load_run_config(FOLDER)
-    policies = (load_policy(best_checkpoint(run), config) for run in (out, FOLDER))
+    policies = (read_policy(best_checkpoint(run), config) for run in (out, FOLDER))
     jax.tree.map(np.testing.assert_array_equal, *policies)
     onnx_file = f"{FOLDER.name}.onnx"
     assert (out / onnx_file).read_bytes() == export_onnx(pretrained_checkpoint())

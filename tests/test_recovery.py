@@ -46,7 +46,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.runs.reading import RESUMABLE_KEYS, load_policy, read_record
+from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
@@ -494,7 +494,7 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
     env = BounceBall(config.env)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_evaluator(env, networks, config.eval_episodes)
-    policy = load_policy(best_checkpoint(straight), config)
+    policy = read_policy(best_checkpoint(straight), config)
 
     def mean_return(seed: int) -> float:
         key = jax.random.split(jax.random.PRNGKey(np.uint32(seed)))[0]
@@ -571,7 +571,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     """The program of a screening of three episodes also runs a full evaluation of four, on the
     resets that one program of four episodes uses."""
     config = load_run_config(straight).model_copy(update={"screening_episodes": 3})
-    env, policy = BounceBall(config.env), load_policy(best_checkpoint(straight), config)
+    env, policy = BounceBall(config.env), read_policy(best_checkpoint(straight), config)
     with concurrent.futures.ThreadPoolExecutor() as pool:
         chunked, whole = (
             Evaluators(each, env, make_mesh(1, config.ppo), pool)

@@ -32,7 +32,7 @@ from bounce_mjx.reports.robustness import load_robustness, robustness_figure, ro
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task import Tally
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
@@ -239,7 +239,7 @@ def shipped() -> tuple[Policy, PPOConfig, EnvConfig]:
     config = load_run_config(checkpoint.run)
     # Long enough for a settled bounce.
     return (
-        load_policy(checkpoint, config),
+        read_policy(checkpoint, config),
         config.ppo,
         config.env.model_copy(update={"episode_seconds": 3.0}),
     )

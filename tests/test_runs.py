@@ -50,7 +50,7 @@ from bounce_mjx.runs.folders import (
     save_config,
 )
 from bounce_mjx.runs.progress import Progress, load_results
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training import job
 from tiny_runs import contents
@@ -519,7 +519,7 @@ def test_evaluations_of_another_shape(plain: dict) -> None:
 def test_policy_loads_where_double_precision_is_on() -> None:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
-    single = load_policy(checkpoint, config)
+    single = read_policy(checkpoint, config)
     with jax.enable_x64(True):
-        double = load_policy(checkpoint, config)
+        double = read_policy(checkpoint, config)
     jax.tree.map(np.testing.assert_array_equal, single, double)

@@ -24,7 +24,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.adapters.torch.gymnasium_env import TorchGymnasiumVectorEnv
 from bounce_mjx.adapters.torch.networks import (
-    Normalizer,
+    InputNormalizer,
     init_weights,
     linears_of,
     make_mlp,
@@ -501,7 +501,7 @@ def test_normalizer_equals_the_normalizer_in_jax():
     """The statistics over batches and the normalised observations are equal, also for a constant
     observation."""
     rng = np.random.default_rng(0)
-    normalizer, statistics = Normalizer(3), init_statistics(3)
+    normalizer, statistics = InputNormalizer(3), init_statistics(3)
     for count in (5, 40, 7):
         batch = rng.normal([2.0, -300.0, 0.0], [1.0, 20.0, 0.0], (count, 3)).astype(np.float32)
         seen = normalizer(torch.tensor(batch), train=True)
@@ -567,7 +567,7 @@ def test_initial_weights_are_distributed_as_in_jax():
 def test_network_of_another_shape_is_refused():
     mlp = make_mlp(PPO.model_copy(update={"hidden_layers": (16,)}), 29, 6)
     with pytest.raises(UserError, match="hidden_layers"):
-        to_policy(PPO, Normalizer(29), linears_of(mlp), torch.zeros(6))
+        to_policy(PPO, InputNormalizer(29), linears_of(mlp), torch.zeros(6))
 
 
 @pytest.mark.slow

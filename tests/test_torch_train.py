@@ -27,7 +27,7 @@ from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import load_config
 from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint, latest_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import run_command
 from tiny_runs import arrays
@@ -115,7 +115,7 @@ def test_rsl_rls_runner_opens_the_model(run, library):
     assert not torch.equal(actor.mlp[0].weight, fresh)
     assert runner.alg.optimizer.state_dict()["state"][0]["step"] > 0
     # The latest checkpoint holds the same policy.
-    policy = load_policy(find_checkpoint(run / "checkpoints" / "latest"), config)
+    policy = read_policy(find_checkpoint(run / "checkpoints" / "latest"), config)
     kernel = policy.params["params"]["MLP_0"]["hidden_0"]["kernel"]
     np.testing.assert_array_equal(actor.mlp[0].weight.detach().numpy().T, kernel)
 
@@ -144,7 +144,7 @@ def test_best_policy_is_the_evaluated_policy(run):
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_evaluator(env, networks, config.eval_episodes)
     key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed + 2**31)))[0]
-    report = judge(env, evaluate(load_policy(checkpoint, config), key))
+    report = judge(env, evaluate(read_policy(checkpoint, config), key))
     for again, stored in zip(report.results, results["results"], strict=True):
         assert again.name == stored["name"]
         measured = stored["value"] is not None

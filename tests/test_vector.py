@@ -69,7 +69,7 @@ def limited(reset, step, actions):
 
 
 def python_loop(single, actions, episode_steps, i):
-    """Environment i alone, in plain Python, with the results that `StepResult` describes."""
+    """Environment i alone, in plain Python, with the results that `VectorStep` describes."""
     reset_one, step_one = single
     state = reset_one(jax.random.split(RESET_KEY, NUM_ENVS)[i])
     episode_return, length, rows = 0.0, 0, []

@@ -39,7 +39,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import browser, native, offscreen, pace, show
@@ -964,7 +964,7 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
         ("ended",),
     ]
     (folder,) = tmp_path.iterdir()
-    saved = load_policy(latest_checkpoint(folder), load_run_config(folder))
+    saved = read_policy(latest_checkpoint(folder), load_run_config(folder))
     jax.tree.map(np.testing.assert_array_equal, *shown, saved)
     assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
 
@@ -1144,7 +1144,7 @@ def played() -> Simulation:
     )
     env = BounceBall(with_sliders(config))
     networks = make_networks(run.ppo, env.observation_size, env.action_size)
-    controller = make_policy_controller(networks, load_policy(checkpoint, run))
+    controller = make_policy_controller(networks, read_policy(checkpoint, run))
     return Simulation(env, controller, 2, seed=0, ranges=drawn_ranges(config))
 
 

@@ -53,7 +53,7 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.reports.tables import details_line, results_table
         from bounce_mjx.runs.files import check_output, to_json, writable, write_output
         from bounce_mjx.runs.folders import choose_checkpoint
-        from bounce_mjx.runs.reading import load_policy
+        from bounce_mjx.runs.reading import read_policy
         from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
@@ -62,7 +62,7 @@ def main(args: Sequence[str]) -> None:
     config = command.config(checkpoint.run)
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     with _progress(console) as progress:

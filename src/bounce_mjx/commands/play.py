@@ -77,12 +77,12 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
 def _load(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
     from bounce_mjx.learning.policy import make_networks
-    from bounce_mjx.runs.reading import load_policy
+    from bounce_mjx.runs.reading import read_policy
     from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
 
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
 
     def make_controller(env: "Env") -> "Controller":
         networks = make_networks(config.ppo, env.observation_size, env.action_size)

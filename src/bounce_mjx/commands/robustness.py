@@ -56,7 +56,7 @@ def main(args: Sequence[str]) -> None:
         )
         from bounce_mjx.runs.files import to_json, writable, write_output
         from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
-        from bounce_mjx.runs.reading import load_policy
+        from bounce_mjx.runs.reading import read_policy
         from bounce_mjx.training.setup import set_up_jax
 
     console = Console()
@@ -65,7 +65,7 @@ def main(args: Sequence[str]) -> None:
     suite = command.suite or resource_path("configs/robustness.yaml")
     conditions = load_suite(suite, config.env)
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
     shipped = checkpoint.run in map(resource_path, SHIPPED.values())
     out = command.out or (Path("robustness") if shipped else checkpoint.run)
     # Fails before the measurement if its results could not be written.

@@ -11,8 +11,7 @@ from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import TrainingCommand, config_of, early_flag
-from bounce_mjx.training.command import read_command as read
+from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, read_training
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
 PROG = "bounce-mjx train"
@@ -82,7 +81,7 @@ def main(args: Sequence[str]) -> None:
 
 def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
-    return read(TrainCommand, args, prog=PROG, preset=preset)
+    return read_training(TrainCommand, args, prog=PROG, preset=preset)
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import TrainingCommand, read_command
+from bounce_mjx.training.command import TrainingCommand, read_training
 
 PROG = "bounce-mjx train-torch"
 
@@ -30,7 +30,7 @@ class TorchTrainCommand(TrainingCommand):
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    read = functools.partial(read_command, TorchTrainCommand, args, prog=PROG)
+    read = functools.partial(read_training, TorchTrainCommand, args, prog=PROG)
     command = read(preset=default_preset(has_plugin()))
     with interruptible_imports():
         from bounce_mjx.runs.folders import latest_checkpoint

@@ -31,7 +31,7 @@ class State:
         return dataclasses.replace(self, **changes)
 
 
-class Env(Protocol):
+class AnyEnv(Protocol):
     """One environment, unbatched and pure: the part of brax's `Env` that training needs, and the
     task, which names what to log."""
 

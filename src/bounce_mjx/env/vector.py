@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.env.state import Env, State
+from bounce_mjx.env.state import AnyEnv, State
 from bounce_mjx.gpu.elementwise import in_one_kernel
 
 
@@ -27,7 +27,7 @@ class VectorState(NamedTuple):
     """Sum of the rewards since the reset [B]."""
 
 
-class StepResult(NamedTuple):
+class VectorStep(NamedTuple):
     """Result of one step of B environments."""
 
     observation: jax.Array
@@ -50,7 +50,7 @@ class StepResult(NamedTuple):
     """Length of the episode up to this step [B], int."""
 
 
-def reset(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) -> VectorState:
+def reset(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None) -> VectorState:
     """Starts `num_envs` episodes; consumes `key`."""
     states = first_states(env, key, num_envs, ranges)
     return VectorState(
@@ -61,7 +61,7 @@ def reset(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) -> Vector
     )
 
 
-def first_states(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) -> State:
+def first_states(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None) -> State:
     """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`.
 
     Args:
@@ -73,7 +73,7 @@ def first_states(env: Env, key: jax.Array, num_envs: int, ranges: Any = None) ->
     )
 
 
-def ranges_after(env: Env, count: jax.Array | None, steps_each: int) -> Any:
+def ranges_after(env: AnyEnv, count: jax.Array | None, steps_each: int) -> Any:
     """Ranges of the randomisation after `count` [] times `steps_each` environment steps, which grow
     over its warm-up; None, the environment's own, without one."""
     warmup_steps = getattr(env, "warmup_steps", 0)
@@ -88,13 +88,13 @@ def observe(state: VectorState) -> jax.Array:
 
 
 def step(
-    env: Env,
+    env: AnyEnv,
     state: VectorState,
     action: jax.Array,
     key: jax.Array,
     episode_steps: int,
     ranges: Any = None,
-) -> tuple[VectorState, StepResult]:
+) -> tuple[VectorState, VectorStep]:
     """Advances every environment, and resets every ended episode with a new draw.
 
     Args:
@@ -108,8 +108,8 @@ def step(
 
 
 def step_with(
-    env: Env, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
-) -> tuple[VectorState, StepResult]:
+    env: AnyEnv, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
+) -> tuple[VectorState, VectorStep]:
     """`step` with initial states that were drawn in advance; on a GPU, one draw for many steps
     costs less.
 
@@ -125,8 +125,8 @@ def step_with(
 
 
 def _step_one(
-    env: Env, episode_steps: int, state: VectorState, action: jax.Array, fresh: State
-) -> tuple[VectorState, StepResult]:
+    env: AnyEnv, episode_steps: int, state: VectorState, action: jax.Array, fresh: State
+) -> tuple[VectorState, VectorStep]:
     """`step_with` of one environment, without the batch axis."""
     stepped = env.step(state.env, action)
     clock, length = state.clock + 1, state.length + 1
@@ -136,7 +136,7 @@ def _step_one(
     ended = terminated | truncated
 
     env_state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, stepped)
-    result = StepResult(
+    result = VectorStep(
         observation=env_state.obs,
         final_observation=stepped.obs,
         reward=stepped.reward,

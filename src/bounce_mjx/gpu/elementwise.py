@@ -51,7 +51,7 @@ def elementwise(
     def chosen(*args: jax.Array) -> Arrays:
         if not (interpret or has_kernels()) or any(x.dtype != jnp.float32 for x in args):
             return function(*args)
-        layout = Layout(
+        layout = RowLayout(
             used=(np.array(True),) * len(args),
             results=tuple(np.arange(num_results)),
             dtypes=(jnp.dtype(jnp.float32),) * num_results,
@@ -109,7 +109,7 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
             return tuple(map(to_float, batched(*every)))
 
         used, ends = np.array(scalar_function.used), np.cumsum([x.size for x in leaves])
-        layout = Layout(
+        layout = RowLayout(
             used=tuple(
                 part.reshape(x.shape)
                 for part, x in zip(np.split(used, ends[:-1]), leaves, strict=True)
@@ -136,7 +136,7 @@ def _say_once(operation: str) -> None:
     )
 
 
-class Layout(NamedTuple):
+class RowLayout(NamedTuple):
     """How small arrays lie in the rows of a kernel, which are float32."""
 
     used: tuple[np.ndarray, ...]
@@ -182,7 +182,7 @@ def _runs(numbers: np.ndarray) -> list[tuple[int, int]]:
 def _in_kernel_for_batches(
     function: Callable[..., Sequence[jax.Array]],
     on_rows: ElementwiseFunction,
-    layout: Layout,
+    layout: RowLayout,
     interpret: bool,
     key: Key | None = None,
 ) -> Callable[..., Arrays]:

@@ -38,7 +38,7 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
     return tuple(names)
 
 
-def step_metrics(result: vector.StepResult, groups: int, curves: Sequence[Curve]) -> Metrics:
+def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:
     """Metrics of one step over each group of environments [G]: means, and sums under the names
     `SUM`... for means over episodes and events."""
     ended = result.terminated | result.truncated

@@ -17,7 +17,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.env import vector
-from bounce_mjx.env.state import Env
+from bounce_mjx.env.state import AnyEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, pack_steps, unpack
 from bounce_mjx.learning import statistics
@@ -48,7 +48,7 @@ class PPO(NamedTuple):
     """What stays the same during a training."""
 
     config: PPOConfig
-    env: Env
+    env: AnyEnv
     episode_steps: int
     """Control steps after which an episode is truncated."""
     critic_metrics: tuple[str, ...]
@@ -127,7 +127,7 @@ class TrainingFunctions(NamedTuple):
 
 
 def make_trainer(
-    config: PPOConfig, env: Env, episode_steps: int, num_devices: int = 1
+    config: PPOConfig, env: AnyEnv, episode_steps: int, num_devices: int = 1
 ) -> TrainingFunctions:
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
 
@@ -312,7 +312,7 @@ def advantages(
     return advantage, advantage + values[:-1]
 
 
-class Learner(NamedTuple):
+class LearnerState(NamedTuple):
     """What a minibatch step changes."""
 
     params: jax.Array
@@ -350,7 +350,7 @@ def update(
         deviation = jnp.std(advantage, axis=(1, 2), keepdims=True)
         return jax.lax.scan(step, learner, (orders, (advantage - mean) / (deviation + 1e-8)))
 
-    learner = Learner(flat, state.optimizer, state.learning_rate)
+    learner = LearnerState(flat, state.optimizer, state.learning_rate)
     learner, metrics = jax.lax.scan(epoch, learner, jax.random.split(key, config.num_epochs))
     return state._replace(
         params=unravel(learner.params),
@@ -360,8 +360,8 @@ def update(
 
 
 def minibatch_step(
-    ppo: PPO, batch_loss: Callable, learner: Learner, limit: jax.Array
-) -> tuple[Learner, Metrics]:
+    ppo: PPO, batch_loss: Callable, learner: LearnerState, limit: jax.Array
+) -> tuple[LearnerState, Metrics]:
     """One step of the optimizer.
 
     Args:
@@ -372,7 +372,7 @@ def minibatch_step(
     direction, optimizer = ppo.optimizer.update(gradient, learner.optimizer)
     rate = learner.learning_rate
     metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
-    return Learner(
+    return LearnerState(
         params=learner.params - rate * direction,
         optimizer=optimizer,
         learning_rate=adapt_learning_rate(ppo.config, rate, metrics["policy/kl"], limit),

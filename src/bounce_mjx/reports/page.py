@@ -26,7 +26,7 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
-from bounce_mjx.runs.reading import load_policy
+from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task.shown import Recording
 
 REPORT_FILE = "report.html"
@@ -35,7 +35,7 @@ REPORT_FILE = "report.html"
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
-    policy = load_policy(checkpoint, config)
+    policy = read_policy(checkpoint, config)
     env = Env(config.env)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)

@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import Arm, Servo, build_arm, compile_spec, locate
+from bounce_mjx.robot.arm import Arm, ServoSettings, build_arm, compile_spec, locate
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, named
-from bounce_mjx.robot.pose import Mount, Pose, find_pose, mounts
+from bounce_mjx.robot.pose import Mount, PaddlePose, find_pose, mounts
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
 # arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
@@ -28,9 +28,9 @@ class Adoption(NamedTuple):
     config: RobotConfig
     action_scale: float
     """Change of the servo target for an action of 1, rad; of a slide, m."""
-    pose: Pose
+    pose: PaddlePose
     arm: Arm
-    servos: tuple[Servo, ...]
+    servos: tuple[ServoSettings, ...]
     """The servo of each acting joint."""
     are_kept: bool
     """Whether the servos are the MJCF's own."""
@@ -50,7 +50,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
       UserError: the arm cannot do the task.
     """
     path = locate(mjcf)
-    config = config.model_copy(update={f"servo_{name}": None for name in Servo._fields})
+    config = config.model_copy(update={f"servo_{name}": None for name in ServoSettings._fields})
     try:
         arm = build_arm(path, config)
         arm.spec.compiler.discardvisual = True
@@ -62,7 +62,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
         update = {"paddle": config.paddle.model_copy(update=pose.mount._asdict())}
         if not are_kept:
-            columns = zip(Servo._fields, zip(*servos, strict=True), strict=True)
+            columns = zip(ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
         return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
@@ -71,8 +71,8 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
 
 
 def _servos(
-    model: mujoco.MjModel, arm: Arm, pose: Pose, control_dt: float
-) -> tuple[tuple[Servo, ...], float, bool]:
+    model: mujoco.MjModel, arm: Arm, pose: PaddlePose, control_dt: float
+) -> tuple[tuple[ServoSettings, ...], float, bool]:
     """The servos, the action scale, and whether the servos are the MJCF's own."""
     addresses = find_addresses(model)
     joints = list(addresses.arm_joints)
@@ -101,7 +101,7 @@ def _servos(
     stiffness = damping * speed / scale
     limits = arm.force_limits
     made = zip(stiffness, damping, limits, strict=True)
-    servos = tuple(Servo(_rounded(k), _rounded(d), limit) for k, d, limit in made)
+    servos = tuple(ServoSettings(_rounded(k), _rounded(d), limit) for k, d, limit in made)
     return servos, _rounded(scale), False
 
 

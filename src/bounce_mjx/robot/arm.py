@@ -34,7 +34,7 @@ _SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
-class Servo(NamedTuple):
+class ServoSettings(NamedTuple):
     """A position servo of one joint."""
 
     stiffness: float
@@ -51,7 +51,7 @@ class Arm(NamedTuple):
     spec: mujoco.MjSpec
     joint_names: tuple[str, ...]
     """The acting joints, from the base to the paddle."""
-    servos: tuple[Servo | None, ...]
+    servos: tuple[ServoSettings | None, ...]
     """The MJCF's own position servo of each acting joint; None for another actuator."""
     force_limits: tuple[float | None, ...]
     """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
@@ -527,7 +527,7 @@ def limit_words(limit: float | None) -> str:
     return "no force limit" if limit is None else f"force limit {limit:.4g}"
 
 
-def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
+def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
     """The position servo that drives a joint alone; None for other actuators."""
     actuator = actuators[0]
     gear = float(model.actuator_gear[actuator, 0])
@@ -543,7 +543,7 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> Servo | None:
     if not plain:
         return None
     joint = int(model.actuator_trnid[actuator, 0])
-    return Servo(
+    return ServoSettings(
         float(model.actuator_gainprm[actuator, 0] * gear**2),
         float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
         _force_limit(model, actuators, joint),

@@ -45,7 +45,7 @@ class Mount(NamedTuple):
     quaternion: tuple[float, float, float, float]
 
 
-class Pose(NamedTuple):
+class PaddlePose(NamedTuple):
     """A start pose, with a level paddle."""
 
     angles: tuple[float, ...]
@@ -84,7 +84,7 @@ def find_pose(
     model: mujoco.MjModel,
     force_limits: Sequence[float | None],
     choices: Sequence[Mount],
-) -> Pose:
+) -> PaddlePose:
     """The best start pose of an arm in the task's scene.
 
     Args:
@@ -126,7 +126,7 @@ class _Search:
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
 
-    def best(self, choices: Sequence[Mount]) -> Pose:
+    def best(self, choices: Sequence[Mount]) -> PaddlePose:
         reach = self._reach()
         poses, level = [], 0
         for choice in choices:
@@ -246,7 +246,7 @@ class _Search:
         inside = self._hinge & (turned >= low) & (turned <= high)
         return np.where(inside, turned, angles)
 
-    def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> Pose | None:
+    def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> PaddlePose | None:
         """The pose with its score; None if the arm is in the way of the ball or in the floor."""
         paddle, _ = self._forward(angles)
         if not self._is_clear(paddle):
@@ -262,7 +262,7 @@ class _Search:
         if smallest >= _LEAST_MANIPULABILITY and np.all(np.abs(holding) <= self._limits):
             acceleration = self._acceleration(mass @ np.linalg.pinv(task)[:, -3], holding)
         strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
-        return Pose(
+        return PaddlePose(
             tuple(angles.tolist()),
             tuple(paddle.tolist()),
             choice,

@@ -43,7 +43,7 @@ class Record(pydantic.BaseModel):
     progress: dict[str, Any]
 
 
-def load_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
+def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     read_record(checkpoint)
     policy = _read_arrays(checkpoint, "policy", policy_shapes(config))

@@ -48,7 +48,7 @@ class TrainingCommand(TrainConfig):
 CommandT = TypeVar("CommandT", bound=TrainingCommand)
 
 
-def read_command(
+def read_training(
     command_class: type[CommandT],
     args: Sequence[str],
     *,

@@ -29,7 +29,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.runs.reading import load_policy, load_training_state, read_record
+from bounce_mjx.runs.reading import load_training_state, read_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
@@ -353,7 +353,7 @@ class _Job:
         evaluated = [member for member in self.members if member.progress.best is not None]
         for member in evaluated:
             if member.best_policy is None:
-                member.best_policy = load_policy(folders.best_checkpoint(member.run), member.config)
+                member.best_policy = read_policy(folders.best_checkpoint(member.run), member.config)
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
         policies = [member.best_policy or evaluated[0].best_policy for member in self.members]

@@ -20,7 +20,7 @@ from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD, MIN_VARIANCE
 
 
-class Normalizer(nn.Module):
+class InputNormalizer(nn.Module):
     """`learning.statistics` as a module: running statistics, and normalisation with them.
 
     rsl_rl uses it as its observation normaliser (`update`), skrl as its preprocessor (`train`).
@@ -83,7 +83,10 @@ def linears_of(mlp: nn.Module) -> list[nn.Linear]:
 
 
 def to_policy(
-    config: PPOConfig, normalizer: Normalizer, linears: Sequence[nn.Linear], log_std: torch.Tensor
+    config: PPOConfig,
+    normalizer: InputNormalizer,
+    linears: Sequence[nn.Linear],
+    log_std: torch.Tensor,
 ) -> Policy:
     """The `Policy` with the normalisation and the mean network of a PyTorch policy.
 

@@ -28,7 +28,7 @@ from torch import nn
 
 from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.networks import (
-    Normalizer,
+    InputNormalizer,
     init_weights,
     linears_of,
     to_policy,
@@ -142,7 +142,7 @@ class Network(MLPModel):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, obs_normalization=False, **kwargs)
         self.obs_normalization = True
-        self.obs_normalizer = Normalizer(self.obs_dim)
+        self.obs_normalizer = InputNormalizer(self.obs_dim)
         init_weights(self.mlp, output_gain=2**0.5 if self.distribution is None else 0.01)
 
 

@@ -22,7 +22,7 @@ import torch
 
 from bounce_mjx.adapters.torch.learner import Learner
 from bounce_mjx.adapters.torch.networks import (
-    Normalizer,
+    InputNormalizer,
     init_weights,
     linears_of,
     make_mlp,
@@ -217,12 +217,12 @@ def agent_config(config: PPOConfig, env: SkrlEnv) -> PPO_CFG:
             "min_lr": config.min_learning_rate,
             "max_lr": config.max_learning_rate,
         },
-        observation_preprocessor=Normalizer,
+        observation_preprocessor=InputNormalizer,
         observation_preprocessor_kwargs={
             "size": env.observation_space.shape[0],
             "device": env.device,
         },
-        state_preprocessor=Normalizer,
+        state_preprocessor=InputNormalizer,
         state_preprocessor_kwargs={"size": env.state_space.shape[0], "device": env.device},
         grad_norm_clip=config.max_grad_norm,
         ratio_clip=config.clip_epsilon,
