@@ -97,7 +97,13 @@ def assert_same(left, right, tolerance: float) -> None:
 
 
 def test_import_registers_whichever_comes_first():
-    for order in ("import bounce_mjx, gymnasium", "import gymnasium, bounce_mjx"):
+    # Other libraries, such as TorchRL, look for Gymnasium before they import it.
+    looks = "import bounce_mjx; __import__('importlib.util').util.find_spec('gymnasium')"
+    for order in (
+        "import bounce_mjx, gymnasium",
+        "import gymnasium, bounce_mjx",
+        f"{looks}; import gymnasium",
+    ):
         script = (
             f"{order}\nprint(gymnasium.spec({ENV_ID!r}).id, 'torch' in __import__('sys').modules)"
         )

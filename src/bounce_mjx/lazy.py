@@ -46,19 +46,23 @@ class _AroundImport(importlib.abc.MetaPathFinder):
 
     def __init__(self, name: str, before: Hook | None, after: Hook | None):
         self._name, self._before, self._after = name, before, after
+        self._is_searching = False
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         """The module's own spec."""
-        if fullname != self._name:
+        if fullname != self._name or self._is_searching:
             return None
-        sys.meta_path.remove(self)
+        self._is_searching = True
         spec = importlib.util.find_spec(fullname)
+        self._is_searching = False
         if spec is not None and spec.loader is not None:
             load = spec.loader.exec_module
 
             def load_between(module: types.ModuleType) -> None:
+                # Not before: a search for the module need not be followed by its import.
+                sys.meta_path.remove(self)
                 if self._before is not None:
                     self._before(module)
                 load(module)
