@@ -117,7 +117,7 @@ BAD_FLAGS = {
     "ball at infinity": ("--ball-init-pos 0 0 inf", "--ball-init-pos is inf", "finite"),
     "weight nan": ("--reward.height.weight nan", "--reward.height.weight is nan", "finite"),
     "width zero": ("--reward.height.scale 0", "--reward.height.scale is 0.0", "greater than 0"),
-    "negative noise": ("--joint-angle-noise -0.1", "--joint-angle-noise is -0.1", "equal to 0"),
+    "negative noise": ("--reset.joint-angles -0.1", "--reset.joint-angles is -0.1", "equal to 0"),
     "negative rate": ("--learning-rate -1", "--learning-rate is -1.0", "greater than 0"),
     "discount": ("--discount 1.5", "--discount is 1.5", "less than or equal to 1"),
     "negative seed": ("--seed -1", "--seed is -1", "greater than or equal to 0"),
