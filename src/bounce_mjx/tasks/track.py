@@ -1,330 +1,200 @@
-"""Tracking: the ball bounces over a point that moves, at a height that moves."""
+"""Tracking: the ball bounces over a point that moves along a path (`paths`), at its height."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from typing import Annotated, NamedTuple
+from dataclasses import replace
+from typing import Annotated, Any
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, NonNegative, Positive
-from bounce_mjx.lazy import jax, jnp, np
+from bounce_mjx.config.settings import Finite, Positive
+from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.tasks import paths
+from bounce_mjx.world.config import ActionConfig
 
-PATHS = ("circle", "line", "eight", "steps", "wander")
-GRAVITY = 9.81
 REST = 0.0225
 """Height of the ball's centre over the paddle's while they touch, m."""
-STEP_SECONDS = 4.0
-
-
-class Flight(NamedTuple):
-    """Free flight of the ball down to the paddle's home height."""
-
-    apex: jax.Array
-    """Position at the apex of the present flight, which may have passed [3], m."""
-    apex_time: jax.Array
-    """Time to that apex [], s; negative once it has passed."""
-    landing: jax.Array
-    """Horizontal position at the landing [2], m."""
-    landing_time: jax.Array
-    """Time to the landing [], s."""
-
-
-def fly(ball: jax.Array, velocity: jax.Array, floor: float) -> Flight:
-    up = velocity[2] / GRAVITY
-    height = ball[2] + 0.5 * GRAVITY * jnp.square(up)
-    apex = jnp.concatenate([ball[:2] + up * velocity[:2], height[None]])
-    down = up + task.safe_sqrt(2.0 * (height - floor) / GRAVITY)
-    return Flight(apex, up, ball[:2] + down * velocity[:2], down)
-
-
-class Inputs(NamedTuple):
-    """What the reward terms depend on."""
-
-    apex_distance: jax.Array
-    apex_error: jax.Array
-    landing_distance: jax.Array
-    paddle_distance: jax.Array
-    lift: jax.Array
-    action_change: jax.Array
-    joint_speed: jax.Array
-
-
-def peak(error, scale):
-    return 1.0 / (1.0 + jnp.square(error / scale))
-
-
-class ApexReward(task.RewardTerm):
-    weight: Finite = 4.0
-    scale: Positive = 0.03
-    height_scale: Positive = 0.1
-
-    def value(self, inputs):
-        return peak(inputs.apex_distance, self.scale) * peak(inputs.apex_error, self.height_scale)
-
-
-class HeightReward(task.RewardTerm):
-    weight: Finite = 2.0
-    scale: Positive = 0.05
-
-    def value(self, inputs):
-        return peak(inputs.apex_error, self.scale)
-
-
-class LandingReward(task.RewardTerm):
-    weight: Finite = 2.0
-    scale: Positive = 0.06
-    height_scale: Positive = 0.1
-
-    def value(self, inputs):
-        return peak(inputs.landing_distance, self.scale) * peak(inputs.apex_error, self.height_scale)
-
-
-class PaddleReward(task.RewardTerm):
-    weight: Finite = 1.0
-    scale: Positive = 0.03
-
-    def value(self, inputs):
-        return peak(inputs.paddle_distance, self.scale)
-
-
-class HomeReward(task.RewardTerm):
-    weight: Finite = 1.0
-    scale: Positive = 0.05
-
-    def value(self, inputs):
-        return peak(inputs.lift, self.scale)
-
-
-class ActionRateReward(task.RewardTerm):
-    weight: Finite = 1e-3
-
-    def value(self, inputs):
-        return -inputs.action_change
-
-
-class JointVelocityReward(task.RewardTerm):
-    weight: Finite = 1e-3
-
-    def value(self, inputs):
-        return -inputs.joint_speed
+SETTLING, STEP_SETTLING = 2.0, 1.0
+"""Time since a reset, and since a step of the point, after which apexes count, s."""
+BANDS = {"slow error": (0.0, 0.1, 0.015), "fast error": (0.25, 0.3, 0.03)}
+"""Speeds of a point without steps that a result judges (m/s), and the largest RMS error (m)."""
+MAX_STEP_ERROR, MAX_HEIGHT_ERROR = 0.03, 0.1
+JUMP_SPEED, JUMP_ACCELERATION = 1.0, 3.0
+"""A point that is faster (m/s) or accelerates more (m/s^2) has jumped."""
 
 
 class Rewards(task.StrictModel):
-    apex: ApexReward = ApexReward()
-    height: HeightReward = HeightReward()
-    landing: LandingReward = LandingReward()
-    paddle: PaddleReward = PaddleReward()
-    home: HomeReward = HomeReward()
-    action_rate: ActionRateReward = ActionRateReward()
-    joint_velocity: JointVelocityReward = JointVelocityReward()
+    """The reward terms. For its apexes alone the ball would swing across the point: what brings one
+    apex back to the point aims the next landing as far beyond it."""
+
+    apex: task.Near = task.Near(weight=6.0)
+    """The flight's apex is the point at that time; 0.1 m of height count as 0.03 m."""
+    landing: task.Near = task.Near(weight=2.0)
+    """The flight ends over the point at that time."""
+    paddle: task.Near = task.Near()
+    """The paddle is where the flight ends."""
+    home: task.Near = task.Near(scale=0.05)
+    """The paddle is at its home height."""
+    calm: task.Near = task.Near(weight=0.1, scale=10.0)
+    """The joints and the actions change slowly."""
 
 
 class Observation(task.ObservationConfig):
+    """The world's quantities without the ball's rotation; the point; and where to aim."""
+
     ball_quaternion: task.History = 0
     ball_angular_velocity: task.History = 0
     target_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     target_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     aim: Annotated[task.History, task.Quantity(2, "m")] = 1
-    landing: Annotated[task.History, task.Quantity(2, "m")] = 0
+    """From the flight's end to the point at the next apex, if the point keeps its acceleration."""
 
 
 class Config(task.WorldConfig):
-    middle: tuple[Finite, Finite] = (0.58856, 0.0)
-    home_height: Finite = 0.05
-    target_height_range: tuple[float, float] = (0.45, 0.55)
-    target_speed_range: tuple[float, float] = (0.05, 0.3)
-    size: Positive = 0.15
-    height_size: NonNegative = 0.05
-    min_ball_height: Finite = 0.05
-    max_height_above_target: Positive = 0.5
-    max_distance: Positive = 0.5
+    """The world, the point, the ends and the reward."""
+
+    home: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.05)
+    """Home of the paddle, m."""
+    height_range: tuple[Finite, Finite] = (0.4, 0.5)
+    """Range of the target height over home, around which it sways, m."""
+    speed_range: tuple[Finite, Finite] = (0.05, 0.3)
+    """Range of the point's greatest speed, m/s."""
+    path_size: Positive = 0.15
+    """Radius of the circle, half the length of the line and of the figure of eight, m."""
+    max_distance: Positive = 0.7
+    """The episode ends when the ball is this far from the point, or lower than home, m."""
+    action: ActionConfig = ActionConfig(base="target")
     observation: Observation = Observation()
+    """The quantities that the policy sees."""
     reward: Rewards = Rewards()
+    """The reward terms."""
+
+    @classmethod
+    def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        return super().settings_at(paddle) | {"home": paddle}
 
     @property
-    def commands(self):
-        x, y = self.middle
+    def commands(self) -> dict[str, task.Command]:
+        """The point, drawn as the middle of its path, its speed, and its path."""
+        (x, y, z), (low, high) = self.home, self.height_range
         return {
-            "target_x": task.Command(x, x, "m", span=(x - 0.15, x + 0.15), step=0.01),
-            "target_y": task.Command(y, y, "m", span=(y - 0.15, y + 0.15), step=0.01),
-            "target_height": task.Command(*self.target_height_range, "m", least=1e-3, span=(0.3, 0.8)),
-            "target_speed": task.Command(*self.target_speed_range, "m/s", 0.0, span=(0.0, 0.3)),
-            "path": task.Command(0, len(PATHS), "", 0, len(PATHS), step=1),
-            "course": task.Command(0, 1, "turns", 0, 1),
-            "phase": task.Command(0, 1, "turns", 0, 1),
-        }
-
-
-def choose(path, *values):
-    chosen = values[0]
-    for i, value in enumerate(values[1:], start=1):
-        chosen = jnp.where(path >= i, value, chosen)
-    return chosen
-
-
-def curve(path, course, phase, size, height_size):
-    """Displacement [3] of the point from the middle of its path, and the greatest speed in m per turn"""
-    wave = lambda n, shift=0.0: jnp.sin(2.0 * math.pi * (n * phase + shift * course))
-    cosine = lambda a: jnp.cos(2.0 * math.pi * a)
-    corner = jnp.floor(6.0 * phase) / 6.0
-    r = size
-    xs = [r * cosine(phase), r * wave(1), r * wave(1), 0.1 * cosine(corner), r / 1.5 * (wave(1, 3) + wave(2, 5) / 2.0)]
-    ys = [r * wave(1), 0.0 * phase, r * wave(2) / 2.0, 0.1 * jnp.sin(2 * math.pi * corner), r / 1.5 * (wave(1, 7) + wave(3, 11) / 3.0)]
-    x, y = choose(path, *xs), choose(path, *ys)
-    c, s = cosine(course), jnp.sin(2 * math.pi * course)
-    return jnp.stack([c * x - s * y, s * x + c * y, height_size * wave(1, 2)])
-
-
-def turns_per_second(path, speed, size):
-    longest = 2.0 * math.pi * size * choose(path, 1.0, 1.0, math.sqrt(2.0), 1.0, 2.0 * math.sqrt(2.0) / 1.5)
-    return jnp.where((path >= 3) & (path < 4), (speed > 0) / (6.0 * STEP_SECONDS), speed / longest)
-
-
-class TrackState(NamedTuple):
-    rising: jax.Array
-    offset: jax.Array
-
-
-class Motion(NamedTuple):
-    point: jax.Array
-    velocity: jax.Array
+            "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
+            "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
+            "target_height": task.Command(z + low, z + high, "m", span=(z + 0.3, z + 0.7)),
+            "point_speed": task.Command(*self.speed_range, "m/s", 0.0, span=(0.0, 0.3)),
+        } | paths.COMMANDS
 
 
 class Track(task.Task):
-    """The ball bounces over a point that moves, at a height that moves."""
+    """The ball bounces over a point that moves along a path, at its height."""
 
     Config = Config
     curves = (
-        task.Curve("task/apex_distance", "apex_distance", "apexes", "apex from the point, cm", 100.0),
-        task.Curve("task/apex_error", "apex_error", "apexes", "|apex - height|, cm", 100.0),
+        task.Curve("task/error", "error", "apexes", "distance of apex and point, cm", 100.0),
+        task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    @property
-    def floor(self):
-        return self.config.home_height + REST
+    def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
+        # Whether the ball rises, and the point's offset, 0 as it is drawn in the middle.
+        return jnp.array(False), jnp.zeros_like(start.truth.ball_position)
 
-    def rate(self, command):
-        return turns_per_second(command["path"], command["target_speed"], self.config.size)
+    def next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The path moves the point on from where it is, which a user may have set."""
+        phase = paths.phase_in(self.config.control_dt, command, self.config.path_size)
+        offset = paths.offset(command, self.config.path_size, phase)
+        x, y, z = paths.point(command) + offset - state[1]
+        command = command | {"target_x": x, "target_y": y, "target_height": z}
+        return command | {"path": jnp.floor(command["path"]), "phase": phase - jnp.floor(phase)}
 
-    def offset(self, command, seconds=0.0):
-        phase = command["phase"] + self.rate(command) * seconds
-        return curve(command["path"], command["course"], phase, self.config.size, self.config.height_size)
+    def step(self, state: Any, step: task.Step) -> task.TaskStep:
+        truth, command, home = step.truth, step.command, self.config.home[2]
+        ball, velocity, paddle = truth.ball_position, truth.ball_velocity, truth.paddle_position
+        flight, size = task.flight(ball, velocity, home + REST), self.config.path_size
+        offset = paths.offset(command, size, command["phase"])
 
-    def reset(self, start):
-        zero = jnp.zeros_like(start.truth.ball_position)
-        return TrackState(zero[0] > 0, zero)
+        def point(seconds: jax.Array) -> jax.Array:
+            phase = paths.phase_in(seconds, command, size)
+            return paths.point(command) + paths.offset(command, size, phase) - offset
 
-    def next_command(self, state, command):
-        path = jnp.floor(command["path"])
-        phase = command["phase"] + self.rate(command) * self.config.control_dt
-        command = command | {"path": path, "phase": phase - jnp.floor(phase)}
-        names = ("target_x", "target_y", "target_height")
-        moved = self.offset(command) - state.offset
-        return command | {name: command[name] + moved[i] for i, name in enumerate(names)}
-
-    def step(self, state, step):
-        config, truth, command = self.config, step.truth, step.command
-        ball = truth.ball_position
-        point = jnp.stack([command[n] for n in ("target_x", "target_y", "target_height")])
-        offset = self.offset(command)
-        flight = fly(ball, truth.ball_velocity, self.floor)
-        at = lambda seconds: point + self.offset(command, seconds) - offset
-        then = at(flight.apex_time)
-        distance = task.horizontal_distance(flight.apex, then)
-        inputs = Inputs(
-            apex_distance=distance,
-            apex_error=flight.apex[2] - then[2],
-            landing_distance=task.horizontal_distance(flight.landing, at(flight.landing_time)),
-            paddle_distance=task.horizontal_distance(flight.landing, truth.paddle_position),
-            lift=truth.paddle_position[2] - config.home_height,
-            action_change=jnp.sum(jnp.square(step.action - step.last_action)),
-            joint_speed=jnp.sum(jnp.square(truth.joint_velocities)),
-        )
-        rising = truth.ball_velocity[2] > 0.0
-        apex = state.rising & ~rising & (ball[2] > self.floor + 0.1)
-        away = task.horizontal_distance(ball, point)
-        is_step = (command["path"] >= 3) & (command["path"] < 4)
-        since = (6.0 * command["phase"]) % 1.0 * STEP_SECONDS
+        errors = {
+            "apex": (flight.top - point(flight.rise)) * jnp.array([1.0, 1.0, 0.3]),
+            "landing": (flight.end - point(flight.fall))[:2],
+            "paddle": (flight.end - paddle)[:2],
+            "home": paddle[2] - home,
+            "calm": jnp.concatenate([truth.joint_velocities, step.action - step.last_action]),
+        }
+        is_apex = state[0] & (velocity[2] <= 0.0) & (ball[2] > home + MAX_HEIGHT_ERROR)
+        x, y, z = jnp.square(ball - paths.point(command))
         return task.TaskStep(
-            state=TrackState(rising, offset),
-            reward=task.weighted_terms(config.reward, inputs),
-            ended=(ball[2] < config.min_ball_height)
-            | (ball[2] > point[2] + config.max_height_above_target)
-            | (away > config.max_distance),
+            state=(velocity[2] > 0.0, offset),
+            reward={n: term.weight * term.value(errors[n]) for n, term in self.config.reward},
+            ended=(ball[2] < home) | (x + y + z > self.config.max_distance**2),
             metrics={
-                "apexes": apex,
-                "apex_distance": jnp.where(apex, away, 0.0),
-                "apex_error": jnp.where(apex, jnp.abs(ball[2] - point[2]), 0.0),
-                "settled": ~is_step | (since > 1.0),
+                "apexes": is_apex,
+                "error": jnp.where(is_apex, task.safe_sqrt(x + y), 0.0),
+                "height_error": jnp.where(is_apex, task.safe_sqrt(z), 0.0),
             },
         )
 
-    def aim(self, motion, acceleration, measured):
-        ball = measured["ball_position"]
-        flight = fly(ball, measured["ball_velocity"], self.floor)
-        rise = measured["target_height"][0] - self.floor
-        t = flight.landing_time + task.safe_sqrt(2.0 * rise / GRAVITY)
-        point = motion.point + t * motion.velocity + 0.5 * jnp.square(t) * acceleration
-        return {"aim": point - flight.landing, "landing": flight.landing - measured["paddle_position"][:2]}
+    def first_quantities(self, measured: dict[str, jax.Array]) -> Any:
+        memory = paths.point(measured)[:2, 0], jnp.zeros_like(measured["ball_position"][:2])
+        memory, seen = self.next_quantities(memory, {"aim": memory[1][None]}, measured)
+        return memory, {"aim": seen["aim"][0]}
 
-    def first_quantities(self, measured):
-        point = jnp.concatenate([measured["target_x"], measured["target_y"]])
-        motion = Motion(point, jnp.zeros_like(point))
-        return motion, self.aim(motion, motion.velocity, measured)
+    def next_quantities(self, memory: Any, seen: Any, measured: dict[str, jax.Array]) -> Any:
+        """It remembers the point [2] and its velocity [2]."""
 
-    def next_quantities(self, memory, seen, measured):
-        dt = self.config.control_dt
-        point = jnp.concatenate([measured["target_x"], measured["target_y"]])
-        velocity = calm((point - memory.point) / dt, 1.0)
-        acceleration = calm((velocity - memory.velocity) / dt, 3.0)
-        motion = Motion(point, velocity)
-        new = self.aim(motion, acceleration, measured)
-        every = jnp.array(True)
-        return motion, {n: jnp.concatenate([new[n][None], past[:-1]]) for n, past in seen.items()}
+        def rate(change: jax.Array, limit: float) -> jax.Array:
+            change = change / self.config.control_dt
+            return jnp.where(jnp.abs(change) <= limit, change, 0.0)
 
-    def tally(self, moment):
-        metrics, command = moment.metrics, moment.command
-        apex = (metrics["apexes"] > 0) & (moment.command_seconds > 2.0)
-        path, speed = command["path"], command["target_speed"]
-        is_step = (path >= 3) & (path < 4)
-        square = jnp.square(100.0 * metrics["apex_distance"])
-        slow = apex & ~is_step & (speed < 0.1001)
-        fast = apex & ~is_step & (speed > 0.2499)
-        stepped = apex & is_step & (metrics["settled"] > 0)
+        ground, target = self.config.home[2] + REST, paths.point(measured)[:, 0]
+        flight = task.flight(measured["ball_position"], measured["ball_velocity"], ground)
+        time = flight.fall + task.safe_sqrt(2.0 * (target[2] - ground) / task.GRAVITY)
+        velocity = rate(target[:2] - memory[0], JUMP_SPEED)
+        acceleration = rate(velocity - memory[1], JUMP_ACCELERATION)
+        then = target[:2] + time * velocity + 0.5 * jnp.square(time) * acceleration
+        aims = {n: task.latest(h, True, True, then - flight.end[:2]) for n, h in seen.items()}
+        return (target[:2], velocity), aims
+
+    def tally(self, moment: task.Moment) -> task.Tally:
+        error, command = moment.metrics["error"], moment.command
+        apex = (moment.metrics["apexes"] > 0) & (moment.command_seconds > SETTLING)
+        steps, speed = command["path"] == paths.STEPS, command["point_speed"]
+        late = apex & steps & (paths.seconds_at_corner(command) > STEP_SETTLING)
+        high = apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR)
         sums = {
             "apexes": apex,
-            "high": apex & (metrics["apex_error"] <= 0.1),
-            "slow": slow, "slow_squares": slow * square,
-            "fast": fast, "fast_squares": fast * square,
-            "steps": stepped, "near": stepped & (metrics["apex_distance"] <= 0.03),
+            "high": high,
+            "late": late,
+            "near": late & (error <= MAX_STEP_ERROR),
         }
-        for i, name in enumerate(PATHS):
-            it = (path == i) & apex & (metrics["settled"] > 0)
-            sums[name] = it
-            sums[name + "_squares"] = it * square
-        return task.Tally(sums)
+        kinds = {"after steps": steps}
+        for name, (low, top, _) in BANDS.items():
+            kinds[name] = ~steps & (speed > low - 1e-6) & (speed < top + 1e-6)
+            sums[name] = apex & kinds[name]
+            sums[f"{name}^2"] = sums[name] * jnp.square(error)
+        return task.Tally(sums, maxima=kinds)
 
-    def results(self, episodes):
-        s = episodes.sums
-        rms = lambda name, words, most: _root(task.mean_of_events(name, words, s[name + "_squares"], s[name], (0.0, most**2), "" if s[name].sum() else "none"), most)
+    def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
+        sums, had, words = episodes.sums, episodes.maxima, "apexes within 3 cm, 1 s after a step"
+        found = [task.share_of_events("after steps", words, sums["near"], sums["late"], 0.95)]
+        for name, (low, top, most) in BANDS.items():
+            words = f"RMS distance of apex and point at {low} to {top} m/s, m"
+            found += [task.root_mean_square(name, words, sums[f"{name}^2"], sums[name], most)]
+        words, length = "apexes within 0.1 m of their height", f"{self.config.episode_seconds:g} s"
         return (
-            rms("slow", "RMS distance of the apexes, cm", 1.5),
-            rms("fast", "RMS distance of the apexes, cm", 3.0),
-            task.share_of_events("after a step", "apexes within 3 cm", s["near"], s["steps"], 0.95),
-            task.share_of_events("height", "apexes within 0.1 m", s["high"], s["apexes"], 0.95),
-            task.share_of_episodes("stable", "episodes that last", episodes.lasted, 0.99),
+            # Episodes of other paths or speeds do not judge.
+            *(r if had[r.name].any() else replace(r, passed=None, margin=None) for r in found),
+            task.share_of_events("height", words, sums["high"], sums["apexes"], 0.95),
+            task.share_of_episodes("stable", f"episodes that last {length}", episodes.lasted, 0.99),
         )
 
-    def details(self, episodes):
-        s = episodes.sums
-        return {f"{n}_rms_cm": math.sqrt(s[n + "_squares"].sum() / max(s[n].sum(), 1)) for n in PATHS}
+    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+        return paths.markers(command, self.config.path_size)
 
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"path": f"{paths.name(command)}, {command['point_speed']:.2f} m/s"}
 
-def calm(x, limit):
-    return jnp.where(jnp.abs(x) <= limit, x, 0.0)
-
-
-def _root(result, most):
-    return dataclasses.replace(result, value=None if result.value is None else math.sqrt(result.value), bound=f"<= {most:g}")
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        return {"target": command["target_height"]}
