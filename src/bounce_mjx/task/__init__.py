@@ -1,6 +1,7 @@
 """What a task is made of: `Task`, its settings, reward terms, results and pictures."""
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.task.flight import GRAVITY, Flight, flight
 from bounce_mjx.task.quantities import latest
 from bounce_mjx.task.results import (
     Episodes,
@@ -8,10 +9,12 @@ from bounce_mjx.task.results import (
     Result,
     mean_and_margin,
     mean_of_events,
+    root_mean_square,
     share_of_episodes,
     share_of_events,
 )
 from bounce_mjx.task.rewards import (
+    Near,
     RewardTerm,
     gaussian,
     horizontal_distance,
@@ -25,16 +28,19 @@ from bounce_mjx.world.config import Command, ResetConfig, WorldConfig
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 
 __all__ = [
+    "GRAVITY",
     "Command",
     "Curve",
     "Episodes",
     "Figure",
+    "Flight",
     "Histogram",
     "History",
     "Hits",
     "Kinematics",
     "Marker",
     "Moment",
+    "Near",
     "ObservationConfig",
     "Quantity",
     "Recording",
@@ -48,11 +54,13 @@ __all__ = [
     "Task",
     "TaskStep",
     "WorldConfig",
+    "flight",
     "gaussian",
     "horizontal_distance",
     "latest",
     "mean_and_margin",
     "mean_of_events",
+    "root_mean_square",
     "safe_sqrt",
     "share_of_episodes",
     "share_of_events",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bounce_mjx.config.settings import Finite, StrictModel
+from bounce_mjx.config.settings import Finite, Positive, StrictModel
 from bounce_mjx.lazy import jax, jnp
 
 
@@ -26,6 +26,17 @@ class RewardTerm(StrictModel):
           inputs: what the task gives to its terms.
         """
         raise NotImplementedError
+
+
+class Near(RewardTerm):
+    """A term that falls with the length of an error: weight / (1 + (length / scale)^2)."""
+
+    scale: Positive = 0.03
+    """Length at half the weight, in the unit of the error."""
+
+    def value(self, error: jax.Array) -> jax.Array:
+        """The unweighted term [] for an error [] or [...]."""
+        return 1.0 / (1.0 + jnp.sum(jnp.square(error)) / self.scale**2)
 
 
 def term_names(reward: type[StrictModel]) -> tuple[str, ...]:

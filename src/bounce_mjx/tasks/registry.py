@@ -31,7 +31,7 @@ _MAX_BYTES = 2**20
 # The tasks of the files that the user has named, by their content.
 _named: dict[tuple[str, str], type[Task]] = {}
 
-_OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce"}
+_OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce", "track": "bounce_mjx.tasks.track:Track"}
 
 
 def find_task(name: str) -> type[Task]:

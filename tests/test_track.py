@@ -1,0 +1,250 @@
+"""The task track: paths, the prediction of the point, rewards and results."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import task
+from bounce_mjx.tasks import paths
+from bounce_mjx.tasks.track import Config, Track
+
+CONFIG = Config()
+TRACK = Track(CONFIG)
+SIZE, DT = CONFIG.path_size, CONFIG.control_dt
+NOT_STEPS = [i for i in range(len(paths.NAMES)) if i != paths.STEPS]
+
+
+def command(path: float = 0, speed: float = 0.3, course: float = 0.2, phase: float = 0.4) -> dict:
+    values = {"target_x": 0.6, "target_y": 0.1, "target_height": 0.5, "point_speed": speed}
+    values |= {"path": path, "course": course, "phase": phase}
+    return {name: jnp.float32(value) for name, value in values.items()}
+
+
+@partial(jax.jit, static_argnums=1)
+def followed(start: dict, steps: int) -> jax.Array:
+    """The point [steps, 3] of an episode that starts with drawn commands."""
+
+    def advance(carry, _):
+        now, offset = carry
+        now = TRACK.next_command((jnp.array(True), offset), now)
+        return (now, paths.offset(now, SIZE, now["phase"])), paths.point(now)
+
+    return jax.lax.scan(advance, (start, jnp.zeros(3)), None, steps)[1]
+
+
+def from_middle(start: dict, seconds: float) -> np.ndarray:
+    """The point from the middle of its path, turned back by its course [T, 2], m."""
+    x, y = (np.asarray(followed(start, round(seconds / DT)), float)[:, :2] - [0.6, 0.1]).T
+    angle = 2.0 * np.pi * 0.2
+    return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x])
+
+
+def test_the_paths_are_their_equations() -> None:
+    """Of a circle, a line, and the lemniscate of Gerono, each over more than one turn."""
+    x, y = from_middle(command(0), 4.0)
+    np.testing.assert_allclose(np.hypot(x, y), SIZE, atol=1e-5)
+    x, y = from_middle(command(1), 4.0)
+    np.testing.assert_allclose(y, 0.0, atol=1e-5)
+    np.testing.assert_allclose((x.min(), x.max()), (-SIZE, SIZE), atol=1e-4)
+    x, y = from_middle(command(2), 6.0)
+    np.testing.assert_allclose(y**2, x**2 * (1.0 - (x / SIZE) ** 2), atol=1e-6)
+    np.testing.assert_allclose((x.min(), x.max()), (-SIZE, SIZE), atol=1e-4)
+
+
+def test_the_point_steps_by_10_cm_every_4_s() -> None:
+    way = np.linalg.norm(np.diff(np.asarray(followed(command(3), 2000))[:, :2], axis=0), axis=1)
+    (steps,) = np.nonzero(way > 1e-4)
+    np.testing.assert_allclose(way[steps], 0.1, atol=1e-5)
+    np.testing.assert_allclose(np.diff(steps), 400, atol=1)
+    assert len(steps) == 5
+
+
+@pytest.mark.parametrize("path", NOT_STEPS)
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+def test_the_point_is_at_most_as_fast_as_commanded(path: int, speed: float) -> None:
+    """In any course; the courses of the wandering differ in their greatest speed."""
+    courses = np.linspace(0.0, 1.0, 50, endpoint=False)
+    starts = jax.vmap(lambda course: command(path, speed) | {"course": course})(courses)
+    points = np.asarray(jax.vmap(lambda start: followed(start, 3000))(starts), float)
+    fastest = np.linalg.norm(np.diff(points[..., :2], axis=1), axis=-1).max() / DT
+    assert 0.9 * speed < fastest < 1.001 * speed
+    assert np.abs(points[..., :2] - [0.6, 0.1]).max() < 0.2
+
+
+@pytest.mark.parametrize("path", range(len(paths.NAMES)))
+def test_a_path_is_closed_and_its_markers_lie_on_it(path: int) -> None:
+    start = command(path)
+    ends = [np.asarray(paths.offset(start, SIZE, phase)) for phase in (0.0, 1.0)]
+    np.testing.assert_allclose(*ends, atol=1e-6)
+    now = {name: float(value) for name, value in start.items()}
+    disc, *dots = TRACK.markers(now)
+    np.testing.assert_allclose(disc.position, (0.6, 0.1, 0.5))
+    later = start | {"target_x": 0.7, "phase": jnp.float32(0.7)}
+    assert [m.name for m in TRACK.markers(later)] == [disc.name, *(dot.name for dot in dots)]
+    middle = np.array([0.6, 0.1, 0.5]) - np.asarray(paths.offset(start, SIZE, start["phase"]))
+    walked = [middle + np.asarray(paths.offset(start, SIZE, i / 24)) for i in range(24)]
+    np.testing.assert_allclose([dot.position for dot in dots], walked, atol=1e-6)
+
+
+def test_a_point_stays_where_a_user_sets_it() -> None:
+    for path in range(len(paths.NAMES)):
+        still = followed(command(path, speed=0.0), 50)
+        np.testing.assert_allclose(still, still[:1].repeat(50, 0), atol=1e-6)
+    # A path goes on from the place that a user sets.
+    now = command(0)
+    offset = paths.offset(now, SIZE, now["phase"])
+    moved = TRACK.next_command((jnp.array(True), offset), now | {"target_x": jnp.float32(0.7)})
+    assert 0.0 < np.hypot(moved["target_x"] - 0.7, moved["target_y"] - 0.1) < 0.3 * DT + 1e-6
+
+
+def test_flight_is_that_of_a_falling_ball() -> None:
+    """Against small steps of Newton's law."""
+    ball, velocity = np.array([0.5, 0.1, 0.3]), np.array([0.2, -0.1, 1.5])
+    flight = task.flight(jnp.array(ball), jnp.array(velocity), 0.1)
+    time, highest, dt = 0.0, (0.0, ball), 1e-5
+    while ball[2] > 0.1:
+        ball = ball + dt * velocity + 0.5 * dt**2 * np.array([0.0, 0.0, -9.81])
+        velocity, time = velocity + dt * np.array([0.0, 0.0, -9.81]), time + dt
+        highest = max(highest, (time, ball), key=lambda found: found[1][2])
+    np.testing.assert_allclose((flight.rise, flight.fall), (highest[0], time), atol=1e-4)
+    np.testing.assert_allclose(flight.top, highest[1], atol=1e-4)
+    np.testing.assert_allclose(flight.end, ball, atol=1e-4)
+
+
+def measured(x: float, y: float, **others: object) -> dict:
+    given = {"ball_position": jnp.array([0.6, 0.0, 0.4]), "ball_velocity": jnp.zeros(3)}
+    values = {"target_x": [x], "target_y": [y], "target_height": [0.5]} | others
+    return given | {name: jnp.array(value) for name, value in values.items()}
+
+
+def seen_aim(points: list[tuple[float, float]], **others: object) -> np.ndarray:
+    """The aim [2] after measurements of a point at successive control steps."""
+    memory, seen = TRACK.first_quantities(measured(*points[0], **others))
+    seen = {"aim": seen["aim"][None]}
+    for there in points[1:]:
+        memory, seen = TRACK.next_quantities(memory, seen, measured(*there, **others))
+    return np.asarray(seen["aim"][0])
+
+
+def test_the_aim_is_the_point_at_the_next_apex() -> None:
+    """A ball that falls from rest at 0.4 m to 0.0725 m and rises to 0.5 m; a point that is
+    uniformly accelerated."""
+    seconds = np.sqrt(2 * (0.4 - 0.0725) / 9.81) + np.sqrt(2 * (0.5 - 0.0725) / 9.81)
+    with jax.enable_x64(True):
+
+        def at(time: float) -> tuple[float, float]:
+            return 0.6 + 0.2 * time - 0.3 * time**2, 0.1 * time + 0.25 * time**2
+
+        aim = seen_aim([at(DT * step) for step in (-3, -2, -1, 0)])
+        x, y = at(seconds)
+    # The velocity is that of half a step ago.
+    np.testing.assert_allclose(aim, (x - 0.6, y), atol=0.005)
+    assert np.linalg.norm(aim - np.array(at(0.0)) + (0.6, 0.0)) > 0.05
+
+
+def test_a_jump_of_the_point_has_no_velocity() -> None:
+    np.testing.assert_allclose(
+        seen_aim([(0.6, 0.0), (0.6, 0.0), (0.7, 0.0)]), (0.1, 0.0), atol=1e-6
+    )
+
+
+def truth_of(ball: jax.Array, velocity: jax.Array, paddle: jax.Array) -> task.Kinematics:
+    zero = jnp.zeros(6)
+    return task.Kinematics(zero, ball, jnp.zeros(4), zero, velocity, jnp.zeros(3), paddle)
+
+
+def rewards_at(seconds: float, shift: float = 0.0, lift: float = 0.0) -> dict[str, float]:
+    """Rewards of a flight whose apex is the point on a circle at that time."""
+    now = command(0)
+    offset = paths.offset(now, SIZE, now["phase"])
+    later = paths.offset(now, SIZE, paths.phase_in(seconds, now, SIZE))
+    apex = paths.point(now) + later - offset + jnp.array([shift, 0.0, lift])
+    speed = jnp.array([0.2, 0.1, 9.81 * seconds])
+    ball = apex - speed * seconds + jnp.array([0.0, 0.0, 0.5 * 9.81 * seconds**2])
+    end = task.flight(ball, speed, CONFIG.home[2] + 0.0225).end
+    truth = truth_of(ball, speed, end.at[2].set(CONFIG.home[2]))
+    step = task.Step(truth, now, jnp.zeros(6), jnp.zeros(6))
+    return TRACK.step((jnp.array(True), offset), step).reward
+
+
+@pytest.mark.parametrize("seconds", [0.2, -0.1])
+def test_rewards_are_greatest_without_an_error(seconds: float) -> None:
+    """The apex counts throughout its flight; an error of 3 cm, or of 10 cm in height, halves it."""
+    best = rewards_at(seconds)
+    weights = dict(CONFIG.reward)
+    for name in ("apex", "paddle", "home", "calm"):
+        np.testing.assert_allclose(best[name], weights[name].weight, rtol=1e-4)
+    assert best.keys() == set(task.term_names(type(CONFIG.reward)))
+    np.testing.assert_allclose(rewards_at(seconds, shift=0.03)["apex"], 3.0, rtol=1e-3)
+    np.testing.assert_allclose(rewards_at(seconds, lift=0.1)["apex"], 3.0, rtol=1e-3)
+    assert rewards_at(seconds, shift=0.5)["apex"] < 0.03
+
+
+def apex_metrics(ball: tuple[float, float, float]) -> task.TaskStep:
+    truth = truth_of(jnp.array(ball), jnp.array([0.3, 0.0, -0.01]), jnp.array(CONFIG.home))
+    step = task.Step(truth, command(), jnp.zeros(6), jnp.zeros(6))
+    return TRACK.step((jnp.array(True), jnp.zeros(3)), step)
+
+
+def test_an_apex_is_measured_against_the_point_now() -> None:
+    done = apex_metrics((0.63, 0.14, 0.56))
+    assert done.metrics["apexes"] and not done.ended
+    np.testing.assert_allclose(done.metrics["error"], 0.05, rtol=1e-4)
+    np.testing.assert_allclose(done.metrics["height_error"], 0.06, rtol=1e-4)
+    assert apex_metrics((0.6, 0.1, 1.25)).ended and apex_metrics((0.6, 0.1, 0.04)).ended
+
+
+def figures(moments: list[tuple[dict, float, float, float]]) -> task.Episodes:
+    """One episode with an apex for each: its commands, error, height error, seconds."""
+    tallies = []
+    for now, error, height, seconds in moments:
+        metrics = {"apexes": 1.0, "error": error, "height_error": height}
+        moment = task.Moment(None, now, None, metrics, jnp.array(seconds), jnp.array(seconds))
+        tallies.append(TRACK.tally(moment))
+
+    def rows(kind: str) -> dict[str, np.ndarray]:
+        found = [getattr(tally, kind) for tally in tallies]
+        return {name: np.array([float(one[name]) for one in found]) for name in found[0]}
+
+    lasted = np.ones(len(moments), bool)
+    return task.Episodes(rows("sums"), rows("maxima"), lasted, {})
+
+
+def test_results_judge_apexes_by_path_and_speed() -> None:
+    """Apexes of the first 2 s, and of the first second after a step, do not count."""
+    slow, fast, between = (command(0, speed) for speed in (0.1, 0.3, 0.2))
+    moments = [(slow, 0.01, 0.0, 5.0), (slow, 0.02, 0.0, 5.0), (slow, 1.0, 1.0, 1.9)]
+    moments += [(fast, 0.05, 0.2, 5.0), (between, 1.0, 0.0, 5.0)]
+    for corner, error in ((0.2, 1.0), (0.3, 0.02), (0.9, 0.04)):
+        moments += [(command(3, 0.3, phase=corner / 6.0), error, 0.0, 9.0)]
+    found = {result.name: result for result in TRACK.results(figures(moments))}
+    np.testing.assert_allclose(found["slow error"].value, np.sqrt(2.5) / 100.0, rtol=1e-5)
+    np.testing.assert_allclose(found["fast error"].value, 0.05, rtol=1e-5)
+    assert found["after steps"].value == 50.0
+    np.testing.assert_allclose(found["height"].value, 600 / 7)
+    assert not any(found[name].passed for name in ("slow error", "fast error", "after steps"))
+    assert found["stable"].passed
+    only_slow = {r.name: r.passed for r in TRACK.results(figures([(slow, 0.015, 0.0, 5.0)]))}
+    assert only_slow == {
+        "after steps": None, "slow error": True, "fast error": None, "height": True, "stable": True
+    }  # fmt: skip
+    # Nothing was measured, although the path and the speed are judged.
+    assert TRACK.results(figures([(slow, 0.0, 0.0, 1.0)]))[1].passed is False
+
+
+def test_the_margin_of_a_root_mean_square_is_that_of_the_mean_square() -> None:
+    squares, events = np.array([1.0, 2.0, 6.0, 3.0]), np.array([1.0, 1.0, 2.0, 1.0])
+    root = task.root_mean_square("", "", squares, events, 1.6)
+    mean = task.mean_of_events("", "", squares, events, (0.0, 1.6**2))
+    assert root.value == pytest.approx(np.sqrt(12 / 5)) and root.margin == mean.margin
+    assert 0.0 < root.margin < 1.0 and root.passed
+    assert not task.root_mean_square("", "", squares, events, 1.5).passed
+
+
+def test_another_arm_tracks_at_its_own_home() -> None:
+    settings = Config.settings_at((0.4, 0.2, 0.3))
+    x, y, z = (Config(**settings).commands[f"target_{axis}"] for axis in ("x", "y", "height"))
+    np.testing.assert_allclose([c.low + c.high for c in (x, y, z)], (0.8, 0.4, 1.5))
