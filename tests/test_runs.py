@@ -27,6 +27,7 @@ from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
+from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import (
     TrainConfig,
     load_config,
@@ -56,6 +57,7 @@ from bounce_mjx.training import job
 from tiny_runs import contents
 
 PRETRAINED = resource_path("pretrained")
+DRIBBLE = Path(__file__).parents[1] / "examples/dribble_task.py"
 NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
 
@@ -345,6 +347,18 @@ def test_a_preset_has_a_name(tmp_path: Path, monkeypatch) -> None:
     assert robots[0] == robots[1] != read_preset(Path("seed"))
     (tmp_path / "seed").write_text("seed: 7")
     assert read_preset(Path("seed")).seed == 7
+
+
+def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> None:
+    for name, seed in (("cpu", 1), ("bounce/cpu", 2), ("seed", 3)):
+        file = tmp_path / "configs" / f"{name}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"seed: {seed}")
+    monkeypatch.setattr(run_configs, "resource_path", lambda name: tmp_path / name)
+    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
+    assert read_preset(Path("seed")).seed == 3
+    assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
 
 
 def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> None:

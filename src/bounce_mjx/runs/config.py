@@ -217,7 +217,8 @@ def read_preset(
     path: Path | None, robot: Path | None = None, task: str | None = None
 ) -> TrainConfig:
     """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
-    this machine.
+    this machine. A task may have its own preset of that name, in the folder of configs/ that has
+    its name.
 
     Args:
       robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
@@ -229,7 +230,8 @@ def read_preset(
     """
     if path is None:
         path = default_preset(has_accelerator())
-    return load_config(named_file(path, "configs"), robot and named_file(robot, ROBOTS), task)
+    path = named_file(named_file(path, f"configs/{task or DEFAULT}"), "configs")
+    return load_config(path, robot and named_file(robot, ROBOTS), task)
 
 
 def default_preset(accelerator: bool) -> Path:

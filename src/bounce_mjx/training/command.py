@@ -39,8 +39,9 @@ class TrainingCommand(TrainConfig):
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
-    """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer).
-    The default is default on an accelerator, and cpu on a CPU."""
+    """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer);
+    a task's own preset of that name, such as configs/track/cpu.yaml, has priority. The default is
+    default on an accelerator, and cpu on a CPU."""
     robot: Path | None = None
     """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
     one in configs/robots/ (ur5e, panda or iiwa)."""
