@@ -8,6 +8,7 @@ from bounce_mjx.task.results import (
     Result,
     mean_and_margin,
     mean_of_events,
+    root_mean_square,
     share_of_episodes,
     share_of_events,
 )
@@ -15,16 +16,19 @@ from bounce_mjx.task.rewards import (
     RewardTerm,
     gaussian,
     horizontal_distance,
+    length,
     safe_sqrt,
     term_names,
     weighted_terms,
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
-from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep
-from bounce_mjx.world.config import Command, WorldConfig
+from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values
+from bounce_mjx.world.config import ActionConfig, Command, WorldConfig
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
+from bounce_mjx.world.randomization import RandomizationConfig
 
 __all__ = [
+    "ActionConfig",
     "Command",
     "Curve",
     "Episodes",
@@ -37,6 +41,7 @@ __all__ = [
     "Moment",
     "ObservationConfig",
     "Quantity",
+    "RandomizationConfig",
     "Recording",
     "Result",
     "RewardTerm",
@@ -46,12 +51,15 @@ __all__ = [
     "Tally",
     "Task",
     "TaskStep",
+    "Values",
     "WorldConfig",
     "gaussian",
     "horizontal_distance",
     "latest",
+    "length",
     "mean_and_margin",
     "mean_of_events",
+    "root_mean_square",
     "safe_sqrt",
     "share_of_episodes",
     "share_of_events",

@@ -100,6 +100,24 @@ def mean_of_events(
     return Result(name, measured, mean, bound, distance >= 0.0, _clearness(distance, margin))
 
 
+def root_mean_square(
+    name: str, measured: str, squares: np.ndarray, events: np.ndarray, most: float
+) -> Result:
+    """The result for the root of a mean square over steps or events, at most `most`; without any it
+    fails.
+
+    Args:
+      squares: sum of the squared quantity in each episode [E].
+      events: number of steps or events in each episode [E].
+    """
+    mean, margin = mean_and_margin(squares, events)
+    distance = -1.0 if mean is None else most**2 - mean
+    root = None if mean is None else math.sqrt(mean)
+    return Result(
+        name, measured, root, f"<= {most:g}", distance >= 0.0, _clearness(distance, margin)
+    )
+
+
 def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:
     """The mean over all steps or events of E episodes, None without any; and its margin.
 
