@@ -31,7 +31,11 @@ _MAX_BYTES = 2**20
 # The tasks of the files that the user has named, by their content.
 _named: dict[tuple[str, str], type[Task]] = {}
 
-_OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce"}
+_OWN = {
+    "balance": "bounce_mjx.tasks.balance:Balance",
+    "bounce": "bounce_mjx.tasks.bounce:Bounce",
+    "catch": "bounce_mjx.tasks.catch:Catch",
+}
 
 
 def find_task(name: str) -> type[Task]:
