@@ -366,11 +366,11 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     """Those of the task, where they differ from those of the group's class."""
     file = tmp_path / "preset.yaml"
     file.write_text(
-        "task: catch\nenv: {action: {max_lead: 0.2}, reward: {rest: {}, speed: {scale: 0.3}}}"
+        "task: catch\nenv: {action: {max_lead: 0.2}, reward: {rest: {}, fall: {scale: 0.3}}}"
     )
     env, default = load_config(file).env, load_config(CATCH).env
     assert env.action.base == "target" and env.action.max_lead == 0.2
-    assert env.reward.speed.scale == 0.3 and env.reward.rest == default.reward.rest
+    assert env.reward.fall.scale == 0.3 and env.reward.rest == default.reward.rest
     assert default.reward.rest.weight != type(default.reward.rest)().weight
 
 

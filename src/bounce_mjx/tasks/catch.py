@@ -9,10 +9,8 @@ from bounce_mjx import task
 from bounce_mjx.config.settings import Finite, NonNegative, Positive
 from bounce_mjx.lazy import jax, jnp
 
-SPEEDS = (1.0, 2.0)
-"""Range of the horizontal speed of a throw, m/s."""
-FLIGHTS = (0.6, 0.7)
-"""Range of the time until the ball is where the throw aims, s."""
+SPEEDS, FLIGHTS = (1.0, 2.0), (0.6, 0.7)
+"""Ranges of a throw's horizontal speed, m/s, and of the time until the ball is at its aim, s."""
 MAX_DISTANCE = 2.0
 """Greatest horizontal distance of a start from the arm's base, m; it limits the fastest throws."""
 MAX_DIRECTION = math.radians(30.0)
@@ -38,7 +36,7 @@ class Inputs(NamedTuple):
     whether it touches the paddle and is slow, and the mean squared change of the action."""
 
     distance: jax.Array
-    speed: jax.Array
+    fall: jax.Array
     resting: jax.Array
     action_change: jax.Array
 
@@ -53,18 +51,18 @@ class CentreReward(task.RewardTerm):
         return task.gaussian(inputs.distance, self.scale)
 
 
-class SpeedReward(task.RewardTerm):
-    """Speed: the ball has little energy relative to the paddle."""
+class FallReward(task.RewardTerm):
+    """Fall: the ball has little energy relative to the paddle."""
 
     scale: Positive = 0.7
     """Width of the Gaussian, m/s."""
 
     def value(self, inputs: Inputs) -> jax.Array:
-        return task.gaussian(inputs.speed, self.scale)
+        return task.gaussian(inputs.fall, self.scale)
 
 
 class RestReward(task.RewardTerm):
-    """Rest: the ball rests on the paddle."""
+    """Rest: the ball touches the paddle and moves with it."""
 
     def value(self, inputs: Inputs) -> jax.Array:
         return 1.0 * inputs.resting
@@ -81,7 +79,7 @@ class Rewards(task.StrictModel):
     """The reward terms."""
 
     centre: CentreReward = CentreReward()
-    speed: SpeedReward = SpeedReward()
+    fall: FallReward = FallReward()
     rest: RestReward = RestReward(weight=3.0)
     action_rate: ActionRateReward = ActionRateReward(weight=-0.1)
 
@@ -165,7 +163,7 @@ class Catch(task.Task):
         drop = 2.0 * GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
         inputs = Inputs(
             distance=task.length(offset[:2]),
-            speed=task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
+            fall=task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
             resting=resting,
             action_change=jnp.mean(jnp.square(step.action - step.last_action)),
         )
