@@ -33,7 +33,7 @@ def paths(start: jax.Array, speed: jax.Array, draws: jax.Array, steps: int) -> n
             command = balance.next_command(centre, command)
             return command, jnp.stack([command["point_x"], command["point_y"]])
 
-        command = {"point_x": start[0], "point_y": start[1], "speed": speed}
+        command = {"point_x": start[0], "point_y": start[1], "point_speed": speed}
         return jax.lax.scan(move, command, length=steps)[1]
 
     batched = jax.vmap(path, in_axes=-1, out_axes=-1)

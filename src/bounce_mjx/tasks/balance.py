@@ -13,7 +13,7 @@ REACH = 0.03
 MAX_SPEED = 0.05
 """Greatest speed of the point, m/s."""
 MIN_RADIUS = 0.01
-"""Radius of the point's circle below which the point is slower than `speed`, m."""
+"""Radius of the point's circle below which the point is slower than `point_speed`, m."""
 HOME = (0.59356, 0.0, 0.0498)
 """Centre of the paddle of the project's own arm at a reset, m."""
 START_HEIGHT = 0.0255
@@ -113,12 +113,12 @@ class Config(task.WorldConfig):
     def commands(self) -> dict[str, task.Command]:
         reach = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
         speed = task.Command(-MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01)
-        return {"point_x": reach, "point_y": reach, "speed": speed}
+        return {"point_x": reach, "point_y": reach, "point_speed": speed}
 
 
 class Balance(task.Task):
     """The ball rests on the paddle and follows the point (point_x, point_y) on it. The point moves
-    on a circle with `speed`, anticlockwise if it is positive; 0 keeps the point where it is."""
+    on a circle with `point_speed`, anticlockwise if it is positive; 0 keeps it where it is."""
 
     Config = Config
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
@@ -151,7 +151,7 @@ class Balance(task.Task):
         """The point turns about the drawn centre, from where it is or where a user has set it, and
         stays within reach."""
         arm = _point(command) - centre
-        turn = command["speed"] * self.config.control_dt
+        turn = command["point_speed"] * self.config.control_dt
         turn = turn / jnp.maximum(task.length(arm), MIN_RADIUS)
         sideways = jnp.stack([-arm[1], arm[0]])
         point = centre + jnp.cos(turn) * arm + jnp.sin(turn) * sideways
@@ -175,11 +175,14 @@ class Balance(task.Task):
         )
 
     def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
-        """A disc on the paddle at the point."""
+        """A frame around the ball at the point."""
         x, y, z = self.focus()
         place = (x + command["point_x"], y + command["point_y"], z + 0.004)
-        size, green = (0.006, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.8)
-        return (task.Marker("point", place, size, green, "cylinder"),)
+        size, green = (0.021, 0.021, 0.001), (0.15, 0.9, 0.3, 0.9)
+        return (task.Marker("point", place, size, green, "frame"),)
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"from the point": f"{1000.0 * metrics['error']:.0f} mm"}
 
     def focus(self) -> tuple[float, float, float]:
         """Where the paddle is held at a reset."""

@@ -187,6 +187,9 @@ class Catch(task.Task):
         size, green = (AIM_RADIUS, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.4)
         return (task.Marker("aim", self.focus(), size, green, "cylinder"),)
 
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"caught": "yes" if metrics["caught"] else "no"}
+
     def focus(self) -> tuple[float, float, float]:
         x, y, z = self.config.ball_init_pos
         return x, y, z - REST_HEIGHT
