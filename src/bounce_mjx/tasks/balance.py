@@ -166,7 +166,7 @@ class Balance(task.Task):
         """Stable episodes, and the error; whether the pushes are on decides on its bound."""
         pushes = (self.config.randomization.push_speed or (0.0, 0.0))[1] > 0.0
         squares, steps = episodes.sums["squares"], episodes.sums["steps"]
-        measured = f"RMS distance of ball and point {'with' if pushes else 'without'} pushes, cm"
+        measured = "RMS distance of ball and point, cm"
         return (
             task.share_of_episodes("stable", "episodes that last", episodes.lasted, MIN_STABLE),
             task.root_mean_square(
