@@ -57,6 +57,7 @@ from bounce_mjx.training import job
 from tiny_runs import contents
 
 PRETRAINED = resource_path("pretrained")
+CATCH = resource_path("configs/catch/cpu.yaml")
 DRIBBLE = Path(__file__).parents[1] / "examples/dribble_task.py"
 NAMES = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
@@ -359,6 +360,18 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
     assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
     assert read_preset(Path("seed")).seed == 3
     assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
+
+
+def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
+    """Those of the task, where they differ from those of the group's class."""
+    file = tmp_path / "preset.yaml"
+    file.write_text(
+        "task: catch\nenv: {action: {max_lead: 0.2}, reward: {rest: {}, fall: {scale: 0.3}}}"
+    )
+    env, default = load_config(file).env, load_config(CATCH).env
+    assert env.action.base == "target" and env.action.max_lead == 0.2
+    assert env.reward.fall.scale == 0.3 and env.reward.rest == default.reward.rest
+    assert default.reward.rest.weight != type(default.reward.rest)().weight
 
 
 def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -64,3 +64,27 @@ class StrictModel(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
     )
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _complete_groups(cls, values: Any) -> Any:
+        """A group that is given in part keeps the other settings of its default, which need not be
+        those of its class."""
+        if not isinstance(values, dict):
+            return values
+        defaults = {name: field.default for name, field in cls.model_fields.items()}
+        return {
+            name: merged(default.model_dump(exclude_unset=True), value)
+            if isinstance(default := defaults.get(name), StrictModel) and isinstance(value, dict)
+            else value
+            for name, value in values.items()
+        }
+
+
+def merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    """Nested mappings in which the others' keys win."""
+    result = dict(values)
+    for key, value in others.items():
+        both = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = merged(result[key], value) if both else value
+    return result

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
@@ -14,6 +15,7 @@ from bounce_mjx.physics import (
     Engine,
     PhysicsParameters,
     PhysicsState,
+    edited_model,
     make_engine,
 )
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
@@ -104,9 +106,7 @@ class Env:
         """
         self.config = config
         self.task: Task = config.task(config)
-        self.mj_model: mujoco.MjModel = load_model(
-            self.config.mjcf, self.config.physics_dt, robot=self.config.robot
-        )
+        self.mj_model: mujoco.MjModel = world_model(config)
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._check_joints()
@@ -586,6 +586,14 @@ class Env:
             for name, value in named.items()
             for i, entry in enumerate(value if value.ndim else (value,))
         }
+
+
+def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
+    """Compiles the model of a world; `visual` and the errors are those of `load_model`."""
+    mj_model = load_model(config.mjcf, config.physics_dt, visual, config.robot)
+    if config.friction is None:
+        return mj_model
+    return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
 
 
 def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bounce_mjx.env.env import Env
+from bounce_mjx.env.env import Env, world_model
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Networks, Policy, act
@@ -19,7 +19,7 @@ from bounce_mjx.physics import (
     edited_model,
     servo_targets,
 )
-from bounce_mjx.robot.model import find_addresses, load_model
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -126,7 +126,7 @@ def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjMod
     given = jax.tree.leaves(parameters)
     if not given:
         return [env.mj_model]
-    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False, robot=env.config.robot)
+    plain = world_model(env.config, visual=False)
     return [
         edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
         for i in range(given[0].shape[-1])

@@ -11,7 +11,14 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.settings import Count, NonNegativeInt, PlainPath, Steps, StrictModel
+from bounce_mjx.config.settings import (
+    Count,
+    NonNegativeInt,
+    PlainPath,
+    Steps,
+    StrictModel,
+    merged,
+)
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
@@ -175,7 +182,7 @@ def load_config(path: Path, robot: Path | None = None, task: str | None = None) 
     if robot is None:
         return validate(config_class, values, str(path))
     own = _robot_for(config_class().env.task, robot)
-    return validate(config_class, _merged(values, own), f"{path} with {robot}")
+    return validate(config_class, merged(values, own), f"{path} with {robot}")
 
 
 def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
@@ -198,15 +205,6 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
 
     home = paddle_home(known.mjcf, known.robot, known.default_joint_angles)
     return values | {"env": of_world | task.Config.settings_at(home)}
-
-
-def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
-    """Nested mappings in which the others' keys win."""
-    merged = dict(values)
-    for key, value in others.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
 
 
 def read_preset(

@@ -18,17 +18,20 @@ from bounce_mjx.task.rewards import (
     RewardTerm,
     gaussian,
     horizontal_distance,
+    length,
     safe_sqrt,
     term_names,
     weighted_terms,
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
-from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep
-from bounce_mjx.world.config import Command, ResetConfig, WorldConfig
+from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values
+from bounce_mjx.world.config import ActionConfig, Command, ResetConfig, WorldConfig
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
+from bounce_mjx.world.randomization import RandomizationConfig
 
 __all__ = [
     "GRAVITY",
+    "ActionConfig",
     "Command",
     "Curve",
     "Episodes",
@@ -43,6 +46,7 @@ __all__ = [
     "Near",
     "ObservationConfig",
     "Quantity",
+    "RandomizationConfig",
     "Recording",
     "ResetConfig",
     "Result",
@@ -53,11 +57,13 @@ __all__ = [
     "Tally",
     "Task",
     "TaskStep",
+    "Values",
     "WorldConfig",
     "flight",
     "gaussian",
     "horizontal_distance",
     "latest",
+    "length",
     "mean_and_margin",
     "mean_of_events",
     "root_mean_square",

@@ -69,6 +69,11 @@ def safe_sqrt(x: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def length(vector: jax.Array) -> jax.Array:
+    """Length [] of a vector [n]; its derivative is 0 where it is 0."""
+    return safe_sqrt(jnp.sum(jnp.square(vector)))
+
+
 def horizontal_distance(a: jax.Array, b: jax.Array) -> jax.Array:
     """Distance [] between two points [2 or 3] in x and y; its derivative is 0 where they
     coincide."""

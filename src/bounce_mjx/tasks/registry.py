@@ -31,7 +31,12 @@ _MAX_BYTES = 2**20
 # The tasks of the files that the user has named, by their content.
 _named: dict[tuple[str, str], type[Task]] = {}
 
-_OWN = {"bounce": "bounce_mjx.tasks.bounce:Bounce", "track": "bounce_mjx.tasks.track:Track"}
+_OWN = {
+    "balance": "bounce_mjx.tasks.balance:Balance",
+    "bounce": "bounce_mjx.tasks.bounce:Bounce",
+    "catch": "bounce_mjx.tasks.catch:Catch",
+    "track": "bounce_mjx.tasks.track:Track",
+}
 
 
 def find_task(name: str) -> type[Task]:

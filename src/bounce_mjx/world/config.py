@@ -108,6 +108,9 @@ class WorldConfig(StrictModel):
     """Time between two actions, s; a whole number of physics steps."""
     episode_seconds: Positive = 20.0
     """Length of an episode before it is truncated, s."""
+    friction: NonNegative | None = None
+    """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
+    the project's own robot."""
     action_scale: Positive = 0.02
     """Change of the servo target for an action of 1, rad."""
     action: ActionConfig = ActionConfig()

@@ -1,0 +1,196 @@
+"""Balancing: the ball rests on the paddle and follows a commanded point on it, despite pushes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple
+
+from bounce_mjx import task
+from bounce_mjx.config.settings import Finite, NonNegative, Positive
+from bounce_mjx.lazy import jax, jnp
+
+REACH = 0.03
+"""Largest distance of the point from the paddle's centre, m."""
+MAX_SPEED = 0.05
+"""Greatest speed of the point, m/s."""
+MIN_RADIUS = 0.01
+"""Radius of the point's circle below which the point is slower than `point_speed`, m."""
+HOME = (0.59356, 0.0, 0.0498)
+"""Centre of the paddle of the project's own arm at a reset, m."""
+START_HEIGHT = 0.0255
+"""Height of the ball over the paddle's centre at a reset, m: 3 mm above its rest, because the noise
+of the joint angles lifts the paddle by up to 2.5 mm."""
+LOST_DISTANCE, LOST_DEPTH = 0.1, 0.02
+"""The episode ends when the ball is farther from the paddle's centre, or lower, m."""
+SETTLING_SECONDS = 1.0
+"""Time at the start of an episode in which the error does not count, s."""
+MAX_ERROR = (0.01, 0.015)
+"""Greatest RMS error without and with pushes, m."""
+MIN_STABLE = 0.99
+"""Least share of episodes that last."""
+
+
+class Inputs(NamedTuple):
+    """What the reward terms depend on, each []: the horizontal distance of the ball from the point
+    and the distance of the paddle from its home (m), and the mean squared change of the action."""
+
+    error: jax.Array
+    paddle: jax.Array
+    action_change: jax.Array
+
+
+class PointReward(task.RewardTerm):
+    """Point: the ball is at the point."""
+
+    scale: Positive = 0.015
+    """Width of the Gaussian, m."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return task.gaussian(inputs.error, self.scale)
+
+
+class HomeReward(task.RewardTerm):
+    """Home: the paddle stays where it is held at a reset."""
+
+    scale: Positive = 0.05
+    """Width of the Gaussian, m."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return task.gaussian(inputs.paddle, self.scale)
+
+
+class ActionRateReward(task.RewardTerm):
+    """Action rate: the action does not jump."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return inputs.action_change
+
+
+class Rewards(task.StrictModel):
+    """The reward terms."""
+
+    point: PointReward = PointReward(weight=2.0)
+    home: HomeReward = HomeReward()
+    action_rate: ActionRateReward = ActionRateReward(weight=-0.2)
+
+
+class Observation(task.ObservationConfig):
+    """What a robot with a camera measures, and the point."""
+
+    ball_quaternion: task.History = 0
+    ball_angular_velocity: task.History = 0
+    point_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    """Point on the paddle, from its centre along the world's x."""
+    point_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    """The same along the world's y."""
+
+
+class Config(task.WorldConfig):
+    """The world, with a rough paddle and pushes, and the settings of balancing."""
+
+    ball_init_pos: tuple[Finite, Finite, Finite] = (*HOME[:2], HOME[2] + START_HEIGHT)
+    """Mean ball position at a reset, m."""
+    reset: task.ResetConfig = task.ResetConfig(joint_angles=0.002, ball_position=0.0)
+    """The noise of a reset."""
+    friction: NonNegative | None = 0.3
+    """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
+    observation: Observation = Observation()
+    """The quantities that the policy sees."""
+    randomization: task.RandomizationConfig = task.RandomizationConfig(
+        push_speed=(0.1, 0.1), push_interval=(2.0, 2.0)
+    )
+    """The world that each episode draws."""
+    reward: Rewards = Rewards()
+    """The reward terms."""
+
+    @classmethod
+    def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        x, y, z = paddle
+        return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
+
+    @property
+    def commands(self) -> dict[str, task.Command]:
+        reach = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
+        speed = task.Command(-MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01)
+        return {"point_x": reach, "point_y": reach, "point_speed": speed}
+
+
+class Balance(task.Task):
+    """The ball rests on the paddle and follows the point (point_x, point_y) on it. The point moves
+    on a circle with `point_speed`, anticlockwise if it is positive; 0 keeps it where it is."""
+
+    Config = Config
+    curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
+    num_draws = 4
+
+    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x, y, z = self.config.ball_init_pos
+        east, north = REACH * (draws[:2] - 0.5)
+        return jnp.stack([x + east, y + north, jnp.full_like(x, z)]), jnp.zeros(3)
+
+    def reset(self, start: task.Start) -> jax.Array:
+        return 0.7 * REACH * (2.0 * start.draws[2:] - 1.0)
+
+    def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
+        truth, error = step.truth, _error(step.truth, step.command)
+        offset = truth.ball_position - truth.paddle_position
+        inputs = Inputs(
+            error=task.length(error),
+            paddle=task.length(truth.paddle_position - jnp.array(self.focus())),
+            action_change=jnp.mean(jnp.square(step.action - step.last_action)),
+        )
+        return task.TaskStep(
+            state=centre,
+            reward=task.weighted_terms(self.config.reward, inputs),
+            ended=(offset[2] < -LOST_DEPTH) | (task.length(offset) > LOST_DISTANCE),
+            metrics={"error": inputs.error},
+        )
+
+    def next_command(self, centre: jax.Array, command: task.Values) -> task.Values:
+        """The point turns about the drawn centre, from where it is or where a user has set it, and
+        stays within reach."""
+        arm = _point(command) - centre
+        turn = command["point_speed"] * self.config.control_dt
+        turn = turn / jnp.maximum(task.length(arm), MIN_RADIUS)
+        sideways = jnp.stack([-arm[1], arm[0]])
+        point = centre + jnp.cos(turn) * arm + jnp.sin(turn) * sideways
+        x, y = point * REACH / jnp.maximum(task.length(point), REACH)
+        return command | {"point_x": x, "point_y": y}
+
+    def tally(self, moment: task.Moment) -> task.Tally:
+        judged = moment.seconds > SETTLING_SECONDS + 0.5 * self.config.control_dt
+        return task.Tally({"steps": judged, "squares": judged * moment.metrics["error"] ** 2})
+
+    def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
+        """Stable episodes, and the error; whether the pushes are on decides on its bound."""
+        pushes = (self.config.randomization.push_speed or (0.0, 0.0))[1] > 0.0
+        squares, steps = episodes.sums["squares"], episodes.sums["steps"]
+        measured = "RMS distance of ball and point, cm"
+        return (
+            task.share_of_episodes("stable", "episodes that last", episodes.lasted, MIN_STABLE),
+            task.root_mean_square(
+                "error", measured, 1e4 * squares, steps, 100.0 * MAX_ERROR[pushes]
+            ),
+        )
+
+    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+        """A frame around the ball at the point."""
+        x, y, z = self.focus()
+        place = (x + command["point_x"], y + command["point_y"], z + 0.004)
+        size, green = (0.021, 0.021, 0.001), (0.15, 0.9, 0.3, 0.9)
+        return (task.Marker("point", place, size, green, "frame"),)
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"from the point": f"{1000.0 * metrics['error']:.0f} mm"}
+
+    def focus(self) -> tuple[float, float, float]:
+        """Where the paddle is held at a reset."""
+        x, y, z = self.config.ball_init_pos
+        return x, y, z - START_HEIGHT
+
+
+def _point(command: task.Values) -> jax.Array:
+    return jnp.stack([command["point_x"], command["point_y"]])
+
+
+def _error(truth: task.Kinematics, command: task.Values) -> jax.Array:
+    return truth.ball_position[:2] - truth.paddle_position[:2] - _point(command)

@@ -1,0 +1,198 @@
+"""Catching: a ball that is thrown at the arm comes to rest on the paddle after a few bounces."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from bounce_mjx import task
+from bounce_mjx.config.settings import Finite, NonNegative, Positive
+from bounce_mjx.lazy import jax, jnp
+
+SPEEDS, FLIGHTS = (1.0, 2.0), (0.6, 0.7)
+"""Ranges of a throw's horizontal speed, m/s, and of the time until the ball is at its aim, s."""
+MAX_DISTANCE = 2.0
+"""Greatest horizontal distance of a start from the arm's base, m; it limits the fastest throws."""
+MAX_DIRECTION = math.radians(30.0)
+"""Greatest angle of a throw to the line from the paddle to the base, rad."""
+AIM_RADIUS = 0.05
+"""Greatest distance of the aim from the ball's rest on the paddle, m."""
+HOME = (0.59356, 0.0, 0.0498)
+"""Centre of the paddle of the project's own arm at a reset, m."""
+REST_HEIGHT = 0.0225
+"""Height of a resting ball over the paddle's centre, m."""
+REST_SPEED, REST_SECONDS = 0.05, 0.5
+"""A ball is at rest that touched the paddle and was slower relative to it (m/s) for a time (s)."""
+CATCH_SECONDS, MIN_CAUGHT = 2.0, 0.95
+"""A caught ball is at rest within this time of the first contact, s; least share of caught ones."""
+LOST_DEPTH, FLOOR = 0.05, 0.02
+"""The episode ends when the ball is farther below the paddle, or the paddle nearer the floor, m."""
+GRAVITY = 9.81
+
+
+class Inputs(NamedTuple):
+    """What the reward terms depend on, each []: the horizontal distance of the ball from the
+    paddle's centre (m), the speed relative to the paddle at which it meets it or would (m/s),
+    whether it touches the paddle and is slow, and the mean squared change of the action."""
+
+    distance: jax.Array
+    fall: jax.Array
+    resting: jax.Array
+    action_change: jax.Array
+
+
+class CentreReward(task.RewardTerm):
+    """Centre: the ball is over the paddle's centre."""
+
+    scale: Positive = 0.05
+    """Width of the Gaussian, m."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return task.gaussian(inputs.distance, self.scale)
+
+
+class FallReward(task.RewardTerm):
+    """Fall: the ball has little energy relative to the paddle."""
+
+    scale: Positive = 0.7
+    """Width of the Gaussian, m/s."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return task.gaussian(inputs.fall, self.scale)
+
+
+class RestReward(task.RewardTerm):
+    """Rest: the ball touches the paddle and moves with it."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return 1.0 * inputs.resting
+
+
+class ActionRateReward(task.RewardTerm):
+    """Action rate: the action does not jump."""
+
+    def value(self, inputs: Inputs) -> jax.Array:
+        return inputs.action_change
+
+
+class Rewards(task.StrictModel):
+    """The reward terms."""
+
+    centre: CentreReward = CentreReward()
+    fall: FallReward = FallReward()
+    rest: RestReward = RestReward(weight=3.0)
+    action_rate: ActionRateReward = ActionRateReward(weight=-0.1)
+
+
+class Config(task.WorldConfig):
+    """The world, with a rough paddle and a thrown ball, and the settings of catching."""
+
+    episode_seconds: Positive = 3.0
+    """Length of an episode before it is truncated, s."""
+    ball_init_pos: tuple[Finite, Finite, Finite] = (*HOME[:2], HOME[2] + REST_HEIGHT)
+    """Where the ball would rest on the paddle at a reset, m; throws aim near it."""
+    reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02, ball_position=0.0)
+    """The noise of a reset."""
+    friction: NonNegative | None = 0.3
+    """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
+    action: task.ActionConfig = task.ActionConfig(base="target")
+    """What an action adds to."""
+    observation: task.ObservationConfig = task.ObservationConfig(
+        ball_quaternion=0, ball_angular_velocity=0
+    )
+    """The quantities that the policy sees: what a robot with a camera measures."""
+    reward: Rewards = Rewards()
+    """The reward terms."""
+
+    @classmethod
+    def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        x, y, z = paddle
+        return {"ball_init_pos": [x, y, round(z + REST_HEIGHT, 4)]}
+
+
+class State(NamedTuple):
+    """What the task keeps of an episode: the ball's vertical velocity [] (m/s) and its position
+    from the paddle's centre [3] (m) after the last step, the time since the first contact and the
+    time at rest [], both s, and whether the ball was at rest in time [], bool."""
+
+    fall: jax.Array
+    offset: jax.Array
+    contact: jax.Array
+    rest: jax.Array
+    caught: jax.Array
+
+
+class Catch(task.Task):
+    """A ball is thrown at the arm, which brings it to rest on the paddle."""
+
+    Config = Config
+    curves = (task.Curve("episode/caught", "caught", "episodes", "share of caught balls"),)
+    num_draws = 5
+
+    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
+        home = jnp.array(self.config.ball_init_pos)
+        offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
+        seconds = FLIGHTS[0] + (FLIGHTS[1] - FLIGHTS[0]) * draws[2]
+        fastest = (MAX_DISTANCE - task.length(home[:2] + offset[:2])) / seconds
+        speed = SPEEDS[0] + (jnp.minimum(SPEEDS[1], fastest) - SPEEDS[0]) * draws[3]
+        outward = jnp.arctan2(home[1], home[0]) + MAX_DIRECTION * (2.0 * draws[4] - 1.0)
+        velocity = -speed * _direction(outward)
+        rising = jnp.array([0.0, 0.0, 0.5 * GRAVITY]) * seconds
+        return home + offset - seconds * velocity, velocity + rising
+
+    def reset(self, start: task.Start) -> State:
+        zero, truth = jnp.zeros(()), start.truth
+        offset = truth.ball_position - truth.paddle_position
+        return State(truth.ball_velocity[2], offset, zero, zero, zero > 0.0)
+
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
+        truth, dt = step.truth, self.config.control_dt
+        offset = truth.ball_position - truth.paddle_position
+        # The mean of the step, in which the servos' speed rises and falls.
+        velocity = (offset - state.offset) / dt
+        # A ball that touches nothing falls freely.
+        touches = truth.ball_velocity[2] - state.fall > -0.5 * GRAVITY * dt
+        resting = touches & (task.length(velocity) < REST_SPEED)
+        contact = jnp.where(touches | (state.contact > 0.0), state.contact + dt, 0.0)
+        rest = jnp.where(resting, state.rest + dt, 0.0)
+        in_time = contact < CATCH_SECONDS + 0.5 * dt
+        caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
+        drop = 2.0 * GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
+        inputs = Inputs(
+            distance=task.length(offset[:2]),
+            fall=task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
+            resting=resting,
+            action_change=jnp.mean(jnp.square(step.action - step.last_action)),
+        )
+        return task.TaskStep(
+            state=State(truth.ball_velocity[2], offset, contact, rest, caught),
+            reward=task.weighted_terms(self.config.reward, inputs),
+            ended=(offset[2] < -LOST_DEPTH) | (truth.paddle_position[2] < FLOOR),
+            metrics={"caught": caught},
+        )
+
+    def tally(self, moment: task.Moment) -> task.Tally:
+        return task.Tally({}, {"caught": moment.metrics["caught"]})
+
+    def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
+        measured = f"balls at rest within {CATCH_SECONDS:g} s of the first contact"
+        caught = (episodes.maxima["caught"] > 0.0) & (episodes.lasted > 0.0)
+        return (task.share_of_episodes("caught", measured, caught, MIN_CAUGHT),)
+
+    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+        """A disc around the points at which throws aim."""
+        size, green = (AIM_RADIUS, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.4)
+        return (task.Marker("aim", self.focus(), size, green, "cylinder"),)
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"caught": "yes" if metrics["caught"] else "no"}
+
+    def focus(self) -> tuple[float, float, float]:
+        x, y, z = self.config.ball_init_pos
+        return x, y, z - REST_HEIGHT
+
+
+def _direction(angle: jax.Array) -> jax.Array:
+    """Horizontal unit vector [3] at an angle [] to x."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)])
