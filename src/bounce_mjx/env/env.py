@@ -105,7 +105,7 @@ class Env:
         self.config = config
         self.task: Task = config.task(config)
         self.mj_model: mujoco.MjModel = load_model(
-            self.config.mjcf, self.config.physics_dt, robot=self.config.robot
+            config.mjcf, config.physics_dt, robot=config.robot, num_balls=config.num_balls
         )
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)

@@ -138,7 +138,8 @@ def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjMod
     given = jax.tree.leaves(parameters)
     if not given:
         return [env.mj_model]
-    plain = load_model(env.config.mjcf, env.config.physics_dt, visual=False, robot=env.config.robot)
+    c = env.config
+    plain = load_model(c.mjcf, c.physics_dt, visual=False, robot=c.robot, num_balls=c.num_balls)
     return [
         edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
         for i in range(given[0].shape[-1])

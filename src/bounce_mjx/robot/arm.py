@@ -29,7 +29,7 @@ _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 _HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball")
-_RESERVED += ("paddle_home",)
+_RESERVED += ("paddle_home", "ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

@@ -7,7 +7,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.config.settings import (
+    Finite,
+    NonNegative,
+    PlainPath,
+    Positive,
+    StrictModel,
+    whole_number,
+)
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
@@ -116,6 +123,8 @@ class WorldConfig(StrictModel):
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
+    num_balls: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)] = 1
+    """Number of balls; those that the MJCF lacks are copies of its first one."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
     """Ball position at a reset, before noise, m."""
     reset: ResetConfig = ResetConfig()
