@@ -1,0 +1,234 @@
+"""Forces of several contacts with sliding friction at one instant, as MuJoCo computes them.
+
+In the units of the cones (`friction.py`), the forces x minimise
+
+    1/2 x.(Q + R) x + x.c    over the product of the cones
+
+with Q = J M^-1 J^T, which couples the contacts, and the regulariser R. Under an acceleration y,
+each contact has the force f(y) that minimises 1/2 f.R f + f.y over its cone, so the solution is
+x = f(c + Q x). MuJoCo's Newton method finds it: -f is the gradient of a convex function of y, which
+is smooth between the zones in which the contact is open, sticks or slips, and a line search keeps
+the steps across zones short enough. Every state runs the same operations, so that the threads of a
+GPU kernel do not diverge.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.contact import ContactModel, upper_rows
+from bounce_mjx.physics.fused.scalars import (
+    Scalar,
+    Vec3,
+    add,
+    dot,
+    is_constant,
+    mul,
+    stored,
+    sub,
+)
+
+_NEWTON_STEPS = 20
+_SEARCH_STEPS = 6
+_ROOT = math.sqrt(2.0)
+
+
+class Cone(NamedTuple):
+    """One contact in the units of its cone."""
+
+    elliptic: bool
+    touches: jax.Array
+    """Whether there is a contact."""
+    normal: Scalar
+    """Regulariser along the normal, 1/kg; of the elliptic cone only."""
+    tangential: Scalar
+    """Regulariser along the tangents, or of each edge of the pyramid, 1/kg."""
+
+
+def tangential_regulariser(model: ContactModel, regulariser: Scalar) -> Scalar:
+    """Regulariser of both tangential forces in the units of the cone, 1/kg.
+
+    Args:
+      regulariser: of the normal force without friction, 1/kg.
+    """
+    friction = model.friction[0]
+    return mul(mul(friction, friction), 1.0 / model.impratio) * regulariser
+
+
+def edge_regulariser(model: ContactModel, tangential: Scalar) -> Scalar:
+    """Regulariser of the coefficient of a pyramid's edge, 1/kg."""
+    friction = model.friction[0]
+    return 2.0 * tangential * add(1.0, mul(friction, friction))
+
+
+def coupled_forces(
+    models: Sequence[ContactModel],
+    touching: Sequence[jax.Array],
+    matrix: Sequence[Scalar],
+    offsets: Sequence[Scalar],
+    regularisers: Sequence[Scalar],
+) -> tuple[Scalar, ...]:
+    """Forces [3 k] of k contacts (N): normal, first and second tangent of each.
+
+    Args:
+      touching: whether each contact exists.
+      matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
+      offsets: J a0 - aref, m/s^2.
+      regularisers: regularisers of the normal forces without friction, 1/kg.
+    """
+    units = [unit for model in models for unit in (1.0, *model.friction)]
+    size = len(units)
+    upper = upper_rows(matrix, size)
+    q = [
+        [mul(upper[min(i, j)][abs(i - j)], mul(units[i], units[j])) for j in range(size)]
+        for i in range(size)
+    ]
+    c = list(map(mul, offsets, units))
+    cones = []
+    for model, touches, normal in zip(models, touching, regularisers, strict=True):
+        tangential = tangential_regulariser(model, normal)
+        if not model.elliptic:
+            tangential = edge_regulariser(model, tangential)
+        cones.append(Cone(model.elliptic, touches, normal, tangential))
+    q, c = stored((q, c))
+
+    def newton_step(_, x: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        return _newton_step(cones, q, c, x)
+
+    start = tuple(entry - entry for entry in c)
+    x = lax.fori_loop(0, _NEWTON_STEPS, newton_step, start)
+    return tuple(map(mul, x, units))
+
+
+def _newton_step(
+    cones: Sequence[Cone], q: list[list[Scalar]], c: list[Scalar], x: Sequence[Scalar]
+) -> tuple[Scalar, ...]:
+    """Forces after one step of Newton's method with a line search.
+
+    With the derivative -L L^T of f, the step s solves s + L L^T Q s = f - x.
+    """
+    y = [add(entry, dot(row, x)) for entry, row in zip(c, q, strict=True)]
+    forces, factors = _response(cones, y)
+    lack = [sub(f, entry) for f, entry in zip(forces, x, strict=True)]
+    q_lack = [dot(row, lack) for row in q]
+    # Columns of L with the first entry's row, and Q L.
+    columns = [(3 * k, column) for k, factor in enumerate(factors) for column in factor]
+    q_columns = [[dot(row[k : k + 3], column) for row in q] for k, column in columns]
+    system = [[dot(column, of_q[k : k + 3]) for of_q in q_columns] for k, column in columns]
+    for i, row in enumerate(system):
+        row[i] = add(row[i], 1.0)
+    factor = stored(chain.cholesky(system))
+    pulls = [dot(column, q_lack[k : k + 3]) for k, column in columns]
+    z = chain.solve_upper(factor, chain.solve_lower(factor, pulls))
+    step, y_step = list(lack), list(q_lack)
+    for (k, column), of_q, size in zip(columns, q_columns, z, strict=True):
+        for i in range(3):
+            step[k + i] = sub(step[k + i], mul(column[i], size))
+        y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, of_q, strict=True)]
+    x, y, step, y_step = stored((list(x), y, step, y_step))
+    length = _line_search(cones, (x, y), (step, y_step))
+    return tuple(add(a, mul(length, b)) for a, b in zip(x, step, strict=True))
+
+
+def _line_search(
+    cones: Sequence[Cone],
+    start: tuple[list[Scalar], list[Scalar]],
+    step: tuple[list[Scalar], list[Scalar]],
+) -> Scalar:
+    """Length of a step of the forces x and the accelerations y to the minimum of MuJoCo's primal
+    objective along it: Newton's method on its slope, which increases, within a bracket."""
+    (x, y), (x_step, y_step) = start, step
+    own = dot(y_step, x_step)
+
+    def shorten(_, state: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+        length, low, high = state
+        forces, factors = _response(
+            cones, [add(a, mul(length, b)) for a, b in zip(y, y_step, strict=True)]
+        )
+        along = [add(a, mul(length, b)) for a, b in zip(x, x_step, strict=True)]
+        slope = dot(y_step, [sub(a, f) for a, f in zip(along, forces, strict=True)])
+        curvature = own
+        for k, factor in enumerate(factors):
+            for column in factor:
+                pull = dot(column, y_step[3 * k : 3 * k + 3])
+                curvature = add(curvature, mul(pull, pull))
+        low, high = jnp.where(slope < 0.0, length, low), jnp.where(slope < 0.0, high, length)
+        newton = length - slope / jnp.maximum(curvature, jnp.finfo(curvature.dtype).tiny)
+        inside = (newton > low) & (newton < high)
+        return jnp.where(inside, newton, 0.5 * (low + high)), low, high
+
+    one = own - own + 1.0
+    return lax.fori_loop(0, _SEARCH_STEPS, shorten, (one, one - 1.0, one + 1.0))[0]
+
+
+def _response(
+    cones: Sequence[Cone], y: Sequence[Scalar]
+) -> tuple[list[Scalar], list[tuple[Vec3, Vec3, Vec3]]]:
+    """f(y) [3 k], and for each contact the three columns of L."""
+    forces, factors = [], []
+    for k, cone in enumerate(cones):
+        respond = _of_ellipse if cone.elliptic else _of_pyramid
+        force, factor = respond(cone, tuple(y[3 * k : 3 * k + 3]))
+        forces += [jnp.where(cone.touches, f, 0.0) for f in force]
+        factors.append(
+            tuple(
+                tuple(x if is_constant(x) else jnp.where(cone.touches, x, 0.0) for x in column)
+                for column in factor
+            )
+        )
+    return forces, factors
+
+
+def _of_ellipse(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+    pull, a, b = y
+    squared = a * a + b * b
+    tiny = float(jnp.finfo(squared.dtype).tiny)
+    inverse = lax.rsqrt(jnp.maximum(squared, tiny))
+    size, u, v = squared * inverse, a * inverse, b * inverse
+    open_ = pull >= size
+    sticks = cone.normal * size <= -cone.tangential * pull
+    slips = ~(open_ | sticks)
+    normal_root, root = lax.rsqrt(cone.normal), lax.rsqrt(cone.tangential)
+    both_root = lax.rsqrt(cone.normal + cone.tangential)
+    pressure = (size - pull) * (both_root * both_root)
+
+    def chosen(stuck: Scalar, slipping: Scalar) -> Scalar:
+        return jnp.where(open_, 0.0, jnp.where(sticks, stuck, slipping))
+
+    force = (
+        chosen(-pull * (normal_root * normal_root), pressure),
+        chosen(-a * (root * root), -pressure * u),
+        chosen(-b * (root * root), -pressure * v),
+    )
+    squared = jnp.where(slips, (1.0 - pull * inverse), 1.0)
+    across = squared * lax.rsqrt(squared) * both_root
+    return force, (
+        (chosen(normal_root, both_root), chosen(0.0, -both_root * u), chosen(0.0, -both_root * v)),
+        (0.0, chosen(root, -across * v), chosen(0.0, across * u)),
+        (0.0, 0.0, chosen(root, 0.0)),
+    )
+
+
+def _of_pyramid(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+    pull, *tangential = y
+    root = lax.rsqrt(cone.tangential)
+    normal, forces, columns, both = 0.0, [], [], []
+    for a in tangential:
+        plus, minus = (jnp.maximum(-x, 0.0) * (root * root) for x in (pull + a, pull - a))
+        normal = add(normal, plus + minus)
+        forces.append(plus - minus)
+        p, m = (jnp.where(x > 0.0, 1.0, 0.0) for x in (plus, minus))
+        both.append(p * m)
+        columns.append(((p - m) * root, (p + m - (2.0 - _ROOT) * p * m) * root))
+    first, second = both
+    together = _ROOT * (first + second) - (2.0 * _ROOT - 2.0) * first * second
+    return (normal, *forces), (
+        (columns[0][0], columns[0][1], 0.0),
+        (columns[1][0], 0.0, columns[1][1]),
+        (together * root, 0.0, 0.0),
+    )
