@@ -91,7 +91,7 @@ class _Inputs(NamedTuple):
     targets: np.ndarray
     """Servo targets [N, substeps, nu]."""
     ball_push: np.ndarray
-    """Velocities [N, 3] that pushes add to the balls, m/s."""
+    """Velocities [N, 3 B] that pushes add to the balls, m/s."""
     air_drag: np.ndarray | None
     """Deceleration [N] of the balls by the air divided by their squared speed, 1/m."""
 
@@ -99,8 +99,10 @@ class _Inputs(NamedTuple):
 def _control_inputs(env: Env, control: Control) -> _Inputs:
     """Inputs from controls whose batch is last."""
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-    push = jnp.zeros((len(targets), 3)) if control.ball_push is None else control.ball_push.T
-    return _Inputs(targets, push, control.air_drag)
+    push = control.ball_push
+    if push is None:
+        push = jnp.zeros((3 * env.config.num_balls, len(targets)))
+    return _Inputs(targets, push.reshape(-1, len(targets)).T, control.air_drag)
 
 
 def _next_states(
@@ -114,13 +116,14 @@ def _next_states(
     if inputs.air_drag is None:
         trajectory, _ = pool.rollout(models, data, states, inputs.targets, control_spec=_CTRL)
         return trajectory[:, -1]
-    ball, ball_velocity = find_addresses(models[0]).ball_body, _ball_velocity(models[0])
-    drag = inputs.air_drag * [model.body_mass[ball] for model in models]
+    balls = [ball.body for ball in find_addresses(models[0]).balls]
+    ball_velocity = _ball_velocity(models[0])
+    drag = inputs.air_drag[:, None] * [model.body_mass[balls] for model in models]
     forces = np.zeros((len(states), models[0].nbody, 6))
     for targets in np.moveaxis(inputs.targets, 1, 0):
-        velocity = states[:, ball_velocity]
-        speed = np.linalg.norm(velocity, axis=1)
-        forces[:, ball, :3] = -(drag * speed)[:, None] * velocity
+        velocity = states[:, ball_velocity].reshape(len(states), -1, 3)
+        speed = np.linalg.norm(velocity, axis=2)
+        forces[:, balls, :3] = -(drag * speed)[:, :, None] * velocity
         control = np.concatenate([targets, forces.reshape(len(states), -1)], axis=1)[:, None]
         trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
         states = trajectory[:, 0]
@@ -128,8 +131,9 @@ def _next_states(
 
 
 def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Indices [3] of the ball's velocity in a state of mjSTATE_FULLPHYSICS."""
-    return np.array(find_addresses(mj_model).ball_qvel[:3]) + 1 + mj_model.nq
+    """Indices [3 B] of the balls' velocities in a state of mjSTATE_FULLPHYSICS."""
+    velocities = [ball.qvel[:3] for ball in find_addresses(mj_model).balls]
+    return np.concatenate(velocities) + 1 + mj_model.nq
 
 
 def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjModel]:

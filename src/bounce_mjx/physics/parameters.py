@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import allow_dry_friction
+from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.model import find_addresses
 
 Array = np.ndarray | jax.Array
@@ -227,7 +227,7 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     _assign(model, fields)
     _assign(model.opt, options)
     if parameters.frictionloss is not None:
-        allow_dry_friction(model.opt)
+        raise_solver_limits(model.opt)
     return model
 
 

@@ -126,7 +126,7 @@ class WorldConfig(StrictModel):
     num_balls: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)] = 1
     """Number of balls; those that the MJCF lacks are copies of its first one."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
-    """Ball position at a reset, before noise, m."""
+    """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
     reset: ResetConfig = ResetConfig()
     """The noise of a reset."""
     max_joint_velocity: Positive = 2.0 * math.pi
@@ -209,7 +209,7 @@ class WorldConfig(StrictModel):
     @property
     def layout(self) -> ObservationLayout:
         """The order of the entries of the observation."""
-        return self.observation.layout(self.num_joints)
+        return self.observation.layout(self.num_joints, self.num_balls)
 
     @property
     def commands(self) -> dict[str, Command]:
