@@ -55,13 +55,12 @@ WORLDS = {
 
 
 def sticking_and_sliding(
-    model: mujoco.MjModel, models: list[mujoco.MjModel]
+    models: list[mujoco.MjModel], states: States
 ) -> tuple[States, np.ndarray, np.ndarray]:
-    """States with torques up to 1.5 times the dry friction beyond all other forces; also the shares
-    of sticking joints and of pressed contacts in each."""
-    rng = np.random.default_rng(1)
-    states = touching_states(model, COUNT, seed=0)
-    slow = rng.uniform(size=(COUNT, 6)) < rng.choice([0.5, 1.0], (COUNT, 1))
+    """The states with torques up to 1.5 times the dry friction beyond all other forces; also the
+    shares of sticking joints and of pressed contacts in each."""
+    rng, count = np.random.default_rng(1), len(models)
+    slow = rng.uniform(size=(count, 6)) < rng.choice([0.5, 1.0], (count, 1))
     states.qvel[:, :6] *= np.where(slow, 10.0 ** rng.uniform(-7.0, -3.0, slow.shape), 1.0)
     sticking, pressed = [], []
     for m, qpos, qvel, ctrl in zip(models, *states, strict=True):
@@ -97,7 +96,8 @@ def test_one_step_with_dry_friction_is_mujocos(name, record_property, tmp_path, 
         converged(edited_model(model, jax.tree.map(lambda x, i=i: x[i], parameters)))
         for i in range(COUNT)
     ]
-    states, sticking, pressed = sticking_and_sliding(model, models)
+    states = touching_states(model, COUNT, seed=0)
+    states, sticking, pressed = sticking_and_sliding(models, states)
     mixed = (sticking > 0.0) & (sticking < 1.0)
     kinds = (sticking == 0.0, sticking == 1.0, mixed & pressed, mixed & ~pressed)
     assert min(map(np.sum, kinds)) >= 2

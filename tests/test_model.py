@@ -1,5 +1,7 @@
 """The robot's model: which MJCF files are refused, and which edits are noticed."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +11,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState, make_engine
-from bounce_mjx.robot.model import load_model
+from bounce_mjx.robot.model import find_addresses, load_model
 from test_physics import XML, edited
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
@@ -171,3 +173,72 @@ def test_a_solver_that_stops_early_is_named(name):
 @pytest.mark.parametrize("settings", [SOLVER, "", 'solver="PGS"', 'solver="CG" iterations="50"'])
 def test_a_solver_that_converges_gives_no_warning(settings):
     assert make_engine(edited(SOLVER, settings), "auto").warnings == ()
+
+
+def dropped(mj_model: mujoco.MjModel, *positions: tuple[float, float, float]):
+    """A run of C in which the arm holds the level paddle and the balls fall from `positions`: the
+    heights [1500, B] of the balls, and the pairs of geoms that touched."""
+    at, data = find_addresses(mj_model), mujoco.MjData(mj_model)
+    data.qpos[at.arm_qpos,] = data.ctrl[at.actuators,] = EnvConfig().default_joint_angles
+    for ball, position in zip(at.balls, positions, strict=True):
+        data.qpos[ball.qpos[:3],] = position
+    heights, touched = [], set()
+    for _ in range(1500):
+        mujoco.mj_step(mj_model, data)
+        heights.append([data.qpos[ball.qpos[2]] for ball in at.balls])
+        touched |= {frozenset(map(int, pair)) for pair in data.contact.geom}
+    return np.array(heights), touched
+
+
+@pytest.mark.parametrize("num_balls", [2, 3])
+def test_further_balls_bounce_and_touch_each_other(num_balls):
+    model = load_model(None, 0.001, num_balls=num_balls)
+    at = find_addresses(model)
+    x, y, z = EnvConfig().ball_init_pos
+    # Each ball falls slower than the paddle returns it, and meets the one below in the air.
+    drops = [(x, y, z - 0.2 + 0.15 * i) for i in range(num_balls)]
+    heights, touched = dropped(model, *drops)
+    geoms = [ball.geom for ball in at.balls]
+    assert frozenset((at.paddle_geom, geoms[0])) in touched
+    assert {frozenset(pair) for pair in itertools.pairwise(geoms)} <= touched
+    assert model.nq == 6 + 7 * num_balls and at.balls[-1].qpos[-1] == model.nq - 1
+    # Apart from the others, each falls and bounces as the ball of the shipped model does.
+    apart = [(x + 0.02 * i, y + 0.05 * (i - 1), z) for i in range(num_balls)]
+    heights, touched = dropped(model, *apart)
+    alone = load_model(None, 0.001)
+    for i, position in enumerate(apart):
+        expected, _ = dropped(alone, position)
+        assert np.ptp(expected[200:]) > 0.2
+        np.testing.assert_allclose(heights[:400, i], expected[:400, 0], atol=1e-3)
+
+
+OWN_BALL = (
+    "</worldbody>",
+    '<body name="ball_link2"><freejoint/><geom name="mine" size="0.03" mass="0.01"/></body>'
+    "</worldbody>",
+)
+OWN_PAIRS = ("</contact>", '<pair geom1="mine" geom2="ball" solref="-500 -5"/></contact>')
+
+
+def test_a_ball_of_the_mjcf_stays_as_it_is(tmp_path):
+    text = XML
+    for old, new in (OWN_BALL, OWN_PAIRS):
+        text = text.replace(old, new, 1)
+    mjcf = tmp_path / "robot.xml"
+    mjcf.write_text(text)
+    model = load_model(mjcf, 0.001, num_balls=3)
+    first, own, third = find_addresses(model).balls
+    assert [model.geom_size[ball.geom, 0] for ball in (first, own, third)] == [0.019, 0.03, 0.019]
+    names = [
+        {model.geom(int(geom)).name for geom in geoms}
+        for geoms in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    ]
+    assert sorted(map(sorted, names)) == [
+        ["ball", "ball3"], ["ball", "blocker"], ["ball", "mine"], ["ball3", "blocker"],
+        ["ball3", "mine"],
+    ]  # fmt: skip
+    assert model.pair_solref[names.index({"ball", "mine"})].tolist() == [-500.0, -5.0]
+    assert model.pair_solref[names.index({"ball", "ball3"})].tolist() == [-98696.0, -31.4]
+    with pytest.raises(UserError, match="2 balls .*but num_balls is 1; set it to 2") as error:
+        load_model(mjcf, 0.001)
+    assert str(mjcf) in str(error.value)

@@ -114,13 +114,18 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
 
     Raises:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is no hinge with a
-        servo, or a command has the name of a measurement.
+        servo, a command has the name of a measurement, or there are several balls.
     """
     env = config.env
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
             f"the command {min(taken)} has the name of a measurement; give it another name in "
             f"the task {env.task.__name__}"
+        )
+    if env.num_balls > 1:
+        raise UserError(
+            f"the policy sees {env.num_balls} balls, but a deployed policy measures one; export a "
+            "policy with num_balls 1"
         )
     m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)

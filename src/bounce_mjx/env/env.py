@@ -1,6 +1,6 @@
 """`Env`: one environment, which is a world and a task."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +19,9 @@ from bounce_mjx.physics import (
     make_engine,
 )
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
+    BallAddresses,
     check_unedited,
     find_addresses,
     fingerprint,
@@ -106,6 +108,12 @@ class Env:
         """
         self.config = config
         self.task: Task = config.task(config)
+        if config.num_balls not in self.task.num_balls:
+            takes = " or ".join(map(str, self.task.num_balls))
+            raise UserError(
+                f"num_balls is {config.num_balls}, but the task {type(self.task).__name__} takes "
+                f"{takes}; set num_balls to {takes}"
+            )
         self.mj_model: mujoco.MjModel = world_model(config)
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
@@ -207,7 +215,7 @@ class Env:
         ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
         # One draw for all numbers: splitting keys for separate draws would cost more than the
         # draws.
-        size = 2 * self.action_size + 3
+        size = 2 * self.action_size + 3 * self.config.num_balls
         count = size + len(commands) + self.task.num_draws
         draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
         own = 0.5 * (draws[size + len(commands) :] + 1.0)
@@ -246,38 +254,49 @@ class Env:
     def _first_physics(
         self, draws: jax.Array, world: World, thrown: tuple[jax.Array, jax.Array] | None
     ) -> PhysicsState:
-        """The arm and the ball at a reset.
+        """The arm and the balls at a reset.
 
         Args:
           draws: numbers from -1 to 1 for the angle and the velocity of each joint, and for the
-            ball's position [2 n + 3].
-          thrown: the task's position and velocity [3] of the ball.
+            balls' positions [2 n + 3 B].
+          thrown: the task's position and velocity of the ball [3], or of the balls [B, 3].
         """
         config, addresses, n = self.config, self._addresses, self.action_size
         dtype = draws.dtype
-        position, velocity = (config.ball_init_pos, ()) if thrown is None else thrown
         qpos = [jnp.asarray(q, dtype) for q in self.mj_model.qpos0]
         qvel = [jnp.zeros((), dtype)] * self.mj_model.nv
         for i, angle in enumerate(config.default_joint_angles):
             qpos[addresses.arm_qpos[i]] = angle + config.reset.joint_angles * draws[i]
             qvel[addresses.arm_qvel[i]] = config.reset.joint_velocities * draws[n + i]
-        for i, component in enumerate(velocity):
-            qvel[addresses.ball_qvel[i]] = component
-        for i, coordinate in enumerate(position):
-            qpos[addresses.ball_qpos[i]] = (
-                coordinate + config.reset.ball_position * draws[2 * n + i]
-            )
-        for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
-            qpos[addresses.ball_qpos[3 + i]] = jnp.asarray(component, dtype)
+        for k, (ball, position, velocity) in enumerate(self._ball_starts(thrown)):
+            for i, component in enumerate(velocity):
+                qvel[ball.qvel[i]] = component
+            for i, coordinate in enumerate(position):
+                noise_of_ball = config.reset.ball_position * draws[2 * n + 3 * k + i]
+                qpos[ball.qpos[i]] = coordinate + noise_of_ball
+            for i, component in enumerate((1.0, 0.0, 0.0, 0.0)):
+                qpos[ball.qpos[3 + i]] = jnp.asarray(component, dtype)
         for term, entries in (
             ("joint_start", addresses.arm_qpos),
-            ("ball_start", addresses.ball_qpos[:3]),
+            *(("ball_start", ball.qpos[:3]) for ball in addresses.balls),
         ):
             for i, entry in enumerate(entries if term in world else ()):
                 qpos[entry] = qpos[entry] + world[term][i]
         return PhysicsState(
             jnp.stack(qpos), jnp.stack(qvel), resting_activations(self.mj_model, qpos)
         )
+
+    def _ball_starts(
+        self, thrown: tuple[jax.Array, jax.Array] | None
+    ) -> list[tuple[BallAddresses, Sequence[Any], Sequence[Any]]]:
+        """Each ball with its position (m) and velocity (m/s) at a reset, before noise."""
+        balls = self._addresses.balls
+        if thrown is None:
+            x, y, z = self.config.ball_init_pos
+            return [(ball, (x, y, z + BALLS_APART * i), ()) for i, ball in enumerate(balls)]
+        if len(balls) == 1:
+            return [(balls[0], *thrown)]
+        return [(ball, *(x[i] for x in thrown)) for i, ball in enumerate(balls)]
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [n], clipped to [-1, 1]."""
@@ -308,7 +327,12 @@ class Env:
             control = control._replace(air_drag=world["air_drag"])
         if "push_speed" in world:
             push = actuation.push(
-                world, memory.counter, memory.phases[1], memory.step, config.control_dt
+                world,
+                memory.counter,
+                memory.phases[1],
+                memory.step,
+                config.control_dt,
+                config.num_balls,
             )
             control = control._replace(ball_push=push)
         command = before.command
@@ -425,13 +449,18 @@ class Env:
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
         addresses, (qpos, qvel) = self._addresses, (state.physics.qpos, state.physics.qvel)
+
+        def of_balls(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
+            rows = [jnp.stack([coordinates[i] for i in row]) for row in entries]
+            return rows[0] if len(rows) == 1 else jnp.stack(rows)
+
         return Kinematics(
             joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos]),
-            ball_position=jnp.stack([qpos[i] for i in addresses.ball_qpos[:3]]),
-            ball_quaternion=jnp.stack([qpos[i] for i in addresses.ball_qpos[3:]]),
+            ball_position=of_balls(qpos, [ball.qpos[:3] for ball in addresses.balls]),
+            ball_quaternion=of_balls(qpos, [ball.qpos[3:] for ball in addresses.balls]),
             joint_velocities=jnp.stack([qvel[i] for i in addresses.arm_qvel]),
-            ball_velocity=jnp.stack([qvel[i] for i in addresses.ball_qvel[:3]]),
-            ball_angular_velocity=jnp.stack([qvel[i] for i in addresses.ball_qvel[3:]]),
+            ball_velocity=of_balls(qvel, [ball.qvel[:3] for ball in addresses.balls]),
+            ball_angular_velocity=of_balls(qvel, [ball.qvel[3:] for ball in addresses.balls]),
             paddle_position=self.engine.paddle_position(state.parameters, qpos),
         )
 
@@ -444,7 +473,10 @@ class Env:
         command = _entries(state.command)
         if state.memory is None or state.memory.sensing is None:
             truth = self.kinematics(state) if truth is None else truth
-            return self.layout.pack(truth._asdict() | command)
+            values = truth._asdict() | command
+            if self.config.num_balls > 1:
+                values = {name: _flat(value) for name, value in values.items()}
+            return self.layout.pack(values)
         seen = dict(state.memory.sensing.seen)
         # A command may have been set since the last step.
         for name in command.keys() & seen.keys():
@@ -500,7 +532,7 @@ class Env:
         past = memory.sensing
         if past is None:
             return memory
-        ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
+        ball = sensing.position_and_velocity(truth)
         balls = jnp.concatenate([ball[None], past.balls[:-1]])
         picture = self._picture(state.world, balls, past.picture, memory)
         angles, measured = self._measured(state, truth, memory, picture)
@@ -584,13 +616,15 @@ class Env:
         return {
             name if value.ndim == 0 else f"{name}_{i}": entry
             for name, value in named.items()
-            for i, entry in enumerate(value if value.ndim else (value,))
+            for i, entry in enumerate(_flat(value) if value.ndim else (value,))
         }
 
 
 def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     """Compiles the model of a world; `visual` and the errors are those of `load_model`."""
-    mj_model = load_model(config.mjcf, config.physics_dt, visual, config.robot)
+    mj_model = load_model(
+        config.mjcf, config.physics_dt, visual, config.robot, num_balls=config.num_balls
+    )
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
@@ -600,6 +634,11 @@ def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
     """The metrics of a task's step, each []."""
     numbers = {name: jnp.asarray(value, dtype) for name, value in done.metrics.items()}
     return {f"reward/{name}": value for name, value in done.reward.items()} | numbers
+
+
+def _flat(value: jax.Array) -> jax.Array:
+    """The entries of a value in one axis."""
+    return jnp.ravel(value) if value.ndim > 1 else value
 
 
 def _entries(command: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -70,7 +70,7 @@ def make_mujoco_evaluator(
                 actions, states, *inputs = decide(policy, states)
                 targets, push, air_drag = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
                 if push is not None:
-                    simulated[:, ball_velocity] += push.T
+                    simulated[:, ball_velocity] += push.reshape(-1, episodes).T
                 simulated = _next_states(pool, models, data, simulated, targets, air_drag)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
@@ -102,13 +102,14 @@ def _next_states(
     if air_drag is None:
         trajectory, _ = pool.rollout(models, data, states, targets, control_spec=_CTRL)
         return trajectory[:, -1]
-    ball, ball_velocity = find_addresses(models[0]).ball_body, _ball_velocity(models[0])
-    drag = air_drag * [model.body_mass[ball] for model in models]
+    balls = [ball.body for ball in find_addresses(models[0]).balls]
+    ball_velocity = _ball_velocity(models[0])
+    drag = air_drag[:, None] * [model.body_mass[balls] for model in models]
     forces = np.zeros((len(states), models[0].nbody, 6))
     for target in np.moveaxis(targets, 1, 0):
-        velocity = states[:, ball_velocity]
-        speed = np.linalg.norm(velocity, axis=1)
-        forces[:, ball, :3] = -(drag * speed)[:, None] * velocity
+        velocity = states[:, ball_velocity].reshape(len(states), -1, 3)
+        speed = np.linalg.norm(velocity, axis=2)
+        forces[:, balls, :3] = -(drag * speed)[:, :, None] * velocity
         control = np.concatenate([target, forces.reshape(len(states), -1)], axis=1)[:, None]
         trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
         states = trajectory[:, 0]
@@ -116,8 +117,9 @@ def _next_states(
 
 
 def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Indices [3] of the ball's velocity in a state of mjSTATE_FULLPHYSICS."""
-    return np.array(find_addresses(mj_model).ball_qvel[:3]) + 1 + mj_model.nq
+    """Indices [3 B] of the balls' velocities in a state of mjSTATE_FULLPHYSICS."""
+    velocities = [ball.qvel[:3] for ball in find_addresses(mj_model).balls]
+    return np.concatenate(velocities) + 1 + mj_model.nq
 
 
 def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjModel]:

@@ -27,9 +27,9 @@ class Control(NamedTuple):
     lag: Any = None
     """Time constant [] of the lags in physics steps."""
     air_drag: Any = None
-    """Deceleration of the ball by the air divided by its squared speed [], 1/m."""
+    """Deceleration of a ball by the air divided by its squared speed [], 1/m."""
     ball_push: Any = None
-    """Velocity [3] added to the ball's before the first step, m/s."""
+    """Velocity [3] added to the ball's before the first step, m/s; [B, 3] with several balls."""
 
 
 def servo_target(control: Control, step: Scalar) -> Scalar:

@@ -29,7 +29,7 @@ class MjxModel(NamedTuple):
 
     model: mjx.Model
     frictional: mjx.Model
-    """`model` with a frictional contact pair; MJX cannot change a pair's dimension later."""
+    """`model` with frictional contact pairs; MJX cannot change a pair's dimension later."""
     mj_model: mujoco.MjModel
     """Source of both models."""
     addresses: Addresses
@@ -46,7 +46,7 @@ def read_model(mj_model: mujoco.MjModel) -> MjxModel:
 
 
 def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Copy of the model with sliding friction in the contact pair of ball and paddle, if any."""
+    """Copy of the model with sliding friction in the contact pairs of ball and paddle, if any."""
     model = copy.copy(mj_model)
     with contextlib.suppress(UserError):
         fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
@@ -148,15 +148,16 @@ def step(
     num_substeps: int = 1,
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps."""
-    addresses = constants.addresses
-    ball_velocity = np.array(addresses.ball_qvel[:3])
+    balls = constants.addresses.balls
+    velocities = [np.array(ball.qvel[:3]) for ball in balls]
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
-        if control.air_drag is not None:
-            acceleration = jnp.stack(drag(control.air_drag, data.qvel[ball_velocity]))
-            force = model.body_mass[addresses.ball_body] * acceleration
-            applied = data.xfrc_applied.at[addresses.ball_body, :3].set(force)
+        braked = [] if control.air_drag is None else zip(balls, velocities, strict=True)
+        for ball, velocity in braked:
+            acceleration = jnp.stack(drag(control.air_drag, data.qvel[velocity]))
+            force = model.body_mass[ball.body] * acceleration
+            applied = data.xfrc_applied.at[ball.body, :3].set(force)
             data = data.replace(xfrc_applied=applied)
         return mjx.step(_with_saturated_servos(model, constants, data), data)
 
@@ -164,7 +165,8 @@ def step(
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
-            data = data.replace(qvel=data.qvel.at[ball_velocity].add(control.ball_push))
+            pushed = np.concatenate(velocities)
+            data = data.replace(qvel=data.qvel.at[pushed].add(jnp.ravel(control.ball_push)))
         if state.act is not None:
             data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import allow_dry_friction
+from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.model import find_addresses
 
 Array = np.ndarray | jax.Array
@@ -28,16 +28,16 @@ class PhysicsParameters(NamedTuple):
     """
 
     ball_mass: Array | None = None
-    """Mass [] of the ball, kg; its inertia scales in proportion."""
+    """Mass [] of each ball, kg; its inertia scales in proportion."""
     ball_radius: Array | None = None
-    """Radius [] of the ball, m; its mass stays the same, its inertia scales with the square."""
+    """Radius [] of each ball, m; its mass stays the same, its inertia scales with the square."""
     contact_stiffness: Array | None = None
-    """Stiffness [] of the contact, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
+    """Stiffness [] of the contacts, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
     contact_damping: Array | None = None
-    """Damping [] of the contact, 1/s: b of `solref="-k -b"`."""
+    """Damping [] of the contacts, 1/s: b of `solref="-k -b"`."""
     contact_friction: Array | None = None
-    """Coefficient [] of sliding friction between ball and paddle; it turns a frictionless pair into
-    one with `condim="3"`."""
+    """Coefficient [] of sliding friction between ball and paddle, and between balls; it turns a
+    frictionless pair into one with `condim="3"`."""
     servo_gain: Array | None = None
     """Stiffness [n] of the position servos, N m/rad: `kp`."""
     servo_damping: Array | None = None
@@ -112,59 +112,97 @@ def edited_fields(
     link's share of the softness, a thousandth of the sum, keeps its value of the unedited model. So
     does `dof_invweight0`, which scales the softness of dry friction.
     """
-    m, addresses, p = mj_model, find_addresses(mj_model), parameters
+    edited = _Fields(mj_model)
+    _edit_balls(edited, parameters)
+    _edit_contacts(edited, parameters)
+    _edit_arm(edited, parameters)
+    p, paddle = parameters, find_addresses(mj_model).paddle_geom
+    if p.ball_mass is not None or p.link_mass is not None:
+        mass = edited.current("body_mass")
+        edited.fields["body_subtreemass"] = _subtree_masses(mj_model, mass)
+    if p.paddle_position is not None:
+        edited.put("geom_pos", paddle, p.paddle_position)
+    if p.paddle_rotation is not None:
+        edited.put("geom_quat", paddle, p.paddle_rotation)
+    if p.paddle_position is not None or p.paddle_rotation is not None:
+        # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
+        edited.put("geom_sameframe", paddle, int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE))
+    return edited.fields, {} if p.gravity is None else {"gravity": p.gravity}
+
+
+class _Fields:
+    """New arrays for some fields of a model."""
+
+    def __init__(self, mj_model: mujoco.MjModel):
+        self.model = mj_model
+        self.fields: dict[str, Array] = {}
+
+    def current(self, field: str) -> Array:
+        return self.fields.get(field, getattr(self.model, field))
+
+    def put(self, field: str, index, value) -> None:
+        self.fields[field] = _replaced(self.current(field), index, value)
+
+    def scale(self, field: str, index, factor) -> None:
+        self.put(field, index, self.current(field)[index] * factor)
+
+
+def _edit_balls(edited: _Fields, p: PhysicsParameters) -> None:
+    m = edited.model
+    for ball in find_addresses(m).balls:
+        if p.ball_mass is not None:
+            ratio = p.ball_mass / m.body_mass[ball.body]
+            edited.put("body_mass", ball.body, p.ball_mass)
+            edited.scale("body_inertia", ball.body, ratio)
+            edited.scale("body_invweight0", ball.body, 1.0 / ratio)
+        if p.ball_radius is not None:
+            ratio = (p.ball_radius / m.geom_size[ball.geom, 0]) ** 2
+            edited.put("geom_size", (ball.geom, 0), p.ball_radius)
+            edited.put("geom_rbound", ball.geom, p.ball_radius)
+            edited.put("geom_aabb", (ball.geom, slice(3, 6)), p.ball_radius)
+            edited.scale("body_inertia", ball.body, ratio)
+            edited.scale("body_invweight0", (ball.body, 1), 1.0 / ratio)
+        if p.ball_mass is not None or p.ball_radius is not None:
+            # MuJoCo stores the constant inertia matrix of a free body, here the ball, in the model.
+            mass, inertia = (edited.current(x)[ball.body] for x in ("body_mass", "body_inertia"))
+            edited.put("dof_M0", np.array(ball.qvel[:3]), mass)
+            edited.put("dof_M0", np.array(ball.qvel[3:]), inertia)
+
+
+def _edit_contacts(edited: _Fields, p: PhysicsParameters) -> None:
+    if p.contact_stiffness is None and p.contact_damping is None and p.contact_friction is None:
+        return
+    m = edited.model
+    for pair in contact_pairs(m):
+        if p.contact_stiffness is not None or p.contact_damping is not None:
+            stiffness, damping = to_direct_solref(m.pair_solref[pair], m.opt.timestep)
+            edited.put("pair_solref", (pair, 0), -_given(p.contact_stiffness, float(stiffness)))
+            edited.put("pair_solref", (pair, 1), -_given(p.contact_damping, float(damping)))
+        if p.contact_friction is not None:
+            edited.put("pair_dim", pair, max(3, int(m.pair_dim[pair])))
+            numpy = jnp if isinstance(p.contact_friction, jax.Array) else np
+            friction = numpy.maximum(p.contact_friction, MIN_FRICTION)
+            edited.put("pair_friction", (pair, slice(0, 2)), friction)
+
+
+def _edit_arm(edited: _Fields, p: PhysicsParameters) -> None:
+    m, addresses = edited.model, find_addresses(edited.model)
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
-    ball, ball_geom, paddle = addresses.ball_body, addresses.ball_geom, addresses.paddle_geom
-    fields: dict[str, Array] = {}
-
-    def current(field: str) -> Array:
-        return fields.get(field, getattr(m, field))
-
-    def put(field: str, index, value) -> None:
-        fields[field] = _replaced(current(field), index, value)
-
-    if p.ball_mass is not None:
-        ratio = p.ball_mass / m.body_mass[ball]
-        put("body_mass", ball, p.ball_mass)
-        put("body_inertia", ball, current("body_inertia")[ball] * ratio)
-        put("body_invweight0", ball, current("body_invweight0")[ball] / ratio)
-    if p.ball_radius is not None:
-        ratio = (p.ball_radius / m.geom_size[ball_geom, 0]) ** 2
-        put("geom_size", (ball_geom, 0), p.ball_radius)
-        put("geom_rbound", ball_geom, p.ball_radius)
-        put("geom_aabb", (ball_geom, slice(3, 6)), p.ball_radius)
-        put("body_inertia", ball, current("body_inertia")[ball] * ratio)
-        put("body_invweight0", (ball, 1), current("body_invweight0")[ball, 1] / ratio)
-    if p.ball_mass is not None or p.ball_radius is not None:
-        # MuJoCo stores the constant inertia matrix of a free body, here the ball, in the model.
-        put("dof_M0", np.array(addresses.ball_qvel[:3]), current("body_mass")[ball])
-        put("dof_M0", np.array(addresses.ball_qvel[3:]), current("body_inertia")[ball])
-    if p.contact_stiffness is not None or p.contact_damping is not None:
-        stiffness, damping = direct_solref(m)
-        pair = contact_pair(m)
-        put("pair_solref", (pair, 0), -_given(p.contact_stiffness, stiffness))
-        put("pair_solref", (pair, 1), -_given(p.contact_damping, damping))
-    if p.contact_friction is not None:
-        pair = contact_pair(m)
-        put("pair_dim", pair, max(3, int(m.pair_dim[pair])))
-        numpy = jnp if isinstance(p.contact_friction, jax.Array) else np
-        friction = numpy.maximum(p.contact_friction, MIN_FRICTION)
-        put("pair_friction", (pair, slice(0, 2)), friction)
     if p.servo_gain is not None:
-        put("actuator_gainprm", (servos, 0), p.servo_gain)
-        put("actuator_biasprm", (servos, 1), -p.servo_gain)
+        edited.put("actuator_gainprm", (servos, 0), p.servo_gain)
+        edited.put("actuator_biasprm", (servos, 1), -p.servo_gain)
     if p.servo_damping is not None:
-        put("actuator_biasprm", (servos, 2), -p.servo_damping)
+        edited.put("actuator_biasprm", (servos, 2), -p.servo_damping)
     if p.force_limit is not None:
-        put("actuator_forcelimited", servos, True)
-        put("actuator_forcerange", (servos, 0), -p.force_limit)
-        put("actuator_forcerange", (servos, 1), p.force_limit)
+        edited.put("actuator_forcelimited", servos, True)
+        edited.put("actuator_forcerange", (servos, 0), -p.force_limit)
+        edited.put("actuator_forcerange", (servos, 1), p.force_limit)
     if p.armature is not None:
-        put("dof_armature", dofs, p.armature)
+        edited.put("dof_armature", dofs, p.armature)
     if p.damping is not None:
-        put("dof_damping", dofs, p.damping)
+        edited.put("dof_damping", dofs, p.damping)
     if p.frictionloss is not None:
-        put("dof_frictionloss", dofs, p.frictionloss)
+        edited.put("dof_frictionloss", dofs, p.frictionloss)
     if p.link_mass is not None:
         links = link_bodies(m)
         bodies = np.concatenate(links)
@@ -172,19 +210,8 @@ def edited_fields(
         moved = m.body_mass[bodies] > 0.0
         bodies, joints = bodies[moved], joints[moved]
         mass, old_mass = p.link_mass[joints], link_masses(m)[joints]
-        ratio = (mass / old_mass)[:, None]
-        put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
-        put("body_inertia", bodies, current("body_inertia")[bodies] * ratio)
-    if p.ball_mass is not None or p.link_mass is not None:
-        fields["body_subtreemass"] = _subtree_masses(m, current("body_mass"))
-    if p.paddle_position is not None:
-        put("geom_pos", paddle, p.paddle_position)
-    if p.paddle_rotation is not None:
-        put("geom_quat", paddle, p.paddle_rotation)
-    if p.paddle_position is not None or p.paddle_rotation is not None:
-        # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
-        put("geom_sameframe", paddle, int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE))
-    return fields, {} if p.gravity is None else {"gravity": p.gravity}
+        edited.put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
+        edited.scale("body_inertia", bodies, (mass / old_mass)[:, None])
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:
@@ -200,7 +227,7 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     _assign(model, fields)
     _assign(model.opt, options)
     if parameters.frictionloss is not None:
-        allow_dry_friction(model.opt)
+        raise_solver_limits(model.opt)
     return model
 
 
@@ -244,16 +271,28 @@ def to_direct_solref(solref: Array, timestep: float, xp: ModuleType = np) -> tup
 
 
 def contact_pair(mj_model: mujoco.MjModel) -> int:
-    """Index of the contact pair of ball and paddle."""
+    """Index of the contact pair of the first ball and the paddle."""
+    return contact_pairs(mj_model)[0]
+
+
+def contact_pairs(mj_model: mujoco.MjModel) -> list[int]:
+    """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle first.
+
+    Raises:
+      UserError: it has no pair.
+    """
     addresses = find_addresses(mj_model)
-    for pair in range(mj_model.npair):
-        geoms = {int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair])}
-        if geoms == {addresses.ball_geom, addresses.paddle_geom}:
-            return pair
-    raise UserError(
-        "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
-        "contact_damping and contact_friction change; add <pair> to <contact>"
-    )
+    geoms = {addresses.paddle_geom, *(ball.geom for ball in addresses.balls)}
+    both = zip(mj_model.pair_geom1.tolist(), mj_model.pair_geom2.tolist(), strict=True)
+    pairs = [set(pair) for pair in both]
+    first = {addresses.paddle_geom, addresses.ball_geom}
+    if first not in pairs:
+        raise UserError(
+            "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
+            "contact_damping and contact_friction change; add <pair> to <contact>"
+        )
+    own = [i for i, pair in enumerate(pairs) if pair <= geoms]
+    return sorted(own, key=lambda i: pairs[i] != first)
 
 
 def _given(value: Array | None, default: float) -> Array | float:

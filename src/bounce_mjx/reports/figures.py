@@ -181,7 +181,7 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""
         label = literal(f"{name}{constant}")
         axes.plot(time, heights, color=_COLOURS[(2 + i) % len(_COLOURS)], label=label)
-    axes.plot(time, recording.ball[:steps, 2, 0], color=_COLOURS[0], label="ball")
+    axes.plot(time, recording.ball[:steps, ..., 2, 0], color=_COLOURS[0], label="ball")
     axes.plot(time, recording.paddle[:steps, 2, 0], color=_COLOURS[1], label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
     if axes.dataLim.y0 >= 0.0:

@@ -29,6 +29,7 @@ _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 _HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
+_RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _SILENCE = threading.Lock()
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -440,7 +441,7 @@ class _Builder:
         if differing:
             self._changes.append(f"replaced the physics options by the task's ({differing})")
         if np.any(self._model.dof_frictionloss):
-            allow_dry_friction(scene.option)
+            raise_solver_limits(scene.option)
         arm.option = scene.option
         with _silent():
             scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
@@ -581,11 +582,11 @@ def _is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
     return body in ancestors
 
 
-def allow_dry_friction(option: mujoco.MjOption) -> None:
+def raise_solver_limits(option: mujoco.MjOption) -> None:
     """Raises the limits of MuJoCo's solver to MuJoCo's defaults, in place.
 
-    The shipped limits suffice for a frictionless contact. With dry friction, the solver would stop
-    before it converges.
+    The shipped limits suffice for one frictionless contact. With dry friction or several contacts,
+    the solver would stop before it converges.
     """
     default = mujoco.MjOption()
     option.iterations = max(option.iterations, default.iterations)

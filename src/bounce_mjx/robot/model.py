@@ -20,8 +20,20 @@ from bounce_mjx.robot.arm import (
     locate,
     read_spec,
 )
+from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
+
+
+class BallAddresses(NamedTuple):
+    """Indices of one ball in the arrays of the model."""
+
+    body: int
+    geom: int
+    qpos: tuple[int, ...]
+    """Position (3) and quaternion (4) in qpos."""
+    qvel: tuple[int, ...]
+    """Linear (3) and angular (3) velocity in qvel."""
 
 
 class Addresses(NamedTuple):
@@ -36,13 +48,28 @@ class Addresses(NamedTuple):
     """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
     """Servos of the acting joints in ctrl."""
-    ball_body: int
-    ball_geom: int
-    ball_qpos: tuple[int, ...]
-    """The ball's position (3) and quaternion (4) in qpos."""
-    ball_qvel: tuple[int, ...]
-    """The ball's linear (3) and angular (3) velocity in qvel."""
+    balls: tuple[BallAddresses, ...]
     paddle_geom: int
+
+    @property
+    def ball_body(self) -> int:
+        """Body of the first ball."""
+        return self.balls[0].body
+
+    @property
+    def ball_geom(self) -> int:
+        """Geom of the first ball."""
+        return self.balls[0].geom
+
+    @property
+    def ball_qpos(self) -> tuple[int, ...]:
+        """Position (3) and quaternion (4) of the first ball in qpos."""
+        return self.balls[0].qpos
+
+    @property
+    def ball_qvel(self) -> tuple[int, ...]:
+        """Linear (3) and angular (3) velocity of the first ball in qvel."""
+        return self.balls[0].qvel
 
 
 def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
@@ -74,6 +101,7 @@ def load_model(
     physics_dt: float,
     visual: bool = True,
     robot: RobotConfig | None = None,
+    num_balls: int = 1,
 ) -> mujoco.MjModel:
     """Compiles an MJCF file.
 
@@ -83,12 +111,14 @@ def load_model(
       visual: False drops the textures and geoms that only pictures need; they take most of a
         model's memory.
       robot: the adoption of an arm; None for an MJCF file that is a whole scene.
+      num_balls: 1 to 3; the balls that the file lacks are copies of its first one.
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
-        without a position servo, or has a number that cannot be simulated.
+        without a position servo, more balls than `num_balls`, or a number that cannot be simulated.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
+    add_balls(spec, num_balls)
     # MuJoCo does not drop geoms that make the bodies' inertia.
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if not visual and spec.compiler.inertiafromgeom != from_geoms:
@@ -96,7 +126,9 @@ def load_model(
     mj_model = compile_spec(spec, path)
     try:
         check_numbers(mj_model)
-        _check_servos(mj_model, find_addresses(mj_model))
+        addresses = find_addresses(mj_model)
+        _check_servos(mj_model, addresses)
+        _check_balls(len(addresses.balls), num_balls)
     except UserError as error:
         raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
@@ -120,6 +152,15 @@ def paddle_home(
     mujoco.mj_kinematics(mj_model, data)
     x, y, z = (round(float(c), 4) for c in data.geom_xpos[addresses.paddle_geom])
     return x, y, z
+
+
+def _check_balls(present: int, num_balls: int) -> None:
+    if present != num_balls:
+        names = ", ".join(map(ball_name, range(present)))
+        raise UserError(
+            f"{present} balls ({names}), but num_balls is {num_balls}; set it to {present}, or "
+            "rename the others' bodies"
+        )
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -164,28 +205,40 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
-    ball_body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, BALL_BODY_NAME)
+    balls = [_find_ball(mj_model, BALL_BODY_NAME)]
+    while len(balls) < MAX_BALLS and _has_body(mj_model, ball_name(len(balls))):
+        balls.append(_find_ball(mj_model, ball_name(len(balls))))
     paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
-
-    ball_joint = mj_model.body_jntadr[ball_body]
-    if ball_joint < 0 or mj_model.jnt_type[ball_joint] != mujoco.mjtJoint.mjJNT_FREE:
-        raise UserError(f"no free joint on the body {BALL_BODY_NAME}; add <freejoint/> to it")
-    if mj_model.body_geomnum[ball_body] < 1:
-        raise UserError(f"no geom on the body {BALL_BODY_NAME}; add the ball's sphere to it")
     servos = _servos(mj_model)
     joints = tuple(servos)
-    ball_qpos, ball_qvel = mj_model.jnt_qposadr[ball_joint], mj_model.jnt_dofadr[ball_joint]
     return Addresses(
         arm_joints=joints,
         arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
         arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
         actuators=tuple(servos.values()),
-        ball_body=ball_body,
-        ball_geom=_ball_geom(mj_model, ball_body),
-        ball_qpos=tuple(range(ball_qpos, ball_qpos + 7)),
-        ball_qvel=tuple(range(ball_qvel, ball_qvel + 6)),
+        balls=tuple(balls),
         paddle_geom=paddle_geom,
     )
+
+
+def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
+    body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
+    joint = mj_model.body_jntadr[body]
+    if joint < 0 or mj_model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise UserError(f"no free joint on the body {name}; add <freejoint/> to it")
+    if mj_model.body_geomnum[body] < 1:
+        raise UserError(f"no geom on the body {name}; add the ball's sphere to it")
+    qpos, qvel = int(mj_model.jnt_qposadr[joint]), int(mj_model.jnt_dofadr[joint])
+    return BallAddresses(
+        body=body,
+        geom=_ball_geom(mj_model, body),
+        qpos=tuple(range(qpos, qpos + 7)),
+        qvel=tuple(range(qvel, qvel + 6)),
+    )
+
+
+def _has_body(mj_model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
 
 
 def joint_name(mj_model: mujoco.MjModel, joint: int) -> str:

@@ -94,6 +94,8 @@ class Task:
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
     """What a training logs and a report draws of the metrics; the first is the progress line's."""
+    num_balls: ClassVar[tuple[int, ...]] = (1,)
+    """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset draws for the task."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
@@ -114,7 +116,8 @@ class Task:
 
     def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
-        terms of the randomisation; None for a ball at rest at `ball_init_pos`.
+        terms of the randomisation, of each ball [B, 3] if there are several; None for balls at rest
+        at `ball_init_pos` and above it.
 
         Args:
           draws: uniform random numbers between 0 and 1 [num_draws].

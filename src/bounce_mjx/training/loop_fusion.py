@@ -25,6 +25,9 @@ def join_loops(*configs: WorldConfig) -> None:
 
     if "XLA_FLAGS" in os.environ:
         return
-    models = {(c.physics, c.mjcf, c.physics_dt, c.robot) for c in configs}
-    if all(is_fused(load_model(mjcf, dt, robot=r), choice) for choice, mjcf, dt, r in models):
+    models = {(c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls) for c in configs}
+    if all(
+        is_fused(load_model(mjcf, dt, robot=robot, num_balls=balls), choice)
+        for choice, mjcf, dt, robot, balls in models
+    ):
         os.environ["XLA_FLAGS"] = OPTION

@@ -257,8 +257,9 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
 def _changed(env: Env, states: State, changes: _Changes) -> State:
     """States [..., N] with the changes of a user."""
     before = states.pipeline_state
-    velocity = jnp.array(find_addresses(env.mj_model).ball_qvel[:3])
-    qvel = before.physics.qvel.at[velocity].add(changes.push[:, None])
+    qvel = before.physics.qvel
+    for ball in find_addresses(env.mj_model).balls:
+        qvel = qvel.at[jnp.array(ball.qvel[:3])].add(changes.push[:, None])
     changed = before._replace(
         physics=before.physics._replace(qvel=qvel),
         command=_given_or_drawn(changes.command, before.command),
@@ -288,7 +289,7 @@ def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFram
     return EnvFrame(
         time=steps * env.dt,
         qpos=now.physics.qpos.T,
-        ball=kinematics.ball_position.T,
+        ball=now.physics.qpos[jnp.array(find_addresses(env.mj_model).ball_qpos[:3])].T,
         paddle=kinematics.paddle_position.T,
         command=now.command,
         metrics=states.metrics,

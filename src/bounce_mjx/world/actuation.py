@@ -84,10 +84,15 @@ def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
 
 
 def push(
-    world: World, counter: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float
+    world: World,
+    counter: jax.Array,
+    phase: jax.Array,
+    step: jax.Array,
+    control_dt: float,
+    num_balls: int = 1,
 ) -> jax.Array:
     """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most
-    steps.
+    steps. Several balls are pushed at one time, each in its direction [B, 3].
 
     Args:
       counter: counter of the random numbers.
@@ -96,9 +101,11 @@ def push(
     """
     interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
     now = passes(interval, phase, step, control_dt)
-    angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, (), phase.dtype)
+    each = () if num_balls == 1 else (num_balls,)
+    angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, each, phase.dtype)
     speed = jnp.where(now, world["push_speed"], 0.0)
-    return jnp.stack([speed * jnp.cos(angle), speed * jnp.sin(angle), jnp.zeros_like(speed)])
+    x, y = speed * jnp.cos(angle), speed * jnp.sin(angle)
+    return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
 def passes(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:

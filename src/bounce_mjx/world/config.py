@@ -7,7 +7,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, NonNegative, PlainPath, Positive, StrictModel
+from bounce_mjx.config.settings import (
+    Finite,
+    NonNegative,
+    PlainPath,
+    Positive,
+    StrictModel,
+    whole_number,
+)
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
@@ -119,8 +126,10 @@ class WorldConfig(StrictModel):
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
+    num_balls: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)] = 1
+    """Number of balls; those that the MJCF lacks are copies of its first one."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
-    """Ball position at a reset, before noise, m."""
+    """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
     reset: ResetConfig = ResetConfig()
     """The noise of a reset."""
     max_joint_velocity: Positive = 2.0 * math.pi
@@ -203,7 +212,7 @@ class WorldConfig(StrictModel):
     @property
     def layout(self) -> ObservationLayout:
         """The order of the entries of the observation."""
-        return self.observation.layout(self.num_joints)
+        return self.observation.layout(self.num_joints, self.num_balls)
 
     @property
     def commands(self) -> dict[str, Command]:

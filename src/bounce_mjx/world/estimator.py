@@ -22,6 +22,8 @@ from bounce_mjx.world.sensing import Picture, oldest_picture
 _LOST_IN_A_ROW = 2.0
 # Smallest time between two pictures, s.
 _SAME_PICTURE = 1e-4
+# A picture's axes in jax.vmap over the balls that it shows.
+_OF_BALLS = Picture(position=0, velocity=0, age=None, number=None)
 
 
 class Estimate(NamedTuple):
@@ -65,12 +67,19 @@ class Estimator:
         return self._filter.plane(paddle, normal)
 
     def start(self, picture: Picture, world: World, plane: jax.Array) -> Estimate:
-        """Estimate at a reset, where the ball is at rest.
+        """Estimate at a reset, where the ball is at rest. With several balls, everything has one
+        row for each.
 
         Args:
           picture: the first one.
           plane: `plane` of the measured joint angles [4].
         """
+        start = self._start
+        if self._config.num_balls > 1:
+            start = jax.vmap(start, in_axes=(_OF_BALLS, None, None))
+        return start(picture, world, plane)
+
+    def _start(self, picture: Picture, world: World, plane: jax.Array) -> Estimate:
         return Estimate(
             track=self._filter.start(picture.position, self.age(picture, world)),
             planes=jnp.broadcast_to(plane, (self._num_planes, 4)),
@@ -96,6 +105,14 @@ class Estimator:
             one if none has arrived.
           plane: `plane` of the measured joint angles [4].
         """
+        following = self._next
+        if self._config.num_balls > 1:
+            following = jax.vmap(following, in_axes=(0, None, _OF_BALLS, _OF_BALLS, None))
+        return following(before, world, last, picture, plane)
+
+    def _next(
+        self, before: Estimate, world: World, last: Picture, picture: Picture, plane: jax.Array
+    ) -> Estimate:
         control_dt, age = self._config.control_dt, self.age(picture, world)
         planes = jnp.concatenate([plane[None], before.planes[:-1]])
         track = before.track._replace(age=before.track.age + control_dt)

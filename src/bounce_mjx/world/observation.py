@@ -24,6 +24,13 @@ class Quantity(NamedTuple):
     group: Literal["state", "command", "past", "task"] = "task"
     """Place in the observation: the present state, the commands, what the world remembers of the
     past, the task's own quantities."""
+    per_ball: bool = False
+    """Whether each ball has its entries, one ball after another."""
+
+    def entries(self, num_joints: int, num_balls: int) -> int:
+        """Number of entries of one value."""
+        size = num_joints if self.size is None else self.size
+        return num_balls * size if self.per_ball else size
 
 
 _GROUPS = ("state", "command", "past", "task")
@@ -45,15 +52,15 @@ class ObservationConfig(StrictModel):
 
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints."""
-    ball_position: Annotated[History, Quantity(3, "m", "state")] = 1
+    ball_position: Annotated[History, Quantity(3, "m", "state", True)] = 1
     """Measured position of the ball."""
-    ball_quaternion: Annotated[History, Quantity(4, "", "state")] = 1
+    ball_quaternion: Annotated[History, Quantity(4, "", "state", True)] = 1
     """Orientation of the ball, which no sensor of a robot measures."""
     joint_velocities: Annotated[History, Quantity(None, "rad/s", "state")] = 1
     """Measured velocities of the acting joints."""
-    ball_velocity: Annotated[History, Quantity(3, "m/s", "state")] = 1
+    ball_velocity: Annotated[History, Quantity(3, "m/s", "state", True)] = 1
     """Measured or estimated velocity of the ball."""
-    ball_angular_velocity: Annotated[History, Quantity(3, "rad/s", "state")] = 1
+    ball_angular_velocity: Annotated[History, Quantity(3, "rad/s", "state", True)] = 1
     """Spin of the ball, which no sensor of a robot measures."""
     paddle_position: Annotated[History, Quantity(3, "m", "state")] = 1
     """Centre of the paddle by the forward kinematics of the measured joint angles."""
@@ -87,23 +94,22 @@ class ObservationConfig(StrictModel):
             if (count := getattr(self, name)) and group in (None, quantity.group)
         }
 
-    def parts(self, num_joints: int) -> tuple[Part, ...]:
+    def parts(self, num_joints: int, num_balls: int = 1) -> tuple[Part, ...]:
         """One value of each quantity that the policy sees, for an arm with this number of acting
-        joints, in order."""
+        joints and for this number of balls, in order."""
         known = self.quantities()
         return tuple(
-            Part(
-                name, num_joints if known[name].size is None else known[name].size, known[name].unit
-            )
+            Part(name, known[name].entries(num_joints, num_balls), known[name].unit)
             for name in self.seen()
         )
 
-    def layout(self, num_joints: int) -> ObservationLayout:
-        """The order of the entries for an arm with this number of acting joints."""
+    def layout(self, num_joints: int, num_balls: int = 1) -> ObservationLayout:
+        """The order of the entries of `parts`, with past values."""
         counts = self.seen()
         return ObservationLayout(
             tuple(
-                part._replace(size=part.size * counts[part.name]) for part in self.parts(num_joints)
+                part._replace(size=part.size * counts[part.name])
+                for part in self.parts(num_joints, num_balls)
             )
         )
 
@@ -179,7 +185,7 @@ class ObservationLayout:
 
 class Kinematics(NamedTuple):
     """The true positions and velocities of an environment, without the noise that an observation
-    may have."""
+    may have. With several balls, their quantities have one row for each ball: [B, 3], [B, 4]."""
 
     joint_angles: jax.Array
     """Positions of the acting joints [n], rad; of a slide, m."""

@@ -25,7 +25,7 @@ _LONG_AGO = 1e6
 
 
 class Picture(NamedTuple):
-    """Last picture of the ball that arrived and was not lost."""
+    """Last picture of the ball that arrived and was not lost; it shows all balls ([B, 3])."""
 
     position: jax.Array
     """Measured position [3], m."""
@@ -41,7 +41,8 @@ class Sensing(NamedTuple):
     """Memory of the sensors."""
 
     balls: jax.Array
-    """True position and velocity of the ball in the last control steps [K, 6], the newest first."""
+    """True position and velocity of the ball in the last control steps [K, 6], the newest first;
+    [K, B, 6] with several balls."""
     picture: Picture
     seen: dict[str, jax.Array]
     """Last values of each observed quantity [H, size], the newest first."""
@@ -59,13 +60,18 @@ def resting_ball(
 ) -> jax.Array:
     """`Sensing.balls` at a reset, before which the ball rested."""
     length = math.ceil(oldest_picture(randomization) / control_dt - 1e-6) + 1
-    ball = jnp.concatenate([truth.ball_position, truth.ball_velocity])
-    return jnp.broadcast_to(ball, (length, 6))
+    ball = position_and_velocity(truth)
+    return jnp.broadcast_to(ball, (length, *ball.shape))
+
+
+def position_and_velocity(truth: Kinematics) -> jax.Array:
+    """Position and velocity of the ball [6], or of each ball [B, 6]."""
+    return jnp.concatenate([truth.ball_position, truth.ball_velocity], axis=-1)
 
 
 def picture_long_ago(truth: Kinematics) -> Picture:
     """The picture before the first one, so long ago that the difference of both is no velocity."""
-    zero = jnp.zeros_like(truth.ball_position[0])
+    zero = jnp.zeros((), truth.ball_position.dtype)
     return Picture(truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO)
 
 
@@ -125,8 +131,8 @@ def take_picture(
     share = age - whole
     position, velocity = _between(newer, older, share, control_dt)
 
-    noises = noise.normal(counter, noise.Stream.BALL, (6,), dtype)
-    position = _disturbed(world, "ball_position", position, noises[:3])
+    noises = noise.normal(counter, noise.Stream.BALL, balls.shape[1:], dtype)
+    position = _disturbed(world, "ball_position", position, noises[..., :3])
     due = number > last.number
     arrived = due
     if "frame_drop" in world:
@@ -136,7 +142,7 @@ def take_picture(
     if observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
         velocity = (position - last.position) / elapsed
-    velocity = _disturbed(world, "ball_velocity", velocity, noises[3:])
+    velocity = _disturbed(world, "ball_velocity", velocity, noises[..., 3:])
     fresh = Picture(position, velocity, age * control_dt, number)
     # A lost picture stays lost.
     held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
@@ -146,17 +152,21 @@ def take_picture(
 def _between(
     newer: jax.Array, older: jax.Array, share: jax.Array, control_dt: float
 ) -> tuple[jax.Array, jax.Array]:
-    """Position [3] and velocity [3] between two control steps (cubic Hermite interpolation).
+    """Position [..., 3] and velocity [..., 3] between two control steps (cubic Hermite
+    interpolation).
 
     Args:
-      newer, older: position and velocity [6] at each.
+      newer, older: position and velocity [..., 6] at each.
       share: time before the newer one as a share of the control step [].
     """
-    change = older[:3] - newer[:3]
-    start, end = -control_dt * newer[3:], -control_dt * older[3:]
+    now, before, velocity, velocity_before = (
+        x[..., part] for part in (slice(3), slice(3, 6)) for x in (newer, older)
+    )
+    change = before - now
+    start, end = -control_dt * velocity, -control_dt * velocity_before
     curve = (1.0 - share) * (start - change) - share * (end - change)
-    position = newer[:3] + share * (change + (1.0 - share) * curve)
-    return position, newer[3:] + share * (older[3:] - newer[3:])
+    position = now + share * (change + (1.0 - share) * curve)
+    return position, velocity + share * (velocity_before - velocity)
 
 
 def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:

@@ -1,9 +1,9 @@
 """The fused engine: MuJoCo's equations for one kind of model, as straight-line scalar arithmetic.
 
-The supported kind: a serial chain of hinges with position servos, a free ball, one contact pair of
-the ball (a sphere) and the paddle (a box) with or without sliding friction, and the implicitfast
-integrator. `read_model` reads the constants of a compiled `mujoco.MjModel` and refuses any other
-kind.
+The supported kind: a serial chain of hinges with position servos, one to three free balls, contact
+pairs of each ball (a sphere) with the paddle (a box) and of the balls with each other, with or
+without sliding friction, and the implicitfast integrator. `read_model` reads the constants of a
+compiled `mujoco.MjModel` and refuses any other kind.
 """
 
 from bounce_mjx.physics.fused.dynamics import paddle_position, step

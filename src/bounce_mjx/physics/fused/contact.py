@@ -1,16 +1,27 @@
-"""MuJoCo's contact of a sphere and a box: geometry, impedance and the force without friction.
+"""MuJoCo's contacts of a ball with the paddle or another ball: geometry, impedance and the forces
+without friction.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: impedance, reference
-acceleration, diagonal regulariser), and its collision function for a sphere and a box.
+acceleration, diagonal regulariser), and its collision functions.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.fused.scalars import Mat3, Scalar, Vec3, dot, matvec, transpose, vsub
+from bounce_mjx.physics.fused.scalars import (
+    Mat3,
+    Scalar,
+    Vec3,
+    dot,
+    matvec,
+    stored,
+    transpose,
+    vsub,
+)
 
 # MuJoCo's mjMINVAL: a centre closer to the box counts as inside it.
 _MIN_DISTANCE = 1e-15
@@ -18,22 +29,19 @@ _MIN_DISTANCE = 1e-15
 
 @dataclasses.dataclass(frozen=True)
 class ContactModel:
-    """Parameters of the contact pair."""
+    """Parameters of a contact pair."""
 
-    radius: Scalar
-    """Radius of the sphere, m."""
-    half_size: tuple[float, float, float]
-    """Half sizes of the box, m."""
+    balls: tuple[int, ...]
+    """The ball that touches the paddle, or the two balls that touch."""
     stiffness: Scalar
     """k of the reference acceleration, 1/s^2."""
     damping: Scalar
     """b of the reference acceleration, 1/s."""
     solimp: tuple[float, float, float, float, float]
     """dmin, dmax, width (m), midpoint, power of the impedance."""
-    paddle_inverse_weight: float
-    """Translational inverse inertia of the paddle's body at the reference pose, 1/kg."""
-    ball_inverse_weight: Scalar
-    """Translational inverse inertia of the ball, 1/kg."""
+    inverse_weights: tuple[Scalar, Scalar]
+    """Translational inverse inertia at the reference pose, 1/kg: of the paddle's body or the first
+    ball, and of the last ball."""
     friction: tuple[Scalar, Scalar] | None = None
     """Coefficients of sliding friction along the two tangents; None for a frictionless contact."""
     elliptic: bool = False
@@ -50,13 +58,42 @@ class Contact(NamedTuple):
     distance: jax.Array
     """Gap between the surfaces, negative when they overlap, m."""
     normal: Vec3
-    """Unit vector in the world from the box to the sphere."""
+    """Unit vector in the world from the paddle or the first ball to the last ball."""
 
 
-def sphere_box(model: ContactModel, centre: Vec3, box_origin: Vec3, box_rotation: Mat3) -> Contact:
-    """Contact at the box's nearest point; for a centre inside the box, at its nearest face."""
+def side(model: ContactModel, ball: int) -> float:
+    """Sign with which a ball's velocity counts in the relative velocity of a contact."""
+    return 1.0 if ball == model.balls[-1] else -1.0
+
+
+def relative(model: ContactModel, vectors: Sequence[Vec3]) -> Vec3:
+    """A vector of the last ball less that of the first one, or less nothing, at a contact.
+
+    Args:
+      vectors: one of each ball.
+    """
+    first, *last = (vectors[i] for i in model.balls)
+    return vsub(*last, first) if last else first
+
+
+def shared(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
+    """The balls of both contacts, and the product of their signs (`side`)."""
+    return [(i, side(a, i) * side(b, i)) for i in a.balls if i in b.balls]
+
+
+def sphere_box(
+    radius: Scalar,
+    centre: Vec3,
+    half: tuple[float, float, float],
+    box_origin: Vec3,
+    box_rotation: Mat3,
+) -> Contact:
+    """Contact at the box's nearest point; for a centre inside the box, at its nearest face.
+
+    Args:
+      half: half sizes of the box, m.
+    """
     local = matvec(transpose(box_rotation), vsub(centre, box_origin))
-    half = model.half_size
     offset = tuple(x - jnp.clip(x, -s, s) for x, s in zip(local, half, strict=True))
     squared = dot(offset, offset)
     outside = squared > _MIN_DISTANCE**2
@@ -74,8 +111,23 @@ def sphere_box(model: ContactModel, centre: Vec3, box_origin: Vec3, box_rotation
     face_depth = jnp.minimum(jnp.minimum(depth[0], depth[1]), depth[2])
 
     normal = tuple(jnp.where(outside, x * inverse, f) for x, f in zip(offset, face, strict=True))
-    distance = jnp.where(outside, squared * inverse, -face_depth) - model.radius
+    distance = jnp.where(outside, squared * inverse, -face_depth) - radius
     return Contact(distance, matvec(box_rotation, normal))
+
+
+def sphere_sphere(
+    first_radius: Scalar, second_radius: Scalar, first: Vec3, second: Vec3
+) -> Contact:
+    """Contact of two spheres with these centres."""
+    offset = vsub(second, first)
+    squared = dot(offset, offset)
+    apart = squared > _MIN_DISTANCE**2
+    inverse = jax.lax.rsqrt(jnp.where(apart, squared, 1.0))
+    normal = tuple(
+        jnp.where(apart, x * inverse, axis) for x, axis in zip(offset, (1.0, 0.0, 0.0), strict=True)
+    )
+    distance = jnp.where(apart, squared * inverse, 0.0) - (first_radius + second_radius)
+    return Contact(distance, normal)
 
 
 def impedance(model: ContactModel, distance: jax.Array) -> jax.Array:
@@ -93,26 +145,83 @@ def impedance(model: ContactModel, distance: jax.Array) -> jax.Array:
 
 def softness(model: ContactModel, d: jax.Array) -> jax.Array:
     """Regulariser (1/kg) of the normal force at the impedance d."""
-    return (1.0 - d) / d * (model.paddle_inverse_weight + model.ball_inverse_weight)
+    return (1.0 - d) / d * (model.inverse_weights[0] + model.inverse_weights[1])
 
 
-def normal_force(
-    model: ContactModel,
-    contact: Contact,
-    normal_velocity: Scalar,
-    free_acceleration: Scalar,
-    inverse_inertia: Scalar,
-) -> jax.Array:
-    """Force (N) along the normal: the exact solution of MuJoCo's constraint problem
-    with one inequality.
+def normal_forces(
+    models: Sequence[ContactModel],
+    contacts: Sequence[Contact],
+    normal_velocities: Sequence[Scalar],
+    matrix: Sequence[Scalar],
+    free_accelerations: Sequence[Scalar],
+) -> tuple[jax.Array, ...]:
+    """Forces (N) along the normals: the exact solution of MuJoCo's constraint problem with one
+    inequality for each contact.
 
     Args:
-      normal_velocity: velocity of the sphere relative to the box along the normal, m/s.
-      free_acceleration: acceleration along the normal without the contact, m/s^2.
-      inverse_inertia: J M^-1 J^T of the contact, 1/kg.
+      normal_velocities: relative velocities along the normals, m/s.
+      matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
+      free_accelerations: accelerations along the normals without the contacts, m/s^2.
     """
-    d = impedance(model, contact.distance)
-    reference = -model.damping * normal_velocity - model.stiffness * d * contact.distance
-    regulariser = softness(model, d)
-    force = (reference - free_acceleration) / (inverse_inertia + regulariser)
-    return jnp.where(contact.distance < 0.0, jnp.maximum(force, 0.0), 0.0)
+    regularisers, references = [], []
+    for model, contact, velocity in zip(models, contacts, normal_velocities, strict=True):
+        d = impedance(model, contact.distance)
+        references.append(-model.damping * velocity - model.stiffness * d * contact.distance)
+        regularisers.append(softness(model, d))
+    pushes = [a - b for a, b in zip(references, free_accelerations, strict=True)]
+    rows = upper_rows(matrix, len(models))
+    for row, regulariser in zip(rows, regularisers, strict=True):
+        row[0] = row[0] + regulariser
+    if len(models) == 1:
+        forces = nonnegative(rows, pushes)
+    else:
+        touches = [contact.distance < 0.0 for contact in contacts]
+        problem = stored(_with_touching_alone(rows, pushes, touches))
+        forces = stored(nonnegative(*problem))
+    return tuple(
+        jnp.where(contact.distance < 0.0, force, 0.0)
+        for contact, force in zip(contacts, forces, strict=True)
+    )
+
+
+def upper_rows(triangle: Sequence[Scalar], size: int) -> list[list[Scalar]]:
+    """Rows of a symmetric matrix from its diagonal on, given one after another."""
+    entries = iter(triangle)
+    return [[next(entries) for _ in range(i, size)] for i in range(size)]
+
+
+def _with_touching_alone(
+    rows: list[list[Scalar]], pushes: list[Scalar], touches: Sequence[jax.Array]
+) -> tuple[list[list[Scalar]], list[Scalar]]:
+    """The problem in which a contact that does not touch has no force and no effect."""
+    masked = [
+        [
+            row[0],
+            *(jnp.where(t & u, x, 0.0) for u, x in zip(touches[i + 1 :], row[1:], strict=True)),
+        ]
+        for i, (t, row) in enumerate(zip(touches, rows, strict=True))
+    ]
+    return masked, [jnp.where(t, x, 0.0) for t, x in zip(touches, pushes, strict=True)]
+
+
+def nonnegative(rows: list[list[Scalar]], push: list[Scalar]) -> list[Scalar]:
+    """Minimum of 1/2 x.Q x - push.x over x >= 0 for a positive definite Q, given by `upper_rows`.
+
+    Without the first entry, the others have their minimum. If the first entry's gradient does not
+    pull it from zero there, this is the solution. Otherwise, the first entry is positive, and its
+    elimination leaves a problem of the others.
+    """
+    (pivot, *row), *rest = rows
+    first, *others = push
+    if not rest:
+        return [jnp.maximum(first / pivot, 0.0)]
+    without = nonnegative(rest, others)
+    ratios = [x / pivot for x in row]
+    left = [
+        [x - ratio * y for x, y in zip(entries, row[i:], strict=True)]
+        for i, (entries, ratio) in enumerate(zip(rest, ratios, strict=True))
+    ]
+    with_first = nonnegative(left, [x - r * first for x, r in zip(others, ratios, strict=True)])
+    pushed = first - dot(row, without) > 0.0
+    solved = [jnp.where(pushed, x, y) for x, y in zip(with_first, without, strict=True)]
+    return [jnp.where(pushed, first / pivot - dot(ratios, with_first), 0.0), *solved]

@@ -15,9 +15,19 @@ import jax.numpy as jnp
 from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, friction, joint_friction
-from bounce_mjx.physics.fused.contact import normal_force, sphere_box
+from bounce_mjx.physics.fused.contact import (
+    Contact,
+    ContactModel,
+    normal_forces,
+    relative,
+    shared,
+    side,
+    sphere_box,
+    sphere_sphere,
+)
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import (
+    Quaternion,
     Scalar,
     Vec3,
     add,
@@ -26,6 +36,7 @@ from bounce_mjx.physics.fused.scalars import (
     matmul,
     matvec,
     mul,
+    neg,
     quaternion_product,
     scale,
     stored,
@@ -34,6 +45,16 @@ from bounce_mjx.physics.fused.scalars import (
 )
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.robot.model import BallAddresses
+
+
+class Ball(NamedTuple):
+    """Coordinates of one ball."""
+
+    position: Vec3
+    velocity: Vec3
+    turning: friction.Turning | None
+    """Spin and orientation; None without friction, as the spin is then constant."""
 
 
 class Motion(NamedTuple):
@@ -41,10 +62,7 @@ class Motion(NamedTuple):
 
     q: tuple[Scalar, ...]
     v: tuple[Scalar, ...]
-    ball_position: Vec3
-    ball_velocity: Vec3
-    turning: friction.Turning | None
-    """Spin and orientation of the ball; None without friction, as the spin is then constant."""
+    balls: tuple[Ball, ...]
 
 
 def step(
@@ -62,47 +80,66 @@ def step(
     orientation.
     """
     addresses = model.addresses
-    frictional = model.contact.friction is not None or parameters.contact_friction is not None
+    frictional = model.contacts[0].friction is not None or parameters.contact_friction is not None
     motion = Motion(
         q=tuple(state.qpos[i] for i in addresses.arm_qpos),
         v=tuple(state.qvel[i] for i in addresses.arm_qvel),
-        ball_position=tuple(state.qpos[i] for i in addresses.ball_qpos[:3]),
-        ball_velocity=tuple(state.qvel[i] for i in addresses.ball_qvel[:3]),
-        turning=friction.turning_of(*_orientation_and_spin(model, state)) if frictional else None,
+        balls=tuple(_ball(at, state, frictional) for at in addresses.balls),
     )
     if control.ball_push is not None:
-        pushed = vadd(motion.ball_velocity, tuple(control.ball_push[i] for i in range(3)))
-        motion = motion._replace(ball_velocity=pushed)
+        motion = motion._replace(balls=tuple(map(_pushed, motion.balls, _pushes(control, model))))
     leaves, tree = jax.tree.flatten(motion)
     inputs = (_arm_control(control, addresses.actuators), parameters)
     numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
-    if motion.turning is None:
-        quaternion = turn(*_orientation_and_spin(model, state), num_substeps * model.dt)
-        spin = ()
-    else:
-        quaternion, spin = motion.turning.orientation, friction.spin_in_ball(motion.turning)
+    turns = [
+        (turn(*_orientation_and_spin(at, state), num_substeps * model.dt), None)
+        if ball.turning is None
+        else (ball.turning.orientation, friction.spin_in_ball(ball.turning))
+        for at, ball in zip(addresses.balls, motion.balls, strict=True)
+    ]
 
     qpos = [state.qpos[i] for i in range(model.nq)]
     qvel = [state.qvel[i] for i in range(model.nv)]
-    positions = (*motion.q, *motion.ball_position, *quaternion)
-    for i, value in zip(addresses.arm_qpos + addresses.ball_qpos, positions, strict=True):
-        qpos[i] = value
-    velocities = (*motion.v, *motion.ball_velocity, *spin)
-    for i, value in zip(addresses.arm_qvel + addresses.ball_qvel, velocities, strict=False):
-        qvel[i] = value
+    _put(qpos, addresses.arm_qpos, motion.q)
+    _put(qvel, addresses.arm_qvel, motion.v)
+    for at, ball, (quaternion, spin) in zip(addresses.balls, motion.balls, turns, strict=True):
+        _put(qpos, at.qpos, (*ball.position, *quaternion))
+        _put(qvel, at.qvel[:3], ball.velocity)
+        if spin is not None:
+            _put(qvel, at.qvel[3:], spin)
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 
-def _orientation_and_spin(
-    model: FusedModel, state: PhysicsState
-) -> tuple[tuple[Scalar, ...], Vec3]:
-    """Orientation and spin of the ball in MuJoCo's coordinates."""
-    addresses = model.addresses
+def _ball(at: BallAddresses, state: PhysicsState, frictional: bool) -> Ball:
+    return Ball(
+        position=tuple(state.qpos[i] for i in at.qpos[:3]),
+        velocity=tuple(state.qvel[i] for i in at.qvel[:3]),
+        turning=friction.turning_of(*_orientation_and_spin(at, state)) if frictional else None,
+    )
+
+
+def _pushes(control: Control, model: FusedModel) -> list[jax.Array]:
+    """The push [3] of each ball."""
+    one = len(model.balls) == 1
+    return [control.ball_push if one else control.ball_push[i] for i in range(len(model.balls))]
+
+
+def _pushed(ball: Ball, push: jax.Array) -> Ball:
+    return ball._replace(velocity=vadd(ball.velocity, tuple(push[i] for i in range(3))))
+
+
+def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:
+    for i, value in zip(indices, values, strict=True):
+        coordinates[i] = value
+
+
+def _orientation_and_spin(at: BallAddresses, state: PhysicsState) -> tuple[Quaternion, Vec3]:
+    """Orientation and spin of a ball in MuJoCo's coordinates."""
     return (
-        tuple(state.qpos[i] for i in addresses.ball_qpos[3:]),
-        tuple(state.qvel[i] for i in addresses.ball_qvel[3:]),
+        tuple(state.qpos[i] for i in at.qpos[3:]),
+        tuple(state.qvel[i] for i in at.qvel[3:]),
     )
 
 
@@ -212,17 +249,14 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         spring = mul(link.stiffness, sub(q, link.spring_position))
         applied.append(joint_force(servo, force, carried) - link.damping * v - add(b, spring))
         servo_damping.append(derivative)
-    constraint_torque, ball_acceleration, spin_acceleration = constraint_response(
-        model, motion, pose, inertia, applied
-    )
+    constraint_torque, *accelerations = constraint_response(model, motion, pose, inertia, applied)
     return integrate(
         model,
         motion,
         inertia,
         servo_damping,
         [add(a, c) for a, c in zip(applied, constraint_torque, strict=True)],
-        ball_acceleration,
-        spin_acceleration,
+        *accelerations,
     )
 
 
@@ -259,66 +293,121 @@ def constraint_response(
     pose: chain.Pose,
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
-) -> tuple[list[Scalar], Vec3, Vec3 | None]:
-    """Joint forces from the contact and dry friction, total acceleration of the ball (m/s^2) and
-    angular acceleration of the ball (rad/s^2, world); the last is None without sliding friction."""
-    contact = sphere_box(
-        model.contact,
-        motion.ball_position,
-        _paddle_origin(model, pose),
-        matmul(pose.world_rotation[-1], model.paddle_rotation),
+) -> tuple[list[Scalar], list[Vec3], list[Vec3 | None]]:
+    """Joint forces from the contacts and dry friction, and of each ball the total acceleration
+    (m/s^2) and the angular acceleration (rad/s^2, world; None without sliding friction)."""
+    contacts = _contacts(model, motion, pose)
+    free = [_free_acceleration(model, i, ball) for i, ball in enumerate(motion.balls)]
+    if motion.balls[0].turning is None:
+        torque, balls = _normal_response(model, motion, pose, inertia, applied, contacts, free)
+        return torque, balls, [None] * len(balls)
+    factor = stored(chain.cholesky(inertia))
+    response = friction.contact_response(
+        model,
+        pose,
+        factor,
+        contacts,
+        joint_velocity=motion.v,
+        half_applied=chain.solve_lower(factor, applied),
+        balls=[(ball.position, ball.velocity, ball.turning.spin) for ball in motion.balls],
+        free_accelerations=free,
     )
-    ball_free = scale(model.gravity, model.ball_weight)
-    if not is_constant(model.air_drag):
-        ball_free = vadd(ball_free, drag(model.air_drag, motion.ball_velocity))
-    if motion.turning is not None:
-        factor = stored(chain.cholesky(inertia))
-        response = friction.contact_response(
-            model,
-            pose,
-            factor,
-            contact,
-            joint_velocity=motion.v,
-            half_applied=chain.solve_lower(factor, applied),
-            ball=(motion.ball_position, motion.ball_velocity, motion.turning.spin),
-            free_acceleration=ball_free,
-        )
-        ball_acceleration = vadd(ball_free, response.ball_acceleration)
-        return response.joint_torque, ball_acceleration, response.spin_acceleration
-    # A force along the normal has the same torque at the contact point and at the ball's centre.
-    jacobian = [
-        -entry
-        for entry in chain.point_jacobian(model.links, pose, motion.ball_position, contact.normal)
+    accelerations = [vadd(a, b) for a, b in zip(free, response.ball_accelerations, strict=True)]
+    return response.joint_torque, accelerations, response.spin_accelerations
+
+
+def _normal_response(
+    model: FusedModel,
+    motion: Motion,
+    pose: chain.Pose,
+    inertia: chain.SquareMatrix,
+    applied: list[Scalar],
+    contacts: Sequence[Contact],
+    free_accelerations: Sequence[Vec3],
+) -> tuple[list[Scalar], list[Vec3]]:
+    """`constraint_response` without sliding friction: joint forces and the balls' accelerations."""
+    pairs = model.contacts
+    jacobians = [
+        _normal_jacobian(model, motion, pose, pair, contact.normal)
+        for pair, contact in zip(pairs, contacts, strict=True)
     ]
-    keep = _keep(model, motion)
-    factor = keep(chain.cholesky(inertia))
-    half_jacobian = chain.solve_lower(factor, jacobian)
+    factor = _keep(model, motion)(chain.cholesky(inertia))
+    halves = [chain.solve_lower(factor, jacobian) for jacobian in jacobians]
     half_applied = chain.solve_lower(factor, applied)
 
-    normal_velocity = dot(contact.normal, motion.ball_velocity)
-    free_acceleration = dot(contact.normal, ball_free)
-    inverse_inertia = 1.0 / model.ball_mass
-    for j, v, half_j, half_a in zip(jacobian, motion.v, half_jacobian, half_applied, strict=True):
-        normal_velocity = normal_velocity + j * v
-        free_acceleration = free_acceleration + half_j * half_a
-        inverse_inertia = inverse_inertia + half_j * half_j
+    speeds, accelerations, matrix = [], [], []
+    for k, (pair, contact) in enumerate(zip(pairs, contacts, strict=True)):
+        speed = dot(contact.normal, relative(pair, [ball.velocity for ball in motion.balls]))
+        acceleration = dot(contact.normal, relative(pair, free_accelerations))
+        inverse = functools.reduce(add, [1.0 / model.balls[i].mass for i in pair.balls])
+        for j, v, half, half_a in zip(jacobians[k], motion.v, halves[k], half_applied, strict=True):
+            speed = add(speed, mul(j, v))
+            acceleration = add(acceleration, mul(half, half_a))
+            inverse = add(inverse, mul(half, half))
+        speeds.append(speed)
+        accelerations.append(acceleration)
+        matrix.append(inverse)
+        for m in range(k + 1, len(pairs)):
+            by_balls = [sign / model.balls[i].mass for i, sign in shared(pair, pairs[m])]
+            along = dot(contact.normal, contacts[m].normal) if by_balls else 0.0
+            by_arm = dot(halves[k], halves[m])
+            matrix.append(add(by_arm, mul(along, functools.reduce(add, by_balls, 0.0))))
 
-    def contact_force(matrix: tuple[Scalar], acceleration: tuple[Scalar]) -> tuple[jax.Array]:
-        return (normal_force(model.contact, contact, normal_velocity, *acceleration, *matrix),)
+    def contact_forces(matrix: Sequence[Scalar], free: Sequence[Scalar]) -> tuple[jax.Array, ...]:
+        return normal_forces(pairs, contacts, speeds, matrix, free)
 
-    (force,), dry_friction = joint_friction.contact_and_friction(
+    forces, dry_friction = joint_friction.contact_and_friction(
         model.links,
         factor,
         motion.v,
         half_applied,
-        [half_jacobian],
-        (inverse_inertia,),
-        (free_acceleration,),
-        contact_force,
+        halves,
+        tuple(matrix),
+        tuple(accelerations),
+        contact_forces,
     )
-    ball_acceleration = vadd(ball_free, scale(contact.normal, force / model.ball_mass))
-    torque = [add(j * force, f) for j, f in zip(jacobian, dry_friction, strict=True)]
-    return torque, ball_acceleration, None
+    balls = list(free_accelerations)
+    for pair, contact, force in zip(pairs, contacts, forces, strict=True):
+        for i in pair.balls:
+            push = mul(force, side(pair, i)) / model.balls[i].mass
+            balls[i] = vadd(balls[i], scale(contact.normal, push))
+    columns = zip(*jacobians, strict=True)
+    return [add(dot(c, forces), f) for c, f in zip(columns, dry_friction, strict=True)], balls
+
+
+def _contacts(model: FusedModel, motion: Motion, pose: chain.Pose) -> list[Contact]:
+    """Geometry of each of `FusedModel.contacts`."""
+    origin = _paddle_origin(model, pose)
+    rotation = matmul(pose.world_rotation[-1], model.paddle_rotation)
+    contacts = []
+    for pair in model.contacts:
+        centres = [motion.balls[i].position for i in pair.balls]
+        radii = [model.balls[i].radius for i in pair.balls]
+        contacts.append(
+            sphere_box(*radii, *centres, model.paddle_half_size, origin, rotation)
+            if len(pair.balls) == 1
+            else sphere_sphere(*radii, *centres)
+        )
+    return contacts
+
+
+def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec3:
+    """Acceleration of a ball without contacts, m/s^2."""
+    free = scale(model.gravity, model.balls[index].weight)
+    if is_constant(model.air_drag):
+        return free
+    return vadd(free, drag(model.air_drag, ball.velocity))
+
+
+def _normal_jacobian(
+    model: FusedModel, motion: Motion, pose: chain.Pose, pair: ContactModel, normal: Vec3
+) -> list[Scalar]:
+    """Relative velocity along the normal of a contact, per unit velocity of each joint."""
+    if len(pair.balls) == 2:
+        return [0.0] * len(model.links)
+    # A force along the normal has the same torque at the contact point and at the ball's centre.
+    centre = motion.balls[pair.balls[0]].position
+    return [neg(entry) for entry in chain.point_jacobian(model.links, pose, centre, normal)]
 
 
 def integrate(
@@ -327,8 +416,8 @@ def integrate(
     inertia: chain.SquareMatrix,
     servo_damping: Sequence[Scalar],
     torque: list[Scalar],
-    ball_acceleration: Vec3,
-    spin_acceleration: Vec3 | None,
+    ball_accelerations: Sequence[Vec3],
+    spin_accelerations: Sequence[Vec3 | None],
 ) -> Motion:
     """MuJoCo's integrators implicitfast and Euler: semi-implicit Euler, implicit in the
     velocity-dependent forces of joint damping and, with implicitfast, of servos (documentation,
@@ -344,15 +433,21 @@ def integrate(
     acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
     v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
-    ball_velocity = vadd(motion.ball_velocity, scale(ball_acceleration, dt))
-    ball_position = vadd(motion.ball_position, scale(ball_velocity, dt))
-    turning = motion.turning
+    accelerations = zip(motion.balls, ball_accelerations, spin_accelerations, strict=True)
+    return Motion(q, v, tuple(_moved(*ball, dt) for ball in accelerations))
+
+
+def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3 | None, dt: float) -> Ball:
+    """The ball one step later."""
+    velocity = vadd(ball.velocity, scale(acceleration, dt))
+    position = vadd(ball.position, scale(velocity, dt))
+    turning = ball.turning
     if turning is not None:
         turning = friction.turned(turning, spin_acceleration, dt)
-    return Motion(q, v, ball_position, ball_velocity, turning)
+    return Ball(position, velocity, turning)
 
 
-def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[Scalar, ...]:
+def turn(quaternion: Quaternion, spin: Vec3, duration: float) -> Quaternion:
     """Quaternion [w, x, y, z] after turning at a constant spin (rad/s, body frame): the axis-angle
     product of MuJoCo's mju_quatIntegrate."""
     w, x, y, z = quaternion
@@ -369,7 +464,9 @@ def turn(quaternion: tuple[Scalar, ...], spin: Vec3, duration: float) -> tuple[S
 
 def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
     """`stored` in the long programs of models with friction, else the identity."""
-    frictional = motion.turning is not None or any(map(joint_friction.has_friction, model.links))
+    frictional = motion.balls[0].turning is not None or any(
+        map(joint_friction.has_friction, model.links)
+    )
     return stored if frictional else lambda values: values
 
 

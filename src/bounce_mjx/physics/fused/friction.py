@@ -20,9 +20,23 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused import chain, joint_friction
-from bounce_mjx.physics.fused.contact import Contact, ContactModel, impedance, softness
+from bounce_mjx.physics.fused.contact import (
+    Contact,
+    ContactModel,
+    impedance,
+    relative,
+    shared,
+    side,
+    softness,
+)
+from bounce_mjx.physics.fused.coupled import (
+    coupled_forces,
+    edge_regulariser,
+    tangential_regulariser,
+)
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.scalars import (
+    ZERO3,
     Quaternion,
     Scalar,
     Vec3,
@@ -31,6 +45,7 @@ from bounce_mjx.physics.fused.scalars import (
     dot,
     matvec,
     mul,
+    neg,
     quaternion_matrix,
     quaternion_product,
     scale,
@@ -59,14 +74,31 @@ class Turning(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Effect of the contact's force and of dry friction on the joints and the ball."""
+    """Effect of the contacts' forces and of dry friction on the joints and the balls."""
 
     joint_torque: list[Scalar]
     """Joint torques of both, N m."""
-    ball_acceleration: Vec3
-    """Acceleration of the ball by the contact alone, m/s^2."""
-    spin_acceleration: Vec3
-    """Angular acceleration of the ball in the world, rad/s^2."""
+    ball_accelerations: list[Vec3]
+    """Acceleration of each ball by the contacts alone, m/s^2."""
+    spin_accelerations: list[Vec3]
+    """Angular acceleration of each ball in the world, rad/s^2."""
+
+
+class Touch(NamedTuple):
+    """A contact with its frame, in which a force has the components normal, first and second
+    tangent."""
+
+    model: ContactModel
+    distance: jax.Array
+    """Gap between the surfaces, m."""
+    axes: tuple[Vec3, Vec3, Vec3]
+    """The frame's unit vectors."""
+    levers: dict[int, Scalar]
+    """Distance from the contact point, midway between the surfaces, to each ball's centre, m."""
+    torques: dict[int, tuple[Vec3, Vec3]]
+    """Torques on each ball from unit forces along the tangents, m."""
+    rows: list[list[Scalar]]
+    """Jacobian [3, n] of the joints."""
 
 
 class Problem(NamedTuple):
@@ -79,88 +111,173 @@ class Problem(NamedTuple):
 
 
 def contact_response(
-    fused_model: FusedModel,
+    model: FusedModel,
     pose: chain.Pose,
     factor: tuple[chain.SquareMatrix, list[jax.Array]],
-    contact: Contact,
+    contacts: Sequence[Contact],
     joint_velocity: Sequence[Scalar],
     half_applied: Sequence[Scalar],
-    ball: tuple[Vec3, Vec3, Vec3],
-    free_acceleration: Vec3,
+    balls: Sequence[tuple[Vec3, Vec3, Vec3]],
+    free_accelerations: Sequence[Vec3],
 ) -> Response:
-    """Effect of the contact's force and of dry friction on the joints and the ball.
+    """Effect of the contacts' forces and of dry friction on the joints and the balls.
 
     Args:
       factor: Cholesky factor L of the arm's inertia matrix.
-      half_applied: L^-1 times the joint torques without the contact and dry friction.
-      ball: position, velocity and spin in the world.
-      free_acceleration: the ball's acceleration without the contact.
+      contacts: geometry of each of the model's contacts.
+      half_applied: L^-1 times the joint torques without the contacts and dry friction.
+      balls: position, velocity and spin of each in the world.
+      free_accelerations: the balls' accelerations without the contacts.
     """
-    model, links = fused_model.contact, fused_model.links
-    ball_mass, ball_inertia = fused_model.ball_mass, fused_model.ball_inertia
-    position, velocity, spin = ball
+    positions, velocities, spins = zip(*balls, strict=True)
+    touches = [
+        _touch(model, pose, pair, contact, positions)
+        for pair, contact in zip(model.contacts, contacts, strict=True)
+    ]
+    halves = [[chain.solve_lower(factor, row) for row in touch.rows] for touch in touches]
+    halves, half_applied = stored((halves, list(half_applied)))
+    matrix = _matrix(model, touches, halves)
+    impedances = [impedance(touch.model, touch.distance) for touch in touches]
+    offsets = []
+    for touch, half, d in zip(touches, halves, impedances, strict=True):
+        velocity = relative(touch.model, velocities), spins, joint_velocity
+        free = relative(touch.model, free_accelerations), half_applied
+        offsets += _offsets(touch, half, d, velocity, free)
+    matrix, offsets = stored((matrix, tuple(offsets)))
+    softnesses = [softness(t.model, d) for t, d in zip(touches, impedances, strict=True)]
+
+    def forces_of(matrix: tuple[Scalar, ...], offsets: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        touching = [touch.distance < 0.0 for touch in touches]
+        if len(touches) > 1:
+            return coupled_forces(model.contacts, touching, matrix, offsets, softnesses)
+        force = contact_force(model.contacts[0], matrix, offsets, softnesses[0])
+        return tuple(jnp.where(touching[0], f, 0.0) for f in force)
+
+    forces, dry_friction = joint_friction.contact_and_friction(
+        model.links,
+        factor,
+        joint_velocity,
+        half_applied,
+        [row for half in halves for row in half],
+        matrix,
+        offsets,
+        forces_of,
+    )
+    forces = stored(forces)
+    rows = [row for touch in touches for row in touch.rows]
+    torque = [
+        add(dot(column, forces), f)
+        for column, f in zip(zip(*rows, strict=True), dry_friction, strict=True)
+    ]
+    return Response(torque, *_ball_accelerations(model, touches, forces))
+
+
+def _touch(
+    model: FusedModel,
+    pose: chain.Pose,
+    pair: ContactModel,
+    contact: Contact,
+    positions: Sequence[Vec3],
+) -> Touch:
+    """A contact with its frame; `positions` are the balls'."""
     contact = stored(contact)
     normal = contact.normal
-    first, second = tangents(normal)
-    first, second = stored((first, second))
-    # Distance from the contact point, midway between the surfaces, to the ball's centre.
-    lever = model.radius + 0.5 * contact.distance
-    point = vsub(position, scale(normal, lever))
-    # Torques on the ball from unit forces along the tangents.
-    torques = (scale(second, -lever), scale(first, lever))
-    columns = list(chain.point_velocities(links, pose, point))
-    rows = [[-dot(axis, column) for column in columns] for axis in (normal, first, second)]
-    rows = stored(rows)
-    half = [chain.solve_lower(factor, row) for row in rows]
-    half, half_applied = stored((half, list(half_applied)))
+    first, second = stored(tangents(normal))
+    axes = normal, first, second
+    levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
+    torques = {i: (scale(second, -lever), scale(first, lever)) for i, lever in levers.items()}
+    rows = [[0.0] * len(model.links)] * 3
+    if len(pair.balls) == 1:
+        ball = pair.balls[0]
+        point = vsub(positions[ball], scale(normal, levers[ball]))
+        columns = list(chain.point_velocities(model.links, pose, point))
+        rows = stored([[neg(dot(axis, column)) for column in columns] for axis in axes])
+    return Touch(pair, contact.distance, axes, levers, torques, rows)
 
-    along_tangent = 1.0 / ball_mass + lever * lever / ball_inertia
-    matrix = (
-        dot(half[0], half[0]) + 1.0 / ball_mass,
-        dot(half[0], half[1]),
-        dot(half[0], half[2]),
-        dot(half[1], half[1]) + along_tangent,
-        dot(half[1], half[2]),
-        dot(half[2], half[2]) + along_tangent,
+
+def _matrix(
+    model: FusedModel, touches: Sequence[Touch], halves: Sequence[Sequence[Sequence[Scalar]]]
+) -> tuple[Scalar, ...]:
+    """J M^-1 J^T of all contacts, the upper triangle row by row, 1/kg.
+
+    Args:
+      halves: L^-1 J^T [3, n] of each contact.
+    """
+    components = [(k, a) for k in range(len(touches)) for a in range(3)]
+    return tuple(
+        add(dot(halves[k][a], halves[m][b]), _by_balls(model, (touches[k], a), (touches[m], b)))
+        for i, (k, a) in enumerate(components)
+        for m, b in components[i:]
     )
-    d = impedance(model, contact.distance)
+
+
+def _by_balls(model: FusedModel, one: tuple[Touch, int], other: tuple[Touch, int]) -> Scalar:
+    """Share of the balls' inertia in an entry of `_matrix`, of a component of one contact and a
+    component of another."""
+    (first, a), (second, b) = one, other
+    share: Scalar = 0.0
+    for i, sign in shared(first.model, second.model):
+        ball = model.balls[i]
+        if first is not second:
+            share = add(share, mul(dot(first.axes[a], second.axes[b]), sign / ball.mass))
+            if a > 0 and b > 0:
+                turning = dot(first.torques[i][a - 1], second.torques[i][b - 1])
+                share = add(share, turning / ball.inertia)
+        elif a == b:
+            share = add(share, 1.0 / ball.mass)
+            if a > 0:
+                share = add(share, first.levers[i] * first.levers[i] / ball.inertia)
+    return share
+
+
+def _offsets(
+    touch: Touch,
+    half: Sequence[Sequence[Scalar]],
+    d: Scalar,
+    velocity: tuple[Vec3, Sequence[Vec3], Sequence[Scalar]],
+    free: tuple[Vec3, Sequence[Scalar]],
+) -> Vec3:
+    """J a0 - aref of a contact, m/s^2.
+
+    Args:
+      half: L^-1 J^T [3, n].
+      d: impedance.
+      velocity: relative velocity of the balls' centres, spins of the balls, and joint velocities.
+      free: relative acceleration without the contacts, and `half_applied`.
+    """
+    model, (along, spins, joint_velocity) = touch.model, velocity
     damping = model.damping if model.tangent_damping is None else model.tangent_damping
     offsets = []
-    for axis, torque, row, half_row, b in zip(
-        (normal, first, second),
-        (None, *torques),
-        rows,
-        half,
-        (model.damping, damping, damping),
-        strict=True,
-    ):
-        speed, acceleration = dot(axis, velocity), dot(axis, free_acceleration)
-        if torque is not None:
-            speed = speed + dot(torque, spin)
-        for j, v, half_j, half_a in zip(row, joint_velocity, half_row, half_applied, strict=True):
-            speed, acceleration = speed + j * v, acceleration + half_j * half_a
+    for a, b in enumerate((model.damping, damping, damping)):
+        speed, acceleration = dot(touch.axes[a], along), dot(touch.axes[a], free[0])
+        if a > 0:
+            for i, torques in touch.torques.items():
+                speed = add(speed, dot(torques[a - 1], spins[i]))
+        for j, v, half_j, half_a in zip(
+            touch.rows[a], joint_velocity, half[a], free[1], strict=True
+        ):
+            speed, acceleration = add(speed, mul(j, v)), add(acceleration, mul(half_j, half_a))
         offsets.append(acceleration + b * speed)
-    offsets[0] = offsets[0] + model.stiffness * d * contact.distance
+    normal, *tangential = offsets
+    return normal + model.stiffness * d * touch.distance, *tangential
 
-    matrix, offsets = stored((matrix, tuple(offsets)))
 
-    def force_of(matrix: tuple[Scalar, ...], offsets: Vec3) -> Vec3:
-        force = contact_force(model, matrix, offsets, softness(model, d))
-        return tuple(jnp.where(contact.distance < 0.0, f, 0.0) for f in force)
-
-    force, dry_friction = joint_friction.contact_and_friction(
-        links, factor, joint_velocity, half_applied, half, matrix, tuple(offsets), force_of
-    )
-    force = stored(force)
-    along = vadd(scale(normal, force[0]), vadd(scale(first, force[1]), scale(second, force[2])))
-    torque = vadd(scale(torques[0], force[1]), scale(torques[1], force[2]))
-    return Response(
-        [
-            add(dot(column, force), f)
-            for column, f in zip(zip(*rows, strict=True), dry_friction, strict=True)
-        ],
-        scale(along, 1.0 / ball_mass),
-        scale(torque, 1.0 / ball_inertia),
+def _ball_accelerations(
+    model: FusedModel, touches: Sequence[Touch], forces: Sequence[Scalar]
+) -> tuple[list[Vec3], list[Vec3]]:
+    """Accelerations and angular accelerations of the balls by the contacts' forces [3 K]."""
+    along, turning = [ZERO3] * len(model.balls), [ZERO3] * len(model.balls)
+    for k, touch in enumerate(touches):
+        normal, *tangential = forces[3 * k : 3 * k + 3]
+        n, t1, t2 = touch.axes
+        force = vadd(scale(n, normal), vadd(scale(t1, tangential[0]), scale(t2, tangential[1])))
+        for i, (torque_1, torque_2) in touch.torques.items():
+            along[i] = vadd(along[i], scale(force, side(touch.model, i)))
+            torque = vadd(scale(torque_1, tangential[0]), scale(torque_2, tangential[1]))
+            turning[i] = vadd(turning[i], torque)
+    return (
+        [scale(a, 1.0 / ball.mass) for a, ball in zip(along, model.balls, strict=True)],
+        [scale(a, 1.0 / ball.inertia) for a, ball in zip(turning, model.balls, strict=True)],
     )
 
 
@@ -202,11 +319,11 @@ def contact_force(
         ),
         tuple(map(mul, offsets, units)),
     )
-    tangential = mul(mul(m1, m1), 1.0 / model.impratio) * regulariser
+    tangential = tangential_regulariser(model, regulariser)
     if model.elliptic:
         x = in_elliptic_cone(problem, regulariser, tangential)
     else:
-        x = in_pyramidal_cone(problem, 2.0 * tangential * add(1.0, mul(m1, m1)))
+        x = in_pyramidal_cone(problem, edge_regulariser(model, tangential))
     return tuple(map(mul, x, units))
 
 

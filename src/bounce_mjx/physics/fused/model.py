@@ -1,6 +1,8 @@
 """Model of the fused engine: constants of a compiled MJCF, and parameters of one environment."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -24,7 +26,7 @@ from bounce_mjx.physics.fused.scalars import (
 )
 from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 # MuJoCo's mjMINVAL.
 _MIN_VALUE = 1e-15
@@ -56,6 +58,20 @@ class Servo:
 
 
 @dataclasses.dataclass(frozen=True)
+class BallModel:
+    """A homogeneous ball."""
+
+    radius: Scalar
+    """Radius, m."""
+    mass: Scalar
+    """Mass, kg."""
+    inertia: Scalar
+    """Inertia about any axis through its centre, kg m^2."""
+    weight: float = 1.0
+    """Share of its weight that acts on it."""
+
+
+@dataclasses.dataclass(frozen=True)
 class FusedModel:
     """Model of the fused engine, in SI units.
 
@@ -74,17 +90,16 @@ class FusedModel:
     """Orientation of the paddle in the frame of the last link."""
     paddle_body: Frame
     """The paddle's body in the frame of the last link."""
-    ball_mass: Scalar
-    ball_inertia: Scalar
-    """Inertia of the homogeneous ball about any axis through its centre, kg m^2."""
-    contact: ContactModel
+    paddle_half_size: tuple[float, float, float]
+    """Half sizes of the paddle, m."""
+    balls: tuple[BallModel, ...]
+    contacts: tuple[ContactModel, ...]
+    """The contact of each ball with the paddle, then those of two balls."""
     addresses: Addresses
     nq: int
     nv: int
     weight: float = 1.0
     """Share of the links' weight that acts on the arm."""
-    ball_weight: float = 1.0
-    """Share of the ball's weight that acts on it."""
     implicit_servos: bool = True
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
@@ -92,7 +107,7 @@ class FusedModel:
     dry_friction: bool = True
     """Whether the joints' dry friction acts (the flag `frictionloss`)."""
     air_drag: Scalar = 0.0
-    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
+    """Deceleration of a ball by the air divided by its squared speed, 1/m."""
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
@@ -124,14 +139,13 @@ def read_model(mj_model: mujoco.MjModel) -> FusedModel:
         paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle.origin)),
         paddle_rotation=exact(matmul(paddle_body.rotation, paddle.rotation)),
         paddle_body=paddle_body,
-        ball_mass=float(m.body_mass[addresses.ball_body]),
-        ball_inertia=float(m.body_inertia[addresses.ball_body, 0]),
-        contact=_read_contact(m, addresses),
+        paddle_half_size=floats(m.geom_size[addresses.paddle_geom]),
+        balls=tuple(_read_ball(m, ball) for ball in addresses.balls),
+        contacts=_read_contacts(m, addresses),
         addresses=addresses,
         nq=m.nq,
         nv=m.nv,
         weight=1.0 - (compensated or 0.0),
-        ball_weight=1.0 - float(_gravity_compensation(m)[addresses.ball_body]),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
         dry_friction=_has_dry_friction(m),
@@ -144,28 +158,7 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
     Args:
       parameters: scalars, or tuples of scalars; None keeps the model's own value.
     """
-    p, contact, ball_inertia = parameters, model.contact, model.ball_inertia
-    if p.ball_mass is not None:
-        ratio = model.ball_mass / p.ball_mass
-        contact = dataclasses.replace(
-            contact, ball_inverse_weight=mul(contact.ball_inverse_weight, ratio)
-        )
-        ball_inertia = mul(p.ball_mass, ball_inertia / model.ball_mass)
-    if p.ball_radius is not None:
-        ratio = mul(p.ball_radius, 1.0 / contact.radius)
-        contact = dataclasses.replace(contact, radius=p.ball_radius)
-        ball_inertia = mul(ball_inertia, mul(ratio, ratio))
-    if p.contact_friction is not None:
-        friction = jnp.maximum(p.contact_friction, MIN_FRICTION)
-        contact = dataclasses.replace(contact, friction=(friction, friction))
-    # MuJoCo scales the direct format of solref by the largest impedance.
-    max_impedance = contact.solimp[1]
-    if p.contact_stiffness is not None:
-        stiffness = mul(p.contact_stiffness, 1.0 / max_impedance**2)
-        contact = dataclasses.replace(contact, stiffness=stiffness)
-    if p.contact_damping is not None:
-        damping = mul(p.contact_damping, 1.0 / max_impedance)
-        contact = dataclasses.replace(contact, damping=damping)
+    p = parameters
     none = (None,) * len(model.links)
     links = zip(
         model.links,
@@ -194,10 +187,45 @@ def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
         paddle_rotation=model.paddle_rotation
         if rotation is None
         else matmul(body.rotation, quaternion_matrix(rotation)),
-        ball_mass=_given(p.ball_mass, model.ball_mass),
-        ball_inertia=ball_inertia,
-        contact=contact,
+        balls=tuple(_ball_in_world(ball, p) for ball in model.balls),
+        contacts=tuple(_contact_in_world(contact, model.balls, p) for contact in model.contacts),
     )
+
+
+def _ball_in_world(ball: BallModel, p: PhysicsParameters) -> BallModel:
+    inertia = ball.inertia
+    if p.ball_mass is not None:
+        inertia = mul(p.ball_mass, inertia / ball.mass)
+    if p.ball_radius is not None:
+        ratio = mul(p.ball_radius, 1.0 / ball.radius)
+        inertia = mul(inertia, mul(ratio, ratio))
+    return dataclasses.replace(
+        ball,
+        radius=_given(p.ball_radius, ball.radius),
+        mass=_given(p.ball_mass, ball.mass),
+        inertia=inertia,
+    )
+
+
+def _contact_in_world(
+    contact: ContactModel, balls: Sequence[BallModel], p: PhysicsParameters
+) -> ContactModel:
+    """Contact with the parameters of one environment; `balls` are the model's own."""
+    changes: dict[str, Any] = {}
+    if p.ball_mass is not None:
+        paddle = contact.inverse_weights[: 2 - len(contact.balls)]
+        moved = zip(contact.inverse_weights[len(paddle) :], contact.balls, strict=True)
+        weights = [mul(weight, balls[i].mass / p.ball_mass) for weight, i in moved]
+        changes["inverse_weights"] = (*paddle, *weights)
+    if p.contact_friction is not None:
+        changes["friction"] = (jnp.maximum(p.contact_friction, MIN_FRICTION),) * 2
+    # MuJoCo scales the direct format of solref by the largest impedance.
+    max_impedance = contact.solimp[1]
+    if p.contact_stiffness is not None:
+        changes["stiffness"] = mul(p.contact_stiffness, 1.0 / max_impedance**2)
+    if p.contact_damping is not None:
+        changes["damping"] = mul(p.contact_damping, 1.0 / max_impedance)
+    return dataclasses.replace(contact, **changes)
 
 
 def _link_in_world(
@@ -260,7 +288,7 @@ def _read_links(
     links: list[chain.Link] = []
     frames, link_of = {0: Frame()}, {0: -1}
     for body in range(1, m.nbody):  # parents come before their children
-        if m.body_weldid[body] == addresses.ball_body:
+        if m.body_weldid[body] in [ball.body for ball in addresses.balls]:
             continue
         parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
         origin = vadd(parent.origin, matvec(parent.rotation, floats(m.body_pos[body])))
@@ -396,25 +424,44 @@ def _read_servo(mj_model: mujoco.MjModel, actuator: int, joint: int) -> Servo:
     )
 
 
-def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactModel:
-    solref, solimp = mj_model.pair_solref[0], mj_model.pair_solimp[0]
+def _read_ball(mj_model: mujoco.MjModel, ball: BallAddresses) -> BallModel:
+    return BallModel(
+        radius=float(mj_model.geom_size[ball.geom, 0]),
+        mass=float(mj_model.body_mass[ball.body]),
+        inertia=float(mj_model.body_inertia[ball.body, 0]),
+        weight=1.0 - float(_gravity_compensation(mj_model)[ball.body]),
+    )
+
+
+def _read_contacts(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[ContactModel, ...]:
+    """The contacts in the order of `FusedModel.contacts`."""
+    m, balls = mj_model, {ball.geom: i for i, ball in enumerate(addresses.balls)}
+    contacts = [
+        _read_contact(m, pair, tuple(sorted(balls[g] for g in map(int, geoms) if g in balls)))
+        for pair, geoms in enumerate(zip(m.pair_geom1, m.pair_geom2, strict=True))
+    ]
+    return tuple(sorted(contacts, key=lambda contact: (len(contact.balls), contact.balls)))
+
+
+def _read_contact(mj_model: mujoco.MjModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
+    m, addresses = mj_model, find_addresses(mj_model)
+    solref, solimp = m.pair_solref[pair], m.pair_solimp[pair]
     dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]])
     if solref[0] > 0.0:
-        time_constant = _time_constant(mj_model, solref)
+        time_constant = _time_constant(m, solref)
         stiffness = 1.0 / (dmax * time_constant * solref[1]) ** 2
     else:
         stiffness = -solref[0] / dmax**2
     power = max(1.0, float(solimp[4]))
-    frictional = mj_model.pair_dim[0] > 1
-    friction = np.maximum(mj_model.pair_friction[0, :2], MIN_FRICTION)
-    elliptic = mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    paddle_body = mj_model.geom_bodyid[addresses.paddle_geom]
-    weights = mj_model.body_invweight0
+    frictional = m.pair_dim[pair] > 1
+    friction = np.maximum(m.pair_friction[pair, :2], MIN_FRICTION)
+    elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    bodies = [addresses.balls[i].body for i in balls]
+    bodies = [m.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
     return ContactModel(
-        radius=float(mj_model.geom_size[addresses.ball_geom, 0]),
-        half_size=floats(mj_model.geom_size[addresses.paddle_geom]),
+        balls=balls,
         stiffness=float(stiffness),
-        damping=_reference_damping(mj_model, solref, dmax),
+        damping=_reference_damping(m, solref, dmax),
         solimp=(
             float(dmin),
             float(dmax),
@@ -422,12 +469,11 @@ def _read_contact(mj_model: mujoco.MjModel, addresses: Addresses) -> ContactMode
             float(midpoint),
             int(power) if power.is_integer() else power,
         ),
-        paddle_inverse_weight=float(weights[paddle_body, 0]),
-        ball_inverse_weight=float(weights[addresses.ball_body, 0]),
+        inverse_weights=floats(m.body_invweight0[bodies, 0]),
         friction=floats(friction) if frictional else None,
         elliptic=bool(elliptic),
-        impratio=max(_MIN_VALUE, float(mj_model.opt.impratio)),
-        tangent_damping=_tangent_damping(mj_model, float(dmax)) if elliptic else None,
+        impratio=max(_MIN_VALUE, float(m.opt.impratio)),
+        tangent_damping=_tangent_damping(m, pair, float(dmax)) if elliptic else None,
     )
 
 
@@ -456,9 +502,9 @@ def _has_dry_friction(mj_model: mujoco.MjModel) -> bool:
     return not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
 
 
-def _tangent_damping(mj_model: mujoco.MjModel, max_impedance: float) -> float | None:
+def _tangent_damping(mj_model: mujoco.MjModel, pair: int, max_impedance: float) -> float | None:
     """b of the pair's `solreffriction`; None if the pair's `solref` applies."""
-    solref = mj_model.pair_solreffriction[0]
+    solref = mj_model.pair_solreffriction[pair]
     if (solref[0] > 0.0) != (solref[1] > 0.0) or not np.any(solref):
         return None
     return _reference_damping(mj_model, solref, max_impedance)

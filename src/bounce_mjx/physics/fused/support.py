@@ -1,9 +1,11 @@
 """Check that the fused engine supports a model; a refusal names the unsupported feature."""
 
+import itertools
+
 import mujoco
 import numpy as np
 
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 
 class UnsupportedModelError(ValueError):
@@ -28,7 +30,7 @@ def check_supported(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     _check_options(mj_model)
     _check_bodies(mj_model, addresses)
     _check_constraints(mj_model, addresses)
-    _check_actuators(mj_model)
+    _check_actuators(mj_model, addresses)
 
 
 def _require(condition: bool, feature: str) -> None:
@@ -77,7 +79,8 @@ def _flags(bits: int, kind: type) -> set[str]:
 def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     bodies = [int(m.jnt_bodyid[joint]) for joint in addresses.arm_joints]
     _require(
-        m.njnt == len(addresses.arm_joints) + 1, "joints other than the acting ones and the ball's"
+        m.njnt == len(addresses.arm_joints) + len(addresses.balls),
+        "joints other than the acting ones and the ball's",
     )
     hinge_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     _require(
@@ -94,7 +97,8 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     )
     _require(not np.any(m.body_mocapid >= 0), "bodies moved from outside (mocap)")
     _require(
-        np.sum(m.body_weldid == addresses.ball_body) == 1, "bodies that are attached to the ball"
+        all(np.sum(m.body_weldid == ball.body) == 1 for ball in addresses.balls),
+        "bodies that are attached to the ball",
     )
     _require(
         m.body_weldid[m.geom_bodyid[addresses.paddle_geom]] == bodies[-1],
@@ -106,46 +110,67 @@ def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
     _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
     _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
     _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
-    inertia = m.body_inertia[addresses.ball_body]
-    plain_ball = (
-        m.geom_type[addresses.ball_geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+    plain = all(_is_plain(m, ball) for ball in addresses.balls)
+    _require(plain, "a ball that is not one free homogeneous sphere")
+
+
+def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
+    """Whether a ball is one free homogeneous sphere."""
+    inertia = m.body_inertia[ball.body]
+    return bool(
+        m.geom_type[ball.geom] == mujoco.mjtGeom.mjGEOM_SPHERE
         and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
-        and not np.any(m.body_ipos[addresses.ball_body])
-        and not np.any(m.geom_pos[addresses.ball_geom])
-        and not np.any(m.dof_damping.reshape(m.nv, -1)[addresses.ball_qvel,])
-        and not np.any(m.dof_armature[addresses.ball_qvel,])
-        and not np.any(m.dof_frictionloss[addresses.ball_qvel,])
-        and not m.jnt_stiffness[m.body_jntadr[addresses.ball_body]]
+        and not np.any(m.body_ipos[ball.body])
+        and not np.any(m.geom_pos[ball.geom])
+        and not np.any(m.dof_damping.reshape(m.nv, -1)[ball.qvel,])
+        and not np.any(m.dof_armature[ball.qvel,])
+        and not np.any(m.dof_frictionloss[ball.qvel,])
+        and not m.jnt_stiffness[m.body_jntadr[ball.body]]
     )
-    _require(plain_ball, "a ball that is not one free homogeneous sphere")
 
 
 def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
     _require(m.neq == 0, "equality constraints")
     _require(m.ntendon == 0, "tendons")
     colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
-    _require(not np.any(colliding), "contacts by contype and conaffinity (only the one pair)")
-    _require(m.npair == 1, "other than one contact pair")
-    pair = {int(m.pair_geom1[0]), int(m.pair_geom2[0])}
+    _require(not np.any(colliding), "contacts by contype and conaffinity (only by pairs)")
+    _check_pairs(m, addresses)
+    frictional = np.any(m.pair_dim > 1)
     _require(
-        pair == {addresses.paddle_geom, addresses.ball_geom},
-        "a pair other than of the ball and the paddle",
+        not frictional or np.all(m.pair_dim > 1), "sliding friction of some contact pairs only"
     )
-    _require(
-        m.pair_dim[0] in (1, 3),
-        f"torsional or rolling friction (condim {m.pair_dim[0]}; only condim 1 and 3)",
-    )
-    friction = m.pair_dim[0] > 1 or np.any(m.dof_frictionloss)
+    friction = frictional or np.any(m.dof_frictionloss)
     _require(not (friction and m.opt.noslip_iterations), "the noslip solver (noslip_iterations)")
-    _require(m.pair_margin[0] == 0.0 and m.pair_gap[0] == 0.0, "a contact margin or gap")
-    _require(m.pair_adhesion[0] == 0.0, "adhesion")
-    solref, width = m.pair_solref[0], m.pair_solimp[0, 2]
-    _require((solref[0] > 0.0) == (solref[1] > 0.0), "a solref with exactly one positive number")
-    _require(width > _MIN_WIDTH, "a solimp without a width")
 
 
-def _check_actuators(m: mujoco.MjModel) -> None:
-    _require(m.nu == m.njnt - 1, "actuators other than one position servo on each joint")
+def _check_pairs(m: mujoco.MjModel, addresses: Addresses) -> None:
+    balls = {ball.geom for ball in addresses.balls}
+    geoms = [frozenset(map(int, pair)) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)]
+    touching = {frozenset((addresses.paddle_geom, ball)) for ball in balls}
+    possible = touching | {frozenset(pair) for pair in itertools.combinations(balls, 2)}
+    _require(
+        m.npair > 0 and len(set(geoms)) == m.npair and touching <= set(geoms),
+        "other than one contact pair of the paddle and each ball",
+    )
+    _require(set(geoms) <= possible, "a pair other than of a ball and the paddle or another ball")
+    for pair in range(m.npair):
+        _require(
+            m.pair_dim[pair] in (1, 3),
+            f"torsional or rolling friction (condim {m.pair_dim[pair]}; only condim 1 and 3)",
+        )
+        gap = m.pair_margin[pair] or m.pair_gap[pair]
+        _require(not gap, "a contact margin or gap")
+        _require(m.pair_adhesion[pair] == 0.0, "adhesion")
+        solref, width = m.pair_solref[pair], m.pair_solimp[pair, 2]
+        same_sign = (solref[0] > 0.0) == (solref[1] > 0.0)
+        _require(same_sign, "a solref with exactly one positive number")
+        _require(width > _MIN_WIDTH, "a solimp without a width")
+
+
+def _check_actuators(m: mujoco.MjModel, addresses: Addresses) -> None:
+    _require(
+        m.nu == len(addresses.arm_joints), "actuators other than one position servo on each joint"
+    )
     affine_gain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
     servos = (
         np.all(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)

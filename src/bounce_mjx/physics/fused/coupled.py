@@ -1,0 +1,271 @@
+"""Forces of several contacts with sliding friction at one instant, as MuJoCo computes them.
+
+In the units of the cones (`friction.py`), the forces x minimise
+
+    1/2 x.(Q + R) x + x.c    over the product of the cones
+
+with Q = J M^-1 J^T, which couples the contacts, and the regulariser R. Under an acceleration y,
+each contact has the force f(y) that minimises 1/2 f.R f + f.y over its cone, so the solution is
+x = f(c + Q x). MuJoCo's Newton method finds it: -f is the gradient of a convex function of y, which
+is smooth between the zones in which the contact is open, sticks or slips, and a line search keeps
+the steps across zones short enough. Every state runs the same operations, so that the threads of a
+GPU kernel do not diverge.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.contact import ContactModel, upper_rows
+from bounce_mjx.physics.fused.scalars import (
+    Scalar,
+    Vec3,
+    add,
+    dot,
+    is_constant,
+    mul,
+    stored,
+    sub,
+)
+
+# Steps, and steps of the line search in each. Of 20,000 states like those of test_balls.py, all
+# reach rounding error; with 12 and 6 steps, 5 do not with the pyramidal cone and 44 with the
+# elliptic one.
+_NEWTON_STEPS = 16
+_SEARCH_STEPS = 6
+_ROOT = math.sqrt(2.0)
+
+
+class Cone(NamedTuple):
+    """One contact in the units of its cone."""
+
+    elliptic: bool
+    touches: jax.Array
+    """Whether there is a contact."""
+    normal: Scalar
+    """Regulariser along the normal, 1/kg; of the elliptic cone only."""
+    tangential: Scalar
+    """Regulariser along the tangents, or of each edge of the pyramid, 1/kg."""
+
+
+def tangential_regulariser(model: ContactModel, regulariser: Scalar) -> Scalar:
+    """Regulariser of both tangential forces in the units of the cone, 1/kg.
+
+    Args:
+      regulariser: of the normal force without friction, 1/kg.
+    """
+    friction = model.friction[0]
+    return mul(mul(friction, friction), 1.0 / model.impratio) * regulariser
+
+
+def edge_regulariser(model: ContactModel, tangential: Scalar) -> Scalar:
+    """Regulariser of the coefficient of a pyramid's edge, 1/kg."""
+    friction = model.friction[0]
+    return 2.0 * tangential * add(1.0, mul(friction, friction))
+
+
+def coupled_forces(
+    models: Sequence[ContactModel],
+    touching: Sequence[jax.Array],
+    matrix: Sequence[Scalar],
+    offsets: Sequence[Scalar],
+    regularisers: Sequence[Scalar],
+) -> tuple[Scalar, ...]:
+    """Forces [3 k] of k contacts (N): normal, first and second tangent of each.
+
+    Args:
+      touching: whether each contact exists.
+      matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
+      offsets: J a0 - aref, m/s^2.
+      regularisers: regularisers of the normal forces without friction, 1/kg.
+    """
+    units = [unit for model in models for unit in (1.0, *model.friction)]
+    size = len(units)
+    upper = upper_rows(matrix, size)
+    q = [
+        [mul(upper[min(i, j)][abs(i - j)], mul(units[i], units[j])) for j in range(size)]
+        for i in range(size)
+    ]
+    c = list(map(mul, offsets, units))
+    cones = []
+    for model, touches, normal in zip(models, touching, regularisers, strict=True):
+        tangential = tangential_regulariser(model, normal)
+        if not model.elliptic:
+            tangential = edge_regulariser(model, tangential)
+        cones.append(Cone(model.elliptic, touches, normal, tangential))
+    q, c = stored((q, c))
+
+    def newton_step(_, x: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        return _newton_step(cones, q, c, x)
+
+    start = tuple(entry - entry for entry in c)
+    x = lax.fori_loop(0, _NEWTON_STEPS, newton_step, start)
+    return tuple(map(mul, x, units))
+
+
+def _newton_step(
+    cones: Sequence[Cone], q: list[list[Scalar]], c: list[Scalar], x: Sequence[Scalar]
+) -> tuple[Scalar, ...]:
+    """Forces after one step of Newton's method with a line search.
+
+    With the derivative -L L^T of f, the step s solves s + L L^T Q s = f - x.
+    """
+    y = [add(entry, dot(row, x)) for entry, row in zip(c, q, strict=True)]
+    forces, factors = _response(cones, y)
+    lack = [sub(f, entry) for f, entry in zip(forces, x, strict=True)]
+    q_lack = [dot(row, lack) for row in q]
+    # Columns of L with the first entry's row, and Q L.
+    columns = [(3 * k, column) for k, factor in enumerate(factors) for column in factor]
+    q_columns = [[dot(row[k : k + 3], column) for row in q] for k, column in columns]
+    system = [[dot(column, of_q[k : k + 3]) for of_q in q_columns] for k, column in columns]
+    for i, row in enumerate(system):
+        row[i] = add(row[i], 1.0)
+    factor = stored(chain.cholesky(system))
+    pulls = [dot(column, q_lack[k : k + 3]) for k, column in columns]
+    z = chain.solve_upper(factor, chain.solve_lower(factor, pulls))
+    step, y_step = list(lack), list(q_lack)
+    for (k, column), of_q, size in zip(columns, q_columns, z, strict=True):
+        for i in range(3):
+            step[k + i] = sub(step[k + i], mul(column[i], size))
+        y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, of_q, strict=True)]
+    x, y, step, y_step = stored((list(x), y, step, y_step))
+    return tuple(_ahead(x, _line_search(cones, (x, y), (step, y_step)), step))
+
+
+def _line_search(
+    cones: Sequence[Cone],
+    start: tuple[list[Scalar], list[Scalar]],
+    step: tuple[list[Scalar], list[Scalar]],
+) -> Scalar:
+    """Length, from 0 to 2, of a step of the forces x and the accelerations y to the minimum of
+    MuJoCo's primal objective along it, where its increasing slope is 0.
+
+    The slope has kinks with the pyramidal cone, and Newton's method within a bracket finds its zero
+    exactly; with the elliptic cone it is curved, and the Illinois method needs fewer steps.
+    """
+    (x, y), (x_step, y_step) = start, step
+
+    def slope(length: Scalar) -> tuple[Scalar, Scalar]:
+        """The slope, and its derivative."""
+        forces, factors = _response(cones, _ahead(y, length, y_step))
+        lack = [sub(a, f) for a, f in zip(_ahead(x, length, x_step), forces, strict=True)]
+        rise = dot(y_step, x_step)
+        for k, factor in enumerate(factors):
+            for column in factor:
+                pull = dot(column, y_step[3 * k : 3 * k + 3])
+                rise = add(rise, mul(pull, pull))
+        return dot(y_step, lack), rise
+
+    def newton(_, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+        low, high, length = bracket
+        here, rise = slope(length)
+        low, high = jnp.where(here < 0.0, length, low), jnp.where(here < 0.0, high, length)
+        length = length - here / jnp.maximum(rise, float(jnp.finfo(rise.dtype).tiny))
+        inside = (length > low) & (length < high)
+        return low, high, jnp.where(inside, length, 0.5 * (low + high))
+
+    def illinois(_, bracket: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        low, high, at_low, at_high, last = bracket
+        length = _crossing(*bracket[:4])
+        here, _ = slope(length)
+        rises = here < 0.0
+        # The slope at an end that stays twice counts half.
+        return (
+            jnp.where(rises, length, low),
+            jnp.where(rises, high, length),
+            jnp.where(rises, here, jnp.where(last > 0.0, 0.5 * at_low, at_low)),
+            jnp.where(rises, jnp.where(last < 0.0, 0.5 * at_high, at_high), here),
+            jnp.where(rises, -1.0, last - last + 1.0),
+        )
+
+    zero = y_step[0] - y_step[0]
+    if not cones[0].elliptic:
+        return lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))[2]
+    bracket = zero, zero + 2.0, slope(zero)[0], slope(zero + 2.0)[0], zero
+    return _crossing(*lax.fori_loop(0, _SEARCH_STEPS, illinois, bracket)[:4])
+
+
+def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scalar]:
+    return [add(a, mul(length, b)) for a, b in zip(start, step, strict=True)]
+
+
+def _crossing(low: Scalar, high: Scalar, at_low: Scalar, at_high: Scalar) -> Scalar:
+    """Where the line between the values at both ends of a bracket is 0; the higher end if there is
+    no such place."""
+    change = at_high - at_low
+    crosses = (at_high > 0.0) & (change > 0.0)
+    place = (low * at_high - high * at_low) / jnp.where(crosses, change, 1.0)
+    return jnp.where(crosses, jnp.clip(place, low, high), high)
+
+
+def _response(
+    cones: Sequence[Cone], y: Sequence[Scalar]
+) -> tuple[list[Scalar], list[tuple[Vec3, Vec3, Vec3]]]:
+    """f(y) [3 k], and for each contact the three columns of L."""
+    forces, factors = [], []
+    for k, cone in enumerate(cones):
+        respond = _of_ellipse if cone.elliptic else _of_pyramid
+        force, factor = respond(cone, tuple(y[3 * k : 3 * k + 3]))
+        forces += [jnp.where(cone.touches, f, 0.0) for f in force]
+        factors.append(
+            tuple(
+                tuple(x if is_constant(x) else jnp.where(cone.touches, x, 0.0) for x in column)
+                for column in factor
+            )
+        )
+    return forces, factors
+
+
+def _of_ellipse(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+    pull, a, b = y
+    squared = a * a + b * b
+    tiny = float(jnp.finfo(squared.dtype).tiny)
+    inverse = lax.rsqrt(jnp.maximum(squared, tiny))
+    size, u, v = squared * inverse, a * inverse, b * inverse
+    open_ = pull >= size
+    sticks = cone.normal * size <= -cone.tangential * pull
+    slips = ~(open_ | sticks)
+    normal_root, root = lax.rsqrt(cone.normal), lax.rsqrt(cone.tangential)
+    both_root = lax.rsqrt(cone.normal + cone.tangential)
+    pressure = (size - pull) * (both_root * both_root)
+
+    def chosen(stuck: Scalar, slipping: Scalar) -> Scalar:
+        return jnp.where(open_, 0.0, jnp.where(sticks, stuck, slipping))
+
+    force = (
+        chosen(-pull * (normal_root * normal_root), pressure),
+        chosen(-a * (root * root), -pressure * u),
+        chosen(-b * (root * root), -pressure * v),
+    )
+    squared = jnp.where(slips, (1.0 - pull * inverse), 1.0)
+    across = squared * lax.rsqrt(squared) * both_root
+    return force, (
+        (chosen(normal_root, both_root), chosen(0.0, -both_root * u), chosen(0.0, -both_root * v)),
+        (0.0, chosen(root, -across * v), chosen(0.0, across * u)),
+        (0.0, 0.0, chosen(root, 0.0)),
+    )
+
+
+def _of_pyramid(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+    pull, *tangential = y
+    root = lax.rsqrt(cone.tangential)
+    normal, forces, columns, both = 0.0, [], [], []
+    for a in tangential:
+        plus, minus = (jnp.maximum(-x, 0.0) * (root * root) for x in (pull + a, pull - a))
+        normal = add(normal, plus + minus)
+        forces.append(plus - minus)
+        p, m = (jnp.where(x > 0.0, 1.0, 0.0) for x in (plus, minus))
+        both.append(p * m)
+        columns.append(((p - m) * root, (p + m - (2.0 - _ROOT) * p * m) * root))
+    first, second = both
+    together = _ROOT * (first + second) - (2.0 * _ROOT - 2.0) * first * second
+    return (normal, *forces), (
+        (columns[0][0], columns[0][1], 0.0),
+        (columns[1][0], 0.0, columns[1][1]),
+        (together * root, 0.0, 0.0),
+    )

@@ -1,0 +1,50 @@
+"""Several balls in the scene of one."""
+
+import itertools
+
+import mujoco
+
+from bounce_mjx.robot.arm import BALL_BODY_NAME, PADDLE_GEOM_NAME, raise_solver_limits
+
+MAX_BALLS = 3
+BALLS_APART = 0.1
+"""Height of each added ball above the last one, m."""
+
+_PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion friction".split()
+
+
+def ball_name(index: int) -> str:
+    """Name of the body of a ball, which counts from 0: ball_link, ball_link2, ball_link3."""
+    return BALL_BODY_NAME + (str(index + 1) if index else "")
+
+
+def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
+    """Adds balls to a scene until it has `num_balls`: copies of the first one with all that it
+    consists of, such as its contact pair with the paddle, and pairs like that one between each two
+    balls. A ball or a pair that the scene has stays as it is.
+
+    MuJoCo's solver may then take its default number of iterations. With the shipped limits, a step
+    with two touching balls is wrong by up to four times the largest velocity.
+    """
+    if num_balls == 1 or spec.body(BALL_BODY_NAME) is None:
+        return
+    raise_solver_limits(spec.option)
+    spec.copy_during_attach = True
+    for i in range(1, num_balls):
+        if spec.body(ball_name(i)) is None:
+            frame = spec.worldbody.add_frame(pos=[0.0, 0.0, BALLS_APART * i])
+            frame.attach_body(spec.body(BALL_BODY_NAME), "", str(i + 1))
+    geoms_of = [{geom.name for geom in spec.body(ball_name(i)).geoms} for i in range(num_balls)]
+    pairs = {frozenset((pair.geomname1, pair.geomname2)): pair for pair in spec.pairs}
+    with_paddle = {
+        geom: pair
+        for geoms, pair in pairs.items()
+        for geom in geoms - {PADDLE_GEOM_NAME}
+        if PADDLE_GEOM_NAME in geoms
+    }
+    touching = [geom for geoms in geoms_of for geom in sorted(geoms & with_paddle.keys())[:1]]
+    for first, second in itertools.combinations(touching, 2):
+        if frozenset((first, second)) not in pairs:
+            like = with_paddle[second]
+            settings = {name: getattr(like, name) for name in _PAIR_SETTINGS}
+            spec.add_pair(geomname1=first, geomname2=second, **settings)

@@ -1,0 +1,356 @@
+"""Several balls in the physics: fused against MuJoCo's C step and against MJX."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import task
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import c_episodes
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    fused,
+    make_engine,
+)
+from bounce_mjx.robot.model import find_addresses, load_model
+from bounce_mjx.world.randomization import RandomizationConfig
+from random_worlds import random_parameters
+from rest_task import Rest
+from test_friction import assert_same_step, c_steps, converged
+from test_joint_friction import sticking_and_sliding
+from test_physics import (
+    HOME,
+    MODEL,
+    RADIUS,
+    CEngine,
+    States,
+    difference,
+    paddle_frame,
+    random_states,
+)
+
+PICOMETRE = 1e-12
+
+
+def balls_model(
+    num_balls: int, cone: str = "pyramidal", friction: float | None = None
+) -> mujoco.MjModel:
+    """Shipped model with several balls, and a C solver that converges to rounding error."""
+    model = load_model(None, 0.001, num_balls=num_balls)
+    model.opt.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
+    if friction is not None:
+        model.pair_dim[:], model.pair_friction[:, :2] = 3, friction
+    return converged(model)
+
+
+def hostile_states(model: mujoco.MjModel, count: int, seed: int) -> States:
+    """The first ball as in `random_states`. Each further ball is close to one before it, in a
+    random direction or along a face of the paddle, which both then touch, or overlaps with it
+    deeply; some of the balls are fast."""
+    rng = np.random.default_rng(seed)
+    num_balls = (model.nq - 6) // 7
+    first, _ = random_states(load_model(None, 0.001), count, seed)
+    qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
+    qpos[:, :13], qvel[:, :12] = first.qpos, first.qvel
+    for i in range(count):
+        _, axes = paddle_frame(model, qpos[i, :6])
+        for ball in range(1, num_balls):
+            direction = rng.normal(size=3)
+            if rng.uniform() < 0.6:
+                direction = axes @ (direction * [1.0, 1.0, 0.1])
+            direction /= np.linalg.norm(direction)
+            other = 6 + 7 * rng.integers(ball)
+            distance = 2.0 * RADIUS * (1.0 + rng.choice([rng.uniform(-0.03, 0.01), -0.6]))
+            at, speeds = 6 + 7 * ball, 6 + 6 * ball
+            qpos[i, at : at + 3] = qpos[i, other : other + 3] + distance * direction
+            quaternion = rng.normal(size=4)
+            qpos[i, at + 3 : at + 7] = quaternion / np.linalg.norm(quaternion)
+            qvel[i, speeds : speeds + 3] = rng.uniform(-3.0, 3.0, 3) * rng.choice([1.0, 10.0])
+            qvel[i, speeds + 3 : speeds + 6] = rng.uniform(-30.0, 30.0, 3)
+    return States(qpos, qvel, first.ctrl)
+
+
+def compiled_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
+    """One fused step from each state."""
+    step = make_engine(model, "fused").step
+    axes = jax.tree.map(lambda x: 0, parameters)
+    steps = jax.jit(jax.vmap(lambda p, s, u: step(p, s, Control(u), 1), in_axes=(axes, 0, 0)))
+    return steps(parameters, PhysicsState(*states[:2]), states.ctrl)
+
+
+def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
+    """Number of contacts with a force in each state."""
+    data, pressed = mujoco.MjData(model), []
+    for data.qpos[:], data.qvel[:], data.ctrl[:] in zip(*states, strict=True):
+        mujoco.mj_forward(model, data)
+        force, forces = np.zeros(6), 0
+        for contact in range(data.ncon):
+            mujoco.mj_contactForce(model, data, contact, force)
+            forces += force[0] > 0.0
+        pressed.append(forces)
+    return np.array(pressed)
+
+
+@pytest.mark.parametrize(
+    ("num_balls", "cone", "friction"),
+    [
+        (2, "pyramidal", None),
+        (3, "pyramidal", None),
+        (2, "pyramidal", 0.3),
+        (2, "elliptic", 0.3),
+        (2, "elliptic", 1.5),
+    ],
+)
+@pytest.mark.usefixtures("float64")
+def test_one_step_of_several_balls_is_mujocos(num_balls, cone, friction, record_property):
+    """From states with one to all contacts at once."""
+    model = balls_model(num_balls, cone, friction)
+    assert fused.unsupported_feature(model) is None
+    count = 1000
+    states = hostile_states(model, count, seed=0)
+    pressed = num_pressed(model, states)
+    assert min(np.sum(pressed == n) for n in range(1, num_balls + 2)) >= 20
+    expected, _ = c_steps([model] * count, states)
+    error = assert_same_step(compiled_steps(model, MODEL, states), expected)
+    record_property("largest_difference", error)
+    print(f"{num_balls} balls, {cone}, friction {friction}: {error:.1e} of the largest speed")
+
+
+@pytest.mark.usefixtures("float64")
+def test_given_parameters_act_on_all_balls(record_property):
+    """All parameters at once, against C on `edited_model`; without and with both kinds of
+    friction."""
+    model, count = balls_model(2), 120
+    states = hostile_states(model, count, seed=1)
+    plain = random_parameters(model, count, seed=2)
+    rng = np.random.default_rng(0)
+    dry = plain._replace(
+        frictionloss=10.0 ** rng.uniform(-1.0, 1.5, (count, 6)),
+        contact_friction=rng.uniform(0.0, 1.0, count),
+    )
+    for parameters in (plain, plain._replace(frictionloss=dry.frictionloss), dry):
+        models = [
+            converged(edited_model(model, jax.tree.map(lambda x, i=i: x[i], parameters)))
+            for i in range(count)
+        ]
+        if parameters.frictionloss is not None:
+            states, sticking, _ = sticking_and_sliding(models, states)
+            assert 0.1 < np.mean(sticking) < 0.9
+        expected, _ = c_steps(models, states)
+        error = assert_same_step(compiled_steps(model, parameters, states), expected)
+        record_property("largest_difference", error)
+        print(f"{error:.1e} of the largest speed")
+
+
+def drop(model: mujoco.MjModel, data: mujoco.MjData, ball: int, rng: np.random.Generator) -> None:
+    """Puts a ball above the paddle, in place."""
+    at = find_addresses(model).balls[ball]
+    centre, _ = paddle_frame(model, data.qpos[:6])
+    data.qpos[at.qpos[:3],] = centre + [*rng.uniform(-0.02, 0.02, 2), 0.06 + 0.06 * ball]
+    data.qvel[at.qvel,] = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0), *np.zeros(3)]
+
+
+@pytest.mark.parametrize(
+    ("num_balls", "friction"), [(2, None), (3, None), (2, 0.3)], ids=["two", "three", "friction"]
+)
+@pytest.mark.usefixtures("float64")
+def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction, record_property):
+    """Each engine runs freely; a lost ball is dropped again. Balls that meet amplify differences:
+    the engines are closer at any time than two runs of C that start a picometre apart."""
+    count, substeps = 16, 10
+    model = balls_model(num_balls, "elliptic", friction)
+    balls, rng = find_addresses(model).balls, np.random.default_rng(0)
+    start = PhysicsState(np.tile(model.qpos0, (2, 1)), np.zeros((2, model.nv)))
+    runs = [CEngine(model, start) for _ in range(count)]
+    for run in runs:
+        first, second = run.data
+        first.qpos[:6] = HOME + rng.uniform(-0.2, 0.2, 6)
+        for ball in range(num_balls):
+            drop(model, first, ball, rng)
+        second.qpos[:], second.qvel[:] = first.qpos, first.qvel
+        second.qpos[8] += PICOMETRE
+    state = PhysicsState(
+        np.array([run.data[0].qpos for run in runs]), np.array([run.data[0].qvel for run in runs])
+    )
+    engine = make_engine(model, "fused")
+    step = jax.jit(jax.vmap(lambda s, u: engine.step(MODEL, s, Control(u), substeps)))
+    meetings, drops, errors, apart = 0, 0, np.zeros(count), np.zeros(count)
+    for _ in range(2000 // substeps):
+        for run, qpos, qvel in zip(runs, *state[:2], strict=True):
+            first, second = run.data
+            for i, at in enumerate(balls):
+                if first.qpos[at.qpos[2]] < first.geom("blocker").xpos[2] - 0.1:
+                    drop(model, first, i, rng)
+                    for coordinates, velocities in ((qpos, qvel), (second.qpos, second.qvel)):
+                        coordinates[at.qpos,] = first.qpos[at.qpos,]
+                        velocities[at.qvel,] = first.qvel[at.qvel,]
+                    second.qpos[at.qpos[2]] += PICOMETRE
+                    drops += 1
+        action = rng.uniform(-0.03, 0.03, (count, 6))
+        after = step(state, state.qpos[:, :6] + action)
+        state = PhysicsState(*(np.array(x) for x in after[:2]))
+        for j, run in enumerate(runs):
+            run.step(run.state.qpos[:, :6] + action[j], substeps)
+            geoms = run.data[0].contact.geom
+            meetings += np.sum(np.all(geoms != find_addresses(model).paddle_geom, axis=1))
+            first, second = (PhysicsState(*(x[k] for x in run.state[:2])) for k in (0, 1))
+            ours = PhysicsState(*(x[j] for x in state[:2]))
+            errors[j] = max(errors[j], *difference(ours, first))
+            apart[j] = max(apart[j], *difference(second, first))
+        assert np.all((errors < 1e-9) | (errors < apart))
+    record_property("largest_difference", float(errors.max()))
+    print(
+        f"{num_balls} balls, friction {friction}: {meetings} meetings, {drops} drops, "
+        f"{np.median(errors):.1e}, at most {errors.max():.1e}, two runs of C {np.median(apart):.1e}"
+    )
+    assert meetings >= 10
+
+
+@pytest.mark.parametrize("friction", [None, 0.3], ids=["frictionless", "friction"])
+@pytest.mark.usefixtures("float64")
+def test_the_gradient_of_touching_balls_is_that_of_finite_differences(friction):
+    """Of a sum of the velocities after a step with all contacts, with respect to the state."""
+    model = balls_model(2, "elliptic", friction)
+    states = hostile_states(model, 400, seed=3)
+    touching = np.flatnonzero(num_pressed(model, states) == 3)[:24]
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=model.nv))
+    step = make_engine(model, "fused").step
+
+    def outcome(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> jax.Array:
+        after = step(MODEL, PhysicsState(qpos, qvel), Control(ctrl), 2)
+        return weights @ after.qvel
+
+    value = jax.jit(jax.vmap(outcome))
+    given = jax.jit(jax.vmap(jax.grad(outcome, argnums=(0, 1))))
+    qpos, qvel, ctrl = (jnp.asarray(x[touching]) for x in states)
+    by_position, by_velocity = given(qpos, qvel, ctrl)
+    rng = np.random.default_rng(1)
+    for _ in range(4):
+        ahead, along = (jnp.asarray(rng.normal(size=x.shape)) for x in (qpos, qvel))
+        ahead = ahead.at[:, np.r_[9:13, 16:20]].set(0.0)
+        ahead, along = 1e-8 * ahead, 1e-6 * along
+        change = value(qpos + ahead, qvel + along, ctrl) - value(qpos - ahead, qvel - along, ctrl)
+        expected = np.asarray(change) / 2.0
+        found = jnp.sum(by_position * ahead, axis=1) + jnp.sum(by_velocity * along, axis=1)
+        scale = np.abs(expected) + 1e-6
+        print(np.max(np.abs(found - expected) / scale))
+        assert np.median(np.abs(found - expected) / scale) < 1e-5
+        # A step across the edge of a zone has two slopes.
+        assert np.mean(np.abs(found - expected) / scale < 1e-3) > 0.9
+
+
+@pytest.mark.separate_loops
+@pytest.mark.usefixtures("float64")
+def test_mjx_agrees_on_several_balls():
+    model, count = balls_model(2), 8
+    states = hostile_states(model, 64, seed=4)
+    some = np.flatnonzero(num_pressed(model, states) >= 2)[:count]
+    expected, _ = c_steps([model] * count, States(*(x[some] for x in states)))
+    step = jax.jit(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
+    after = step(PhysicsState(*(x[some] for x in states[:2])), states.ctrl[some])
+    fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
+    # MJX's solver stops at errors up to 2e-5.
+    assert np.max(np.abs(np.asarray(after.qvel) - expected.qvel) / fastest) < 1e-4
+
+
+class Two(Rest):
+    """A task with two balls, which fly side by side."""
+
+    class Config(Rest.Config):
+        num_balls: int = 2
+        randomization: RandomizationConfig = RandomizationConfig(ball_latency=(0.02, 0.02))
+
+    num_balls = (2, 3)
+    num_draws = 1
+
+    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+        side = jnp.array([[0.0, -0.5, 0.5 + draws[0]], [0.0, 0.5, 0.5]])
+        return side, jnp.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 2.0]])
+
+    def step(self, state, step: task.Step) -> task.TaskStep:
+        heights = step.truth.ball_position[:, 2]
+        return task.TaskStep((), {}, ended=jnp.any(heights < 0.0), metrics={})
+
+
+def after_resting(env: Env, steps: int, key: int = 0):
+    """The kinematics and the observations of some steps without actions, and the last state."""
+    state = jax.jit(env.reset)(jax.random.PRNGKey(key))
+    step, truths, observations = jax.jit(env.step), [], []
+    for _ in range(steps):
+        truths.append(env.kinematics(state.pipeline_state))
+        observations.append(np.asarray(state.obs))
+        state = step(state, jnp.zeros(env.action_size))
+    return truths, np.array(observations), state
+
+
+def test_a_world_of_two_balls_sees_each_late():
+    """Each ball is thrown as the task says, flies freely, and is seen after the latency."""
+    env = Env(Two.Config(observation={"ball_position": 2}))
+    truths, observations, state = after_resting(env, 12)
+    at = np.array([truth.ball_position for truth in truths])
+    assert at.shape == (12, 2, 3)
+    assert np.all(np.abs(at[0, :, 1] - [-0.5, 0.5]) < 0.011)
+    time = env.dt * np.arange(12)[:, None]
+    np.testing.assert_allclose(
+        at[..., 2] - at[0, :, 2], time * [1.0, 2.0] - 0.5 * 9.81 * time**2, atol=1e-3
+    )
+    seen = observations[:, env.layout["ball_position"]].reshape(12, 2, 2, 3)
+    np.testing.assert_allclose(seen[4:, 0], at[2:-2], atol=1e-5)
+    np.testing.assert_array_equal(seen[1:, 1], seen[:-1, 0])
+    assert {"true/ball_position_5", "true/ball_velocity_5"} <= state.metrics.keys()
+    assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s"))]
+
+
+def test_noise_and_pushes_differ_between_the_balls():
+    noisy = {"ball_position_noise": (0.01, 0.01), "ball_position_bias": (0.1, 0.1)}
+    env = Env(
+        Two.Config(randomization=noisy | {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2})
+    )
+    truths, observations, _ = after_resting(env, 40)
+    at = np.array([truth.ball_position for truth in truths])
+    error = observations[:, env.layout["ball_position"]].reshape(at.shape) - at - 0.1
+    assert 0.005 < np.std(error) < 0.02
+    assert abs(np.corrcoef(error[:, 0].ravel(), error[:, 1].ravel())[0, 1]) < 0.4
+    velocity = np.array([truth.ball_velocity for truth in truths])
+    pushes = np.diff(velocity[..., :2], axis=0)
+    pushed = np.linalg.norm(pushes, axis=2) > 0.5
+    assert np.sum(pushed[:, 0]) >= 5 and np.all(pushed[:, 0] == pushed[:, 1])
+    np.testing.assert_allclose(np.linalg.norm(pushes[pushed], axis=1), 1.0, atol=1e-3)
+    assert np.ptp(pushes[pushed[:, 0]][:, 0] - pushes[pushed[:, 0]][:, 1]) > 0.5
+
+
+def test_c_moves_several_balls_as_the_engine_does():
+    """With a push, and with drag in each physics step."""
+    env, count = (
+        Env(Two.Config(randomization={"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5)})),
+        2,
+    )
+    keys = jax.random.split(jax.random.PRNGKey(0), count)
+    states = jax.vmap(env.reset, out_axes=-1)(keys)
+    physics = states.pipeline_state.physics
+    push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
+    ctrl = physics.qpos[:6]
+    control = Control(ctrl, air_drag=jnp.full(count, 0.5), ball_push=push)
+    inputs = jax.tree.map(np.asarray, c_episodes._control_inputs(env, control))
+    simulated = c_episodes.full_states(env.mj_model, physics)
+    simulated[:, c_episodes._ball_velocity(env.mj_model)] += inputs.ball_push
+    data = [mujoco.MjData(env.mj_model)]
+    with mujoco.rollout.Rollout(nthread=0) as pool:
+        models = [env.mj_model] * count
+        simulated = c_episodes._next_states(pool, models, data, simulated, inputs)
+    expected = c_episodes.physics_states(env.mj_model, simulated)
+    step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, 10), in_axes=-1, out_axes=-1)
+    for ours, theirs in zip(step(physics, control), expected, strict=True):
+        if theirs is not None:
+            np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_a_task_of_one_ball_refuses_two():
+    with pytest.raises(UserError, match="num_balls is 2, but the task Rest takes 1; set num_balls"):
+        Env(Rest.Config(num_balls=2))
