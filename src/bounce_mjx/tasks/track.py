@@ -59,7 +59,7 @@ class Config(task.WorldConfig):
     """Range of the target height over home, around which it sways, m."""
     speed_range: tuple[Finite, Finite] = (0.05, 0.3)
     """Range of the point's greatest speed, m/s."""
-    path_size: Positive = 0.15
+    path_size: Positive = 0.12
     """Radius of the circle, half the length of the line and of the figure of eight, m."""
     max_distance: Positive = 0.7
     """The episode ends when the ball is this far from the point, or lower than home, m."""
