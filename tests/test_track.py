@@ -221,8 +221,8 @@ def test_results_judge_apexes_by_path_and_speed() -> None:
     for corner, error in ((0.2, 1.0), (0.3, 0.02), (0.9, 0.04)):
         moments += [(command(3, 0.3, phase=corner / 6.0), error, 0.0, 9.0)]
     found = {result.name: result for result in TRACK.results(figures(moments))}
-    np.testing.assert_allclose(found["slow error"].value, np.sqrt(2.5) / 100.0, rtol=1e-5)
-    np.testing.assert_allclose(found["fast error"].value, 0.05, rtol=1e-5)
+    np.testing.assert_allclose(found["slow error"].value, np.sqrt(2.5), rtol=1e-5)
+    np.testing.assert_allclose(found["fast error"].value, 5.0, rtol=1e-5)
     assert found["after steps"].value == 50.0
     np.testing.assert_allclose(found["height"].value, 600 / 7)
     assert not any(found[name].passed for name in ("slow error", "fast error", "after steps"))

@@ -15,8 +15,8 @@ REST = 0.0225
 """Height of the ball's centre over the paddle's while they touch, m."""
 SETTLING, STEP_SETTLING = 2.0, 1.0
 """Time since a reset, and since a step of the point, after which apexes count, s."""
-BANDS = {"slow error": (0.0, 0.1, 0.015), "fast error": (0.25, 0.3, 0.03)}
-"""Speeds of a point without steps that a result judges (m/s), and the largest RMS error (m)."""
+BANDS = {"slow error": (0.0, 0.1, 1.5), "fast error": (0.25, 0.3, 3.0)}
+"""Speeds of a point without steps that a result judges (m/s), and the largest RMS error (cm)."""
 MAX_STEP_ERROR, MAX_HEIGHT_ERROR = 0.03, 0.1
 JUMP_SPEED, JUMP_ACCELERATION = 1.0, 3.0
 """A point that is faster (m/s) or accelerates more (m/s^2) has jumped."""
@@ -173,14 +173,14 @@ class Track(task.Task):
         for name, (low, top, _) in BANDS.items():
             kinds[name] = ~steps & (speed > low - 1e-6) & (speed < top + 1e-6)
             sums[name] = apex & kinds[name]
-            sums[f"{name}^2"] = sums[name] * jnp.square(error)
+            sums[f"{name}^2"] = sums[name] * jnp.square(100.0 * error)
         return task.Tally(sums, maxima=kinds)
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         sums, had, words = episodes.sums, episodes.maxima, "apexes within 3 cm, 1 s after a step"
         found = [task.share_of_events("after steps", words, sums["near"], sums["late"], 0.95)]
         for name, (low, top, most) in BANDS.items():
-            words = f"RMS distance of apex and point at {low} to {top} m/s, m"
+            words = f"RMS distance of apex and point at {low:g} to {top} m/s, cm"
             found += [task.root_mean_square(name, words, sums[f"{name}^2"], sums[name], most)]
         words, length = "apexes within 0.1 m of their height", f"{self.config.episode_seconds:g} s"
         return (
