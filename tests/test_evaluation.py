@@ -18,6 +18,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.env.env import Env, Memory
 from bounce_mjx.env.state import State
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -31,7 +32,7 @@ from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task import Tally
+from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.tasks.registry import find_task
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
@@ -794,3 +795,9 @@ def test_a_detail_is_shown_in_its_unit():
         "8 episodes: error 1.23 cm, speed 1.50 m/s, load -, tilt 180.0 deg, gap -, return 12, "
         "length 1.00 s (means), hits 34.0"
     )
+
+
+@pytest.mark.parametrize("name", ["steps", "passed", "screening"])
+def test_a_result_may_not_have_the_name_of_a_records_own_key(name: str) -> None:
+    with pytest.raises(UserError, match=f"has the name '{name}', .*; choose another name"):
+        share_of_episodes(name, "episodes", np.ones(3, bool), 0.9)

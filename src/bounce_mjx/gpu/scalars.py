@@ -29,7 +29,7 @@ Scalars = np.ndarray
 # Operations that Mosaic GPU compiles; they are applied to each element.
 _ELEMENTWISE = frozenset(
     "abs add and bitcast_convert_type cos div eq erf exp exp2 ge gt integer_pow le log lt max min "
-    "mul ne neg not or rem round rsqrt select_n sign sin sub square tanh xor convert_element_type "
+    "mul ne neg not or round rsqrt select_n sign sin sub square tanh xor convert_element_type "
     "shift_right_logical shift_left".split()
 )
 # Primitives that call a function, with the parameter that holds it.
@@ -414,6 +414,18 @@ def _pow(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(odd & is_negative, -power, power)
 
 
+def _rem(x: Scalar, y: Scalar) -> Scalar:
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return lax.rem(x, y)
+    ratio = jnp.abs(x / y)
+    rest = jnp.abs(x) - _floor(ratio) * jnp.abs(y)
+    # The ratio may round up to a whole number.
+    rest = jnp.where(rest < 0.0, rest + jnp.abs(y), rest)
+    rest = jnp.where(jnp.abs(y) == jnp.inf, jnp.abs(x), rest)
+    rest = jnp.where(jnp.abs(x) == jnp.inf, jnp.nan, rest)
+    return jnp.where((x < 0.0) | (1.0 / x < 0.0), -rest, rest)
+
+
 def _expm1(x: Scalar) -> Scalar:
     series = x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
     return jnp.where(jnp.abs(x) < 0.03, series, jnp.exp(x) - 1.0)
@@ -469,6 +481,7 @@ _REWRITTEN: dict[str, Callable[..., Scalar]] = {
     "log1p": _log1p,
     "logistic": _logistic,
     "pow": _pow,
+    "rem": _rem,
     "sinh": lambda x: 0.5 * (_expm1(x) - _expm1(-x)),
     "sqrt": _sqrt,
     "stop_gradient": lambda x: x,

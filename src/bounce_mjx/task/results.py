@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import np
 
 MARGIN_EPISODES = 64
@@ -20,6 +21,8 @@ and events, in standard errors of `MARGIN_EPISODES` episodes."""
 MARGIN_FAILURES = 0.5
 """Largest number of failed episodes, as a share of those that the bound allows, in a result that is
 met with a margin."""
+
+_TAKEN_NAMES = ("steps", "passed", "screening")
 
 Figure = Annotated[float, Field(allow_inf_nan=False)] | None
 """A measurement; None where there was nothing to measure, such as the height without a bounce."""
@@ -53,6 +56,13 @@ class Result:
     margin: Figure = None
     """How clearly the value meets the bound: 0 at the bound or beyond it, 1 where `MARGIN_EPISODES`
     other episodes should meet it too; None where the bound does not apply."""
+
+    def __post_init__(self) -> None:
+        if self.name in _TAKEN_NAMES:
+            raise UserError(
+                f"a result of the task has the name {self.name!r}, which a run's record needs for "
+                "itself; choose another name"
+            )
 
 
 def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
