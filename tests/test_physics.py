@@ -502,7 +502,11 @@ UNSUPPORTED = {
     "condim 6": ('condim="1"', 'condim="6"', "condim 6"),
     "second pair": ("</contact>", '<pair geom1="floor" geom2="ball"/></contact>', "another ball"),
     "no pair": (piece("<pair ", "  </contact>"), "", "contact pair"),
-    "pair with the floor": ('pair geom1="blocker"', 'pair geom1="floor"', "contact pair of the paddle"),
+    "pair with the floor": (
+        'pair geom1="blocker"',
+        'pair geom1="floor"',
+        "contact pair of the paddle",
+    ),
     "colliding geoms": ('<geom contype="0"', '<geom contype="1"', "contype"),
     "margin": ("<pair ", '<pair margin="0.001" ', "margin"),
     "gap": ("<pair ", '<pair gap="0.001" ', "gap"),

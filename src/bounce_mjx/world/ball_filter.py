@@ -51,7 +51,7 @@ class Constants(NamedTuple):
     """Distance from the paddle's centre to the ball's centre when they touch, m."""
 
 
-class Track(NamedTuple):
+class BallTrack(NamedTuple):
     """Estimate at the time of the last picture."""
 
     position: Array
@@ -69,7 +69,7 @@ class Track(NamedTuple):
 
 
 class BallFilter:
-    """The filter as pure functions of a `Track`.
+    """The filter as pure functions of a `BallTrack`.
 
     The argument `planes` [K, 4] holds the paddle's planes (`plane`) at the last control steps, the
     newest first; between two control steps the plane moves linearly. A motion further back than
@@ -107,10 +107,10 @@ class BallFilter:
         distance = self._xp.sum(normal * paddle) + self._constants.contact_distance
         return self._xp.concatenate([normal, distance[None]])
 
-    def start(self, position: Array, age: Array) -> Track:
+    def start(self, position: Array, age: Array) -> BallTrack:
         """Track of a ball at rest at a measured position [3]; its picture has the age [] (s)."""
         zero = self._xp.zeros_like(position)
-        return Track(
+        return BallTrack(
             position=position,
             velocity=zero,
             position_variance=zero + self._constants.measurement_noise**2,
@@ -119,7 +119,9 @@ class BallFilter:
             age=age,
         )
 
-    def add_picture(self, track: Track, planes: Array, position: Array, age: Array) -> Track:
+    def add_picture(
+        self, track: BallTrack, planes: Array, position: Array, age: Array
+    ) -> BallTrack:
         """Track after a new picture: a measured position [3] (m), and the time since it was taken
         [] (s)."""
         moved = self._moved(self._step_of_track, track, planes, track.age, age)
@@ -127,7 +129,7 @@ class BallFilter:
         gain = moved.position_variance / (moved.position_variance + noise)
         velocity_gain = moved.covariance / (moved.position_variance + noise)
         surprise = position - moved.position
-        return Track(
+        return BallTrack(
             position=moved.position + gain * surprise,
             velocity=moved.velocity + velocity_gain * surprise,
             position_variance=(1.0 - gain) * moved.position_variance,
@@ -136,7 +138,7 @@ class BallFilter:
             age=age,
         )
 
-    def present(self, track: Track, planes: Array) -> tuple[Array, Array]:
+    def present(self, track: BallTrack, planes: Array) -> tuple[Array, Array]:
         """Position [3] (m) and velocity [3] (m/s) now."""
 
         def step(motion: tuple[Array, Array], *args: Array) -> tuple[Array, Array]:
@@ -172,7 +174,7 @@ class BallFilter:
             state, _ = self._repeat(self._num_steps, one, start)
         return state
 
-    def _step_of_track(self, track: Track, plane: Array, rate: Array, dt: Array) -> Track:
+    def _step_of_track(self, track: BallTrack, plane: Array, rate: Array, dt: Array) -> BallTrack:
         """One time step of the estimate and of its variances, without a picture."""
         constants = self._constants
         position, velocity, share, leaving = self._accelerated(
@@ -187,7 +189,7 @@ class BallFilter:
         misplaced = (1.0 + constants.restitution) * constants.paddle_noise
         error = self._xp.where(leaving > 0.0, misplaced**2, 0.0)
         fast = (constants.restitution_noise * leaving) ** 2
-        return Track(
+        return BallTrack(
             position=position,
             velocity=velocity,
             position_variance=a * a * pp + 2.0 * a * b * pv + b * b * vv + squares * error,

@@ -13,7 +13,7 @@ import numpy as np
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.world.ball_filter import BallFilter, Constants, Track
+from bounce_mjx.world.ball_filter import BallFilter, Constants, BallTrack
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import World
 from bounce_mjx.world.sensing import Picture, oldest_picture
@@ -29,7 +29,7 @@ _OF_BALLS = Picture(position=0, velocity=0, age=None, number=None)
 class Estimate(NamedTuple):
     """Memory of the estimator, and its estimate."""
 
-    track: Track
+    track: BallTrack
     planes: jax.Array
     """Paddle's planes (`BallFilter.plane`) at the last control steps [K, 4], the newest first."""
     position: jax.Array

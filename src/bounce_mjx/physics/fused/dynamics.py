@@ -90,7 +90,7 @@ def step(
         motion = motion._replace(balls=tuple(map(_pushed, motion.balls, _pushes(control, model))))
     leaves, tree = jax.tree.flatten(motion)
     inputs = (_arm_control(control, addresses.actuators), parameters)
-    numbers, given = jax.tree.flatten(as_scalars(inputs, state.qpos.dtype))
+    numbers, given = jax.tree.flatten(scalars_of(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
     turns = [
@@ -146,7 +146,7 @@ def _orientation_and_spin(at: BallAddresses, state: PhysicsState) -> tuple[Quate
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
     relevant = PhysicsParameters(paddle_position=parameters.paddle_position)
-    numbers, given = jax.tree.flatten(as_scalars(relevant, qpos.dtype))
+    numbers, given = jax.tree.flatten(scalars_of(relevant, qpos.dtype))
     # A separate kernel: XLA takes long to fuse such a chain with the surrounding program.
     position = elementwise(_paddle_position(model, given), num_results=3)
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
@@ -166,7 +166,7 @@ def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     )
 
 
-def as_scalars(arrays: Any, dtype: jnp.dtype) -> Any:
+def scalars_of(arrays: Any, dtype: jnp.dtype) -> Any:
     """Arrays of one environment as scalars, or tuples of scalars, of one dtype."""
 
     def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:

@@ -101,7 +101,7 @@ class Touch(NamedTuple):
     """Jacobian [3, n] of the joints."""
 
 
-class Problem(NamedTuple):
+class ConeProblem(NamedTuple):
     """Objective 1/2 x.Q x + c.x in units of the cone, without the regulariser."""
 
     q: tuple[Scalar, ...]
@@ -313,7 +313,7 @@ def contact_force(
     m1, m2 = model.friction
     units = (1.0, m1, m2)
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    problem = Problem(
+    problem = ConeProblem(
         tuple(
             mul(entry, mul(units[i], units[j])) for entry, (i, j) in zip(matrix, pairs, strict=True)
         ),
@@ -327,7 +327,7 @@ def contact_force(
     return tuple(map(mul, x, units))
 
 
-def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Vec3:
+def in_elliptic_cone(problem: ConeProblem, normal: Scalar, tangential: Scalar) -> Vec3:
     """Minimum x in the cone |(x_1, x_2)| <= x_0, with regularisers of x_0 and of (x_1, x_2)."""
     (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
     q00, q11, q22 = q00 + normal, q11 + tangential, q22 + tangential
@@ -379,7 +379,7 @@ def in_elliptic_cone(problem: Problem, normal: Scalar, tangential: Scalar) -> Ve
     return chosen(s0, n), chosen(s1, n * u1), chosen(s2, n * u2)
 
 
-def in_pyramidal_cone(problem: Problem, regulariser: Scalar) -> Vec3:
+def in_pyramidal_cone(problem: ConeProblem, regulariser: Scalar) -> Vec3:
     """Minimum x over nonnegative combinations of the four edges, each with a regulariser.
 
     The first tangent's two edges have four active sets. Each is eliminated in turn, and the second

@@ -36,7 +36,7 @@ _ROUNDS = 3
 _SWEEPS = 5
 
 
-class Problem(NamedTuple):
+class DryFrictionProblem(NamedTuple):
     """The problem of k joints with dry friction, and of c components of the contact's force."""
 
     matrix: list[list[Scalar]]
@@ -74,8 +74,8 @@ def contact_and_friction(
       factor: Cholesky factor L of the arm's inertia matrix.
       half_applied: L^-1 times the joint forces without contact and dry friction.
       half_rows: L^-1 times each row of the contact's Jacobian.
-      contact_matrix: as in `Problem`.
-      contact_offset: as in `Problem`, without dry friction.
+      contact_matrix: as in `DryFrictionProblem`.
+      contact_offset: as in `DryFrictionProblem`, without dry friction.
       contact_force: (contact_matrix, contact_offset) -> force of the contact.
     """
     joints = [i for i, link in enumerate(links) if has_friction(link)]
@@ -87,7 +87,7 @@ def contact_and_friction(
     matrix = [[dot(a, b) for b in half] for a in half]
     for i, j in enumerate(joints):
         matrix[i][i] = add(matrix[i][i], links[j].friction_softness)
-    problem = Problem(
+    problem = DryFrictionProblem(
         matrix=matrix,
         inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
         offset=[
@@ -106,7 +106,7 @@ def contact_and_friction(
 
 
 def _solve(
-    problem: Problem, limits: Scalars, contact_force: ContactForce
+    problem: DryFrictionProblem, limits: Scalars, contact_force: ContactForce
 ) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
     """Force of the contact, and dry friction of the k joints."""
 
@@ -126,7 +126,7 @@ def _solve(
 
 
 def _sweep(
-    problem: Problem, limits: Scalars, contact: Scalars, friction: Scalars
+    problem: DryFrictionProblem, limits: Scalars, contact: Scalars, friction: Scalars
 ) -> tuple[Scalar, ...]:
     """Dry friction after each joint in turn took its best value for the present ones of the others
     (projected Gauss-Seidel)."""
@@ -141,7 +141,7 @@ def _sweep(
 
 
 def _eliminate_sticking(
-    problem: Problem, limits: Scalars, friction: Scalars, contact_force: ContactForce
+    problem: DryFrictionProblem, limits: Scalars, friction: Scalars, contact_force: ContactForce
 ) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
     """Contact force and dry friction that are exact if each joint below its limit sticks, and if
     each other joint keeps its friction."""
@@ -183,8 +183,8 @@ def _eliminate_sticking(
     )
 
 
-def _contact_offset(problem: Problem, friction: Scalars) -> tuple[Scalar, ...]:
-    """`Problem.contact_offset` with dry friction."""
+def _contact_offset(problem: DryFrictionProblem, friction: Scalars) -> tuple[Scalar, ...]:
+    """`DryFrictionProblem.contact_offset` with dry friction."""
     return tuple(
         add(offset, dot(row, friction))
         for offset, row in zip(problem.contact_offset, problem.coupling, strict=True)
