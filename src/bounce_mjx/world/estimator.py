@@ -13,7 +13,7 @@ import numpy as np
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.world.ball_filter import BallFilter, Constants, BallTrack
+from bounce_mjx.world.ball_filter import BallFilter, BallTrack, Constants
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import World
 from bounce_mjx.world.sensing import Picture, oldest_picture
