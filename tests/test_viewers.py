@@ -1028,7 +1028,9 @@ class Lean(Still):
 
     def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
         place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
-        return (task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0)),)
+        wall = task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0))
+        dots = (task.Marker(f"dot {i}", (0.1 * i, 0.0, 0.5), size, (0, 0, 1, 1)) for i in range(3))
+        return wall, *dots
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:
         return {"shelf": 0.3, "wall": 0.2 + command["lean_angle"]}
@@ -1059,6 +1061,7 @@ def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatc
         assert client.lines == ["s", "ball", "shelf", "wall", "paddle"]
         (legend,) = {text for text in client.texts if "path of the ball" in text}
         assert 'rgb(230,26,26)">&#9632;</b> high wall<' in legend
+        assert legend.count("dot") == 1
         assert any(">calm<" in text for text in client.texts)
         client.press("lean angle up")
         wait_until(lambda: leaning.command == {"lean_angle": 0.1})

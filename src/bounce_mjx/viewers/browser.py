@@ -167,12 +167,16 @@ def _reward_terms(frame: EnvFrame) -> dict[str, float]:
 def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
     markers = env.task.markers(of_environment(frame.command, 0))
-    rows = [(255.0 * np.array(marker.rgba[:3]), words(marker.name)) for marker in markers]
-    rows.append((TRAIL_RGB, f"path of the ball, {TRAIL_SECONDS} s"))
+    # Markers whose names differ by a number are parts of one.
+    rows = {
+        words(marker.name.rstrip("_ 0123456789")): 255.0 * np.array(marker.rgba[:3])
+        for marker in markers
+    }
+    rows[f"path of the ball, {TRAIL_SECONDS} s"] = TRAIL_RGB
     lines = [
         f'<b style="color:rgb({",".join(f"{c:.0f}" for c in rgb)})">&#9632;</b> '
         f"{html.escape(meaning)}<br>"
-        for rgb, meaning in rows
+        for meaning, rgb in rows.items()
     ]
     return f"""<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
 {"".join(lines)}
