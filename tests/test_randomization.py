@@ -457,7 +457,8 @@ def test_starts_are_displaced(free_run: Run) -> None:
     displaced = qpos[:6] - np.array(config.default_joint_angles)[:, None]
     np.testing.assert_allclose(displaced, start.world["joint_start"], atol=1e-9)
     ball = qpos[6:9] - np.array(config.ball_init_pos)[:, None] - start.world["ball_start"]
-    assert 0.9 * config.ball_position_noise < np.abs(ball).max() <= config.ball_position_noise
+    noise = config.reset.ball_position
+    assert 0.9 * noise < np.abs(ball).max() <= noise
 
 
 def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
