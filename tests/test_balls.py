@@ -17,6 +17,7 @@ from bounce_mjx.physics import (
     edited_model,
     fused,
     make_engine,
+    servo_targets,
 )
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -309,9 +310,8 @@ def test_a_world_of_two_balls_sees_each_late():
 
 def test_noise_and_pushes_differ_between_the_balls():
     noisy = {"ball_position_noise": (0.01, 0.01), "ball_position_bias": (0.1, 0.1)}
-    env = Env(
-        Two.Config(randomization=noisy | {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2})
-    )
+    pushed = {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2, "ball_latency": None}
+    env = Env(Two.Config(randomization=noisy | pushed))
     truths, observations, _ = after_resting(env, 40)
     at = np.array([truth.ball_position for truth in truths])
     error = observations[:, env.layout["ball_position"]].reshape(at.shape) - at - 0.1
@@ -327,25 +327,24 @@ def test_noise_and_pushes_differ_between_the_balls():
 
 def test_c_moves_several_balls_as_the_engine_does():
     """With a push, and with drag in each physics step."""
-    env, count = (
-        Env(Two.Config(randomization={"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5)})),
-        2,
-    )
+    env = Env(Two.Config(randomization={"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5)}))
+    count, num_steps = 2, env.config.num_substeps
     keys = jax.random.split(jax.random.PRNGKey(0), count)
     states = jax.vmap(env.reset, out_axes=-1)(keys)
     physics = states.pipeline_state.physics
     push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
-    ctrl = physics.qpos[:6]
-    control = Control(ctrl, air_drag=jnp.full(count, 0.5), ball_push=push)
-    inputs = jax.tree.map(np.asarray, c_episodes._control_inputs(env, control))
+    control = Control(physics.qpos[:6], air_drag=jnp.full(count, 0.5), ball_push=push)
+    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
     simulated = c_episodes.full_states(env.mj_model, physics)
-    simulated[:, c_episodes._ball_velocity(env.mj_model)] += inputs.ball_push
-    data = [mujoco.MjData(env.mj_model)]
+    balls = c_episodes._ball_velocity(env.mj_model)
+    simulated[:, balls] += np.asarray(push).reshape(-1, count).T
+    models, data = [env.mj_model] * count, [mujoco.MjData(env.mj_model)]
     with mujoco.rollout.Rollout(nthread=0) as pool:
-        models = [env.mj_model] * count
-        simulated = c_episodes._next_states(pool, models, data, simulated, inputs)
+        simulated = c_episodes._next_states(
+            pool, models, data, simulated, np.asarray(targets), np.asarray(control.air_drag)
+        )
     expected = c_episodes.physics_states(env.mj_model, simulated)
-    step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, 10), in_axes=-1, out_axes=-1)
+    step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)
     for ours, theirs in zip(step(physics, control), expected, strict=True):
         if theirs is not None:
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
