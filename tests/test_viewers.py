@@ -929,7 +929,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     # A page that fails leaves the training alone.
     stop.set()
     wait_until(
-        lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
+        lambda: "the page is not served (the end); the training continues" in printed.getvalue()
     )
     training.wait()
 
@@ -1425,7 +1425,7 @@ MISTAKES = {
     "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
     "speed": ("--speed 0", "--speed is 0", "0.1"),
-    "no host": ("--allow-host http://a", "'http://a' is no name of a host", "without http://"),
+    "no host": ("--allow-host http://a", "'http://a' is not the name of a host", "without http://"),
 }
 
 
