@@ -111,7 +111,7 @@ def _in_menagerie(name: str) -> Path:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         reason = reason_of(error)
         raise UserError(
-            f"menagerie:{shorten(name)} cannot be had ({shorten(reason, 300)}); give a model of "
+            f"menagerie:{shorten(name)} cannot be loaded ({shorten(reason, 300)}); give a model of "
             "MuJoCo Menagerie, and connect to the network for its first use"
         ) from error
 
