@@ -114,13 +114,14 @@ class Task:
     def __init__(self, config: WorldConfig):
         self.config = config
 
-    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+    def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
         terms of the randomisation, of each ball [B, 3] if there are several; None for balls at rest
         at `ball_init_pos` and above it.
 
         Args:
           draws: uniform random numbers between 0 and 1 [num_draws].
+          command: value [] of each command, as it is drawn.
         """
         return None
 
