@@ -1,7 +1,7 @@
 """What a task is made of: `Task`, its settings, reward terms, results and pictures."""
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.task.flight import GRAVITY, Flight, flight
+from bounce_mjx.task.flight import GRAVITY, Flight, closest, flight
 from bounce_mjx.task.quantities import latest
 from bounce_mjx.task.results import (
     Episodes,
@@ -60,6 +60,7 @@ __all__ = [
     "TaskStep",
     "Values",
     "WorldConfig",
+    "closest",
     "flight",
     "gaussian",
     "horizontal_distance",

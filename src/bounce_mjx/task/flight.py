@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.task.rewards import safe_sqrt
+from bounce_mjx.task.rewards import length, safe_sqrt
 
 GRAVITY = 9.81
 """m/s^2."""
@@ -37,3 +38,18 @@ def flight(ball: jax.Array, velocity: jax.Array, ground: float) -> Flight:
     top = after(rise)
     fall = rise + safe_sqrt(2.0 * (top[..., 2] - ground) / GRAVITY)
     return Flight(top, after(fall), rise, fall)
+
+
+def closest(balls: jax.Array, velocities: jax.Array, seconds: float) -> jax.Array:
+    """Smallest distance of two balls in the last `seconds` [], m. Balls in free flight see each
+    other move straight on; they can pass within a control step.
+
+    Args:
+      balls, velocities: present positions [B, 3] (m) and velocities [B, 3] (m/s).
+    """
+    distances = []
+    for i, j in itertools.combinations(range(len(balls)), 2):
+        way, speed = balls[i] - balls[j], velocities[i] - velocities[j]
+        ago = jnp.sum(way * speed) / jnp.maximum(jnp.sum(jnp.square(speed)), 1e-6)
+        distances.append(length(way - jnp.clip(ago, 0.0, seconds) * speed))
+    return jnp.min(jnp.stack(distances))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
@@ -188,8 +188,14 @@ class Task:
         """What a report draws of the first episodes of an evaluation, as NumPy arrays."""
         return ()
 
-    def markers(self, command: dict[str, float]) -> tuple[Marker, ...]:
-        """Shapes in the scene, for these commands; the same names in the same order for all."""
+    def markers(
+        self, command: dict[str, float], metrics: Mapping[str, float]
+    ) -> tuple[Marker, ...]:
+        """Shapes in the scene; the same names in the same order for all.
+
+        Args:
+          metrics: of the last step; each is 0 before the first one.
+        """
         return ()
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:

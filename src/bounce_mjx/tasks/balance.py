@@ -172,7 +172,7 @@ class Balance(task.Task):
             ),
         )
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A frame around the ball at the point."""
         x, y, z = self.focus()
         place = (x + command["point_x"], y + command["point_y"], z + 0.004)

@@ -180,7 +180,7 @@ class Catch(task.Task):
         caught = (episodes.maxima["caught"] > 0.0) & (episodes.lasted > 0.0)
         return (task.share_of_episodes("caught", measured, caught, MIN_CAUGHT),)
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc around the points at which throws aim."""
         size, green = (AIM_RADIUS, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.4)
         return (task.Marker("aim", self.focus(), size, green, "cylinder"),)

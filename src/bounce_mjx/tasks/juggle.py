@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Annotated, Any, NamedTuple
 
 from bounce_mjx import task
@@ -14,7 +13,7 @@ REST = 0.0225
 FLOWN = 0.125
 """Share of its flight that the last ball has flown at a reset."""
 SETTLING, MAX_HEIGHT_ERROR = 2.0, 0.1
-"""Time since the height was commanded after which apexes count, s, and how near they are, m."""
+"""Time since the height was commanded after which apexes count, s; and how near they are, m."""
 
 
 class Rewards(task.StrictModel):
@@ -25,7 +24,7 @@ class Rewards(task.StrictModel):
     landing: task.Near = task.Near(weight=2.0)
     """The flight ends in the column."""
     turn: task.Near = task.Near(weight=4.0)
-    """The flight ends a turn after that of the ball before it, s."""
+    """The next ball lands one turn later, s."""
     home: task.Near = task.Near(scale=0.05)
     """The paddle is at home."""
     calm: task.Near = task.Near(weight=0.1, scale=10.0)
@@ -33,16 +32,15 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """The world's quantities without the balls' rotation; the height; and the ball that lands
-    next."""
+    """The world's quantities without the balls' rotation; the height; and the next ball."""
 
     ball_quaternion: task.History = 0
     ball_angular_velocity: task.History = 0
     target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     next_ball: Annotated[task.History, task.Quantity(9)] = 1
-    """Of the ball that lands next: from the paddle and from the column to its landing (m), its
-    horizontal velocity (m/s), its apex over the height (m), the time until it lands, and until the
-    mean of all landings after that (s)."""
+    """Of the ball that lands next: its landing from the paddle and from the column (m), its
+    horizontal velocity (m/s), its apex from the height (m), the time until it lands, and from then
+    until the mean of all landings (s)."""
 
 
 class Config(task.WorldConfig):
@@ -51,15 +49,13 @@ class Config(task.WorldConfig):
     num_balls: task.NumBalls = 2
     """Number of balls, 2 or 3."""
     home: tuple[Finite, Finite, Finite] = (0.59356, 0.0, 0.0498)
-    """Home of the paddle, m; the columns are beside each other over it."""
+    """Home of the paddle, m; the columns stand beside each other over it."""
     spacing: Positive = 0.065
     """Distance between columns, m."""
     height_range: tuple[Finite, Finite] = (0.35, 0.55)
     """Range of the target height over home, m."""
     max_distance: Positive = 0.5
-    """The episode ends when a ball is this far from the top of its column, m."""
-    reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02)
-    """The noise of a reset."""
+    """The episode ends when a ball is this far from the top of its column, m; or when two touch."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
     observation: Observation = Observation()
@@ -75,7 +71,12 @@ class Config(task.WorldConfig):
     def commands(self) -> dict[str, task.Command]:
         """The height of the apexes."""
         low, high = (self.home[2] + height for height in self.height_range)
-        return {"target_height": task.Command(low, high, "m", self.home[2] + 0.1)}
+        return {"target_height": task.Command(low, high, "m", least=self.home[2] + 0.1)}
+
+    def columns(self, height: Any) -> list[tuple[Any, Any, Any]]:
+        """The wished apex of each ball, m."""
+        (x, y, _), middle = self.home, 0.5 * (self.num_balls - 1)
+        return [(x, y + self.spacing * (i - middle), height) for i in range(self.num_balls)]
 
 
 class State(NamedTuple):
@@ -92,57 +93,51 @@ class Juggle(task.Task):
     Config = Config
     num_balls = (2, 3)
     curves = (
-        task.Curve("task/alternate", "alternating", "hits", "hits in turns, %", 100.0),
+        task.Curve("task/turns", "in_turn", "hits", "hits in turns, %", 100.0),
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    def columns(self, height: jax.Array) -> jax.Array:
-        """The wished apexes [B, 3], m."""
-        (x, y, _), count = self.config.home, self.config.num_balls
-        places = y + self.config.spacing * (jnp.arange(count) - 0.5 * (count - 1))
-        return jnp.stack([jnp.full_like(places, x), places, height + 0.0 * places], axis=1)
-
-    def period(self, height: jax.Array) -> jax.Array:
-        """Time of a flight to the height [], s."""
-        return 2.0 * task.safe_sqrt(2.0 * (height - self.config.home[2] - REST) / task.GRAVITY)
+    def _columns(self, height: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The wished apexes [B, 3] (m) and the time of a whole flight to them [] (s)."""
+        fall = task.safe_sqrt(2.0 * (height - self.config.home[2] - REST) / task.GRAVITY)
+        columns = [jnp.stack([*map(jnp.asarray, top)]) for top in self.config.columns(height)]
+        return jnp.stack(columns), 2.0 * fall
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land in turns, the first one first."""
-        columns, count = self.columns(command["target_height"]), self.config.num_balls
-        period, turns = self.period(command["target_height"]), jnp.arange(count)[::-1] / count
-        rise = (0.5 - FLOWN - turns) * period
-        up = jnp.array([0.0, 0.0, 1.0])
-        drop = 0.5 * task.GRAVITY * jnp.square(rise)
-        return columns - drop[:, None] * up, task.GRAVITY * rise[:, None] * up
+        columns, period = self._columns(command["target_height"])
+        turns = jnp.arange(self.config.num_balls)[::-1, None] / self.config.num_balls
+        rise = (0.5 - FLOWN - turns) * period * jnp.array([0.0, 0.0, 1.0])
+        return columns - 0.5 * task.GRAVITY * jnp.square(rise), task.GRAVITY * rise
 
     def reset(self, start: task.Start) -> State:
-        rising = start.truth.ball_velocity[:, 2] > 0.0
-        return State(rising, jnp.full((), self.config.num_balls - 1.0))
+        last = jnp.full((), self.config.num_balls - 1.0)
+        return State(start.truth.ball_velocity[:, 2] > 0.0, last)
 
     def step(self, state: State, step: task.Step) -> task.TaskStep:
-        truth, height, home = step.truth, step.command["target_height"], jnp.array(self.config.home)
-        balls, velocities, count = truth.ball_position, truth.ball_velocity, self.config.num_balls
-        flights, columns = task.flight(balls, velocities, home[2] + REST), self.columns(height)
-        period = self.period(height)
-        waits = jnp.roll(flights.fall, -1) - flights.fall - period / count
-        waits = jnp.mod(waits + 0.5 * period, period) - 0.5 * period
+        truth, height, count = step.truth, step.command["target_height"], self.config.num_balls
+        balls, velocities, home = truth.ball_position, truth.ball_velocity, self.config.home
+        flights = task.flight(balls, velocities, home[2] + REST)
+        columns, period = self._columns(height)
+        early = jnp.roll(flights.fall, -1) - flights.fall - period / count
         action_change = step.action - step.last_action
         errors = {
             "apex": (flights.top - columns) * jnp.array([1.0, 1.0, 0.3]),
             "landing": (flights.end - columns)[:, :2],
-            "turn": waits[:, None],
-            "home": (truth.paddle_position - home)[None],
+            "turn": (jnp.mod(early + 0.5 * period, period) - 0.5 * period)[:, None],
+            "home": (truth.paddle_position - jnp.array(home))[None],
             "calm": jnp.concatenate([truth.joint_velocities, action_change])[None],
         }
-        rising = velocities[:, 2] > 0.0
-        hits, turns = rising & ~state.rising, jnp.arange(count)
-        alternating = hits & (turns == jnp.mod(state.last + 1.0, count))
-        tops = state.rising & ~rising & (balls[:, 2] > home[2] + MAX_HEIGHT_ERROR)
+        rising, numbers = velocities[:, 2] > 0.0, jnp.arange(count)
+        hits = rising & ~state.rising
+        apexes = state.rising & ~rising & (balls[:, 2] > home[2] + MAX_HEIGHT_ERROR)
+        height_errors = jnp.abs(balls[:, 2] - height)
         far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
-        touched = self._closest(balls, velocities) < 2.0 * self.config.robot.ball.radius
-        last = jnp.where(jnp.any(hits), jnp.max(turns * hits), state.last)
+        closest = task.closest(balls, velocities, self.config.control_dt)
+        touched = closest < 2.0 * self.config.robot.ball.radius
+        landing = _next(flights.end, flights.fall)
         return task.TaskStep(
-            state=State(rising, last),
+            state=State(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), state.last)),
             reward={
                 name: term.weight * jnp.mean(jax.vmap(term.value)(errors[name]))
                 for name, term in self.config.reward
@@ -150,65 +145,74 @@ class Juggle(task.Task):
             ended=jnp.any(far | (balls[:, 2] < home[2])) | touched,
             metrics={
                 "hits": jnp.sum(hits),
-                "alternating": jnp.sum(alternating),
-                "apexes": jnp.sum(tops),
-                "high": jnp.sum(tops & (jnp.abs(balls[:, 2] - height) <= MAX_HEIGHT_ERROR)),
-                "height_error": jnp.sum(jnp.where(tops, jnp.abs(balls[:, 2] - height), 0.0)),
+                "in_turn": jnp.sum(hits & (numbers == jnp.mod(state.last + 1.0, count))),
+                "apexes": jnp.sum(apexes),
+                "high": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
+                "height_error": jnp.sum(apexes * height_errors),
                 "touched": touched,
+                "landing_x": landing[0],
+                "landing_y": landing[1],
             },
         )
 
-    def _closest(self, balls: jax.Array, velocities: jax.Array) -> jax.Array:
-        """Smallest distance between two balls during the step [], m, which may be within it: they
-        pass each other at 3 m/s. In free flight, a ball seen from another one moves straight on."""
-        distances = []
-        for i, j in itertools.combinations(range(self.config.num_balls), 2):
-            way, speed = balls[i] - balls[j], velocities[i] - velocities[j]
-            since = jnp.sum(way * speed) / jnp.maximum(jnp.sum(speed * speed), 1e-6)
-            since = jnp.clip(since, 0.0, self.config.control_dt)
-            distances.append(task.length(way - since * speed))
-        return jnp.min(jnp.stack(distances))
-
     def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
-        return (), {"next_ball": self._next_ball(measured)}
+        height, velocities = measured["target_height"][0], measured["ball_velocity"]
+        ground, (columns, _) = self.config.home[2] + REST, self._columns(height)
+        top, end, _, fall = task.flight(measured["ball_position"], velocities, ground)
+        parts = (
+            (end - measured["paddle_position"])[:, :2],
+            (end - columns)[:, :2],
+            velocities[:, :2],
+            jnp.stack([top[:, 2] - height, fall, jnp.mean(fall) - fall], axis=1),
+        )
+        return (), {"next_ball": _next(jnp.concatenate(parts, axis=1), fall)}
 
     def next_quantities(
         self, memory: Any, seen: task.Values, measured: task.Values
     ) -> tuple[Any, task.Values]:
-        newest = self._next_ball(measured)
-        return memory, {n: task.latest(h, True, True, newest) for n, h in seen.items()}
-
-    def _next_ball(self, measured: task.Values) -> jax.Array:
-        height, velocities = measured["target_height"][0], measured["ball_velocity"]
-        ground = self.config.home[2] + REST
-        flights = task.flight(measured["ball_position"], velocities, ground)
-        parts = (
-            (flights.end - measured["paddle_position"])[:, :2],
-            (flights.end - self.columns(height))[:, :2],
-            velocities[:, :2],
-            (flights.top[:, 2] - height)[:, None],
-            flights.fall[:, None],
-            (jnp.mean(flights.fall) - flights.fall)[:, None],
-        )
-        first, *others = jnp.concatenate(parts, axis=1)
-        for other in others:
-            first = jnp.where(other[7] < first[7], other, first)
-        return first
+        newest = self.first_quantities(measured)[1]
+        return (), {n: task.latest(h, True, True, newest[n]) for n, h in seen.items()}
 
     def tally(self, moment: task.Moment) -> task.Tally:
         metrics, settled = moment.metrics, moment.command_seconds > SETTLING
-        sums = {name: metrics[name] for name in ("hits", "alternating")}
+        sums = {name: metrics[name] for name in ("hits", "in_turn")}
         sums |= {name: settled * metrics[name] for name in ("apexes", "high")}
         return task.Tally(sums, {"touched": metrics["touched"]})
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        sums, length = episodes.sums, f"{self.config.episode_seconds:g} s"
-        apart, lasted = episodes.maxima["touched"] == 0.0, episodes.lasted
-        hits, alternating = sums["hits"], sums["alternating"]
+        sums, apart = episodes.sums, episodes.maxima["touched"] == 0.0
+        kept, high = f"episodes that keep all balls {self.config.episode_seconds:g} s", sums["high"]
         words = "apexes within 0.1 m of the height"
         return (
-            task.share_of_episodes("kept", f"episodes that keep all balls {length}", lasted, 0.99),
-            task.share_of_events("turns", "hits in turns", alternating, hits, 0.99),
+            task.share_of_episodes("kept", kept, episodes.lasted, 0.99),
+            task.share_of_events("turns", "hits in turns", sums["in_turn"], sums["hits"], 0.99),
             task.share_of_episodes("apart", "episodes without touching balls", apart, 0.99),
-            task.share_of_events("height", words, sums["high"], sums["apexes"], 0.95),
+            task.share_of_events("height", words, high, sums["apexes"], 0.95),
         )
+
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
+        """A disc on top of each column, and a frame where the next ball lands."""
+        look = ((0.02, 0.001, 0.0), (0.15, 0.9, 0.3, 0.6), "cylinder")
+        tops = enumerate(self.config.columns(command["target_height"]), start=1)
+        place = (metrics["landing_x"], metrics["landing_y"], self.config.home[2] + 0.005)
+        return (
+            *(task.Marker(f"target height {i}", top, *look) for i, top in tops),
+            task.Marker("next ball", place, (0.021, 0.021, 0.001), (1.0, 0.8, 0.1, 0.9), "frame"),
+        )
+
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        return {"target": command["target_height"]}
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"target": f"{command['target_height']:.2f} m"}
+
+    def focus(self) -> tuple[float, float, float]:
+        return self.config.home
+
+
+def _next(values: jax.Array, falls: jax.Array) -> jax.Array:
+    """The row of values [B, n] of the ball that lands next."""
+    chosen, soonest = values[0], jnp.min(falls)
+    for value, fall in zip(values[1:], falls[1:], strict=True):
+        chosen = jnp.where(fall <= soonest, value, chosen)
+    return chosen

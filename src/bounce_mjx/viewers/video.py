@@ -19,7 +19,7 @@ from bounce_mjx.viewers.simulation import (
     Simulation,
     frame_at,
     frame_readings,
-    of_environment,
+    pose_of,
     resample,
 )
 from bounce_mjx.viewers.trail import Trail
@@ -110,8 +110,7 @@ class VideoWriter:
             for i in range(len(frames.time)):
                 frame = frame_at(frames, i)
                 trail.add(frame)
-                command = of_environment(frame.command, 0)
-                picture = renderer.render(frame.qpos[0], command, trail.points[:, 0])
+                picture = renderer.render(*pose_of(frame, 0), trail.points[:, 0])
                 yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 
