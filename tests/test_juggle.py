@@ -9,7 +9,7 @@ import pytest
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import REST, Config, Juggle, State
+from bounce_mjx.tasks.juggle import REST, Config, Juggle
 from bounce_mjx.viewers.display import Display
 
 JUGGLE = Juggle(Config())
@@ -50,7 +50,7 @@ def truth(balls: np.ndarray, velocities: np.ndarray) -> task.Kinematics:
 
 
 @jax.jit
-def stepped(state: State, balls: jax.Array, velocities: jax.Array) -> task.TaskStep:
+def stepped(state: tuple, balls: jax.Array, velocities: jax.Array) -> task.TaskStep:
     command, action = {"target_height": jnp.float32(0.5)}, jnp.zeros(6)
     return JUGGLE.step(state, task.Step(truth(balls, velocities), command, action, action))
 
@@ -58,7 +58,7 @@ def stepped(state: State, balls: jax.Array, velocities: jax.Array) -> task.TaskS
 def test_hits_count_in_turns() -> None:
     """A ball that is hit twice, and two balls that are hit at once, are out of turn."""
     columns = np.array(JUGGLE.config.columns(0.0)) + [0.0, 0.0, 0.2]
-    state, counted = State(jnp.array([False, True]), jnp.float32(1.0)), []
+    state, counted = (jnp.array([False, True]), jnp.float32(1.0)), []
     # Which balls rise after each step: 1 is hit, 2, 1, 1 again, and both.
     for rising in [(1, 1), (1, 0), (1, 1), (0, 1), (1, 1), (0, 1), (1, 1), (0, 0), (1, 1)]:
         done = stepped(state, columns, np.outer(2.0 * np.array(rising) - 1.0, [0.0, 0.0, 1.0]))
@@ -110,7 +110,7 @@ def test_the_reward_of_turns_is_greatest_half_a_period_apart() -> None:
         """Of two flights, of which the second starts `delay` periods later."""
         rise = (0.5 - np.array([flown, (flown - delay) % 1.0])) * period
         balls = columns - np.outer(0.5 * 9.81 * rise**2, [0.0, 0.0, 1.0])
-        done = stepped(State(rise > 0, 0.0), balls, np.outer(9.81 * rise, [0.0, 0.0, 1.0]))
+        done = stepped((rise > 0, 0.0), balls, np.outer(9.81 * rise, [0.0, 0.0, 1.0]))
         return float(done.reward["turn"])
 
     for flown in (0.1, 0.3, 0.6, 0.9):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from bounce_mjx import task
 from bounce_mjx.config.settings import Finite, Positive
@@ -54,7 +54,7 @@ class Config(task.WorldConfig):
     """Distance between columns, m."""
     height_range: tuple[Finite, Finite] = (0.35, 0.55)
     """Range of the target height over home, m."""
-    max_distance: Positive = 0.5
+    max_distance: Positive = 0.7
     """The episode ends when a ball is this far from the top of its column, m; or when two touch."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
@@ -77,14 +77,6 @@ class Config(task.WorldConfig):
         """The wished apex of each ball, m."""
         (x, y, _), middle = self.home, 0.5 * (self.num_balls - 1)
         return [(x, y + self.spacing * (i - middle), height) for i in range(self.num_balls)]
-
-
-class State(NamedTuple):
-    """What the task keeps of an episode: whether each ball rises [B], and the number of the ball
-    that the paddle hit last []."""
-
-    rising: jax.Array
-    last: jax.Array
 
 
 class Juggle(task.Task):
@@ -110,42 +102,38 @@ class Juggle(task.Task):
         rise = (0.5 - FLOWN - turns) * period * jnp.array([0.0, 0.0, 1.0])
         return columns - 0.5 * task.GRAVITY * jnp.square(rise), task.GRAVITY * rise
 
-    def reset(self, start: task.Start) -> State:
-        last = jnp.full((), self.config.num_balls - 1.0)
-        return State(start.truth.ball_velocity[:, 2] > 0.0, last)
+    def reset(self, start: task.Start) -> Any:
+        # Whether each ball rises, and the number of the ball that was hit last.
+        return start.truth.ball_velocity[:, 2] > 0.0, jnp.full((), self.config.num_balls - 1.0)
 
-    def step(self, state: State, step: task.Step) -> task.TaskStep:
+    def step(self, state: Any, step: task.Step) -> task.TaskStep:
+        (rose, last), terms = state, self.config.reward
         truth, height, count = step.truth, step.command["target_height"], self.config.num_balls
         balls, velocities, home = truth.ball_position, truth.ball_velocity, self.config.home
         flights = task.flight(balls, velocities, home[2] + REST)
         columns, period = self._columns(height)
         early = jnp.roll(flights.fall, -1) - flights.fall - period / count
-        action_change = step.action - step.last_action
         errors = {
             "apex": (flights.top - columns) * jnp.array([1.0, 1.0, 0.3]),
             "landing": (flights.end - columns)[:, :2],
             "turn": (jnp.mod(early + 0.5 * period, period) - 0.5 * period)[:, None],
             "home": (truth.paddle_position - jnp.array(home))[None],
-            "calm": jnp.concatenate([truth.joint_velocities, action_change])[None],
+            "calm": jnp.concatenate([truth.joint_velocities, step.action - step.last_action])[None],
         }
         rising, numbers = velocities[:, 2] > 0.0, jnp.arange(count)
-        hits = rising & ~state.rising
-        apexes = state.rising & ~rising & (balls[:, 2] > home[2] + MAX_HEIGHT_ERROR)
+        hits, apexes = rising & ~rose, rose & ~rising & (balls[:, 2] > home[2] + MAX_HEIGHT_ERROR)
         height_errors = jnp.abs(balls[:, 2] - height)
         far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
         closest = task.closest(balls, velocities, self.config.control_dt)
         touched = closest < 2.0 * self.config.robot.ball.radius
         landing = _next(flights.end, flights.fall)
         return task.TaskStep(
-            state=State(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), state.last)),
-            reward={
-                name: term.weight * jnp.mean(jax.vmap(term.value)(errors[name]))
-                for name, term in self.config.reward
-            },
+            state=(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), last)),
+            reward={n: t.weight * jnp.mean(jax.vmap(t.value)(errors[n])) for n, t in terms},
             ended=jnp.any(far | (balls[:, 2] < home[2])) | touched,
             metrics={
                 "hits": jnp.sum(hits),
-                "in_turn": jnp.sum(hits & (numbers == jnp.mod(state.last + 1.0, count))),
+                "in_turn": jnp.sum(hits & (numbers == jnp.mod(last + 1.0, count))),
                 "apexes": jnp.sum(apexes),
                 "high": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
                 "height_error": jnp.sum(apexes * height_errors),
@@ -167,34 +155,32 @@ class Juggle(task.Task):
         )
         return (), {"next_ball": _next(jnp.concatenate(parts, axis=1), fall)}
 
-    def next_quantities(
-        self, memory: Any, seen: task.Values, measured: task.Values
-    ) -> tuple[Any, task.Values]:
+    def next_quantities(self, memory: Any, seen: Any, measured: Any) -> tuple[Any, task.Values]:
         newest = self.first_quantities(measured)[1]
         return (), {n: task.latest(h, True, True, newest[n]) for n, h in seen.items()}
 
     def tally(self, moment: task.Moment) -> task.Tally:
         metrics, settled = moment.metrics, moment.command_seconds > SETTLING
-        sums = {name: metrics[name] for name in ("hits", "in_turn")}
-        sums |= {name: settled * metrics[name] for name in ("apexes", "high")}
+        counts = {"hits": 1.0, "in_turn": 1.0, "apexes": settled, "high": settled}
+        sums = {name: counted * metrics[name] for name, counted in counts.items()}
         return task.Tally(sums, {"touched": metrics["touched"]})
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         sums, apart = episodes.sums, episodes.maxima["touched"] == 0.0
-        kept, high = f"episodes that keep all balls {self.config.episode_seconds:g} s", sums["high"]
-        words = "apexes within 0.1 m of the height"
         return (
-            task.share_of_episodes("kept", kept, episodes.lasted, 0.99),
+            task.share_of_episodes("kept", "episodes that keep all balls", episodes.lasted, 0.99),
             task.share_of_events("turns", "hits in turns", sums["in_turn"], sums["hits"], 0.99),
             task.share_of_episodes("apart", "episodes without touching balls", apart, 0.99),
-            task.share_of_events("height", words, high, sums["apexes"], 0.95),
+            task.share_of_events(
+                "height", "apexes within 0.1 m", sums["high"], sums["apexes"], 0.95
+            ),
         )
 
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc on top of each column, and a frame where the next ball lands."""
         look = ((0.02, 0.001, 0.0), (0.15, 0.9, 0.3, 0.6), "cylinder")
         tops = enumerate(self.config.columns(command["target_height"]), start=1)
-        place = (metrics["landing_x"], metrics["landing_y"], self.config.home[2] + 0.005)
+        place = (metrics["landing_x"], metrics["landing_y"], self.config.home[2] + REST)
         return (
             *(task.Marker(f"target height {i}", top, *look) for i, top in tops),
             task.Marker("next ball", place, (0.021, 0.021, 0.001), (1.0, 0.8, 0.1, 0.9), "frame"),
@@ -205,9 +191,6 @@ class Juggle(task.Task):
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"target": f"{command['target_height']:.2f} m"}
-
-    def focus(self) -> tuple[float, float, float]:
-        return self.config.home
 
 
 def _next(values: jax.Array, falls: jax.Array) -> jax.Array:
