@@ -50,8 +50,10 @@ def truth(balls: np.ndarray, velocities: np.ndarray) -> task.Kinematics:
 
 
 @jax.jit
-def stepped(state: tuple, balls: jax.Array, velocities: jax.Array) -> task.TaskStep:
-    command, action = {"target_height": jnp.float32(0.5)}, jnp.zeros(6)
+def stepped(
+    state: tuple, balls: jax.Array, velocities: jax.Array, height: float = 0.5
+) -> task.TaskStep:
+    command, action = {"target_height": jnp.float32(height)}, jnp.zeros(6)
     return JUGGLE.step(state, task.Step(truth(balls, velocities), command, action, action))
 
 
@@ -66,6 +68,23 @@ def test_hits_count_in_turns() -> None:
         counted.append((int(done.metrics["hits"]), int(done.metrics["in_turn"])))
     assert counted[::2] == [(1, 1), (1, 1), (1, 1), (1, 0), (2, 1)]
     assert counted[1::2] == [(0, 0)] * 4
+
+
+@pytest.mark.parametrize("height", [0.4, 0.6])
+def test_an_episode_ends_with_a_lost_ball_or_a_touch(height: float) -> None:
+    """And not while one ball is hit and the other one is at its apex."""
+    columns = np.array(JUGGLE.config.columns(height))
+    up, state = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 0.0]]), (jnp.array([False, True]), 1.0)
+
+    def ends(first: list[float]) -> bool:
+        return bool(stepped(state, np.array([first, columns[1]]), up, height).ended)
+
+    x, y, _ = columns[0]
+    assert not ends([x, y, HOME[2] + REST])
+    assert not ends([x, y, height])
+    assert ends([x, y, HOME[2] - 0.01])
+    assert ends([x + 0.8, y, height])
+    assert ends([x, columns[1, 1] - 0.03, height])
 
 
 def test_balls_touch_as_in_mujoco() -> None:
