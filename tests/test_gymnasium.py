@@ -20,7 +20,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.gymnasium import batch, environments
-from bounce_mjx.adapters.gymnasium.registration import ENV_ID, MAX_EPISODE_STEPS
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID, EPISODE_STEPS
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
@@ -128,7 +128,7 @@ def test_each_task_of_the_package_has_a_name() -> None:
     own = {
         name for name in registered_tasks() if find_task(name).__module__.startswith("bounce_mjx")
     }
-    assert own == set(MAX_EPISODE_STEPS)
+    assert own == set(EPISODE_STEPS)
     for name in own:
         spec = gymnasium.spec(f"bounce_mjx/{name.title()}-v0")
         assert spec.max_episode_steps == find_task(name).Config().episode_steps

@@ -8,9 +8,11 @@ ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
 """Name of any other one, with the argument `task`."""
-MAX_EPISODE_STEPS = {"balance": 2000, "bounce": 2000, "catch": 300, "juggle": 2000, "track": 2000}
+EPISODE_STEPS = {"balance": 2000, "bounce": 2000, "catch": 300, "juggle": 2000, "track": 2000}
 """Steps of an episode of each of the package's tasks. Constants, because reading a config takes
 time at each import of Gymnasium."""
+MAX_EPISODE_STEPS = EPISODE_STEPS["bounce"]
+"""Steps of an episode of any other task."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
@@ -32,12 +34,12 @@ def register() -> None:
     import gymnasium
 
     tasks = dict.fromkeys((ENV_ID, TASK_ID), "bounce")
-    tasks |= {f"bounce_mjx/{task.title()}-v0": task for task in MAX_EPISODE_STEPS}
+    tasks |= {f"bounce_mjx/{task.title()}-v0": task for task in EPISODE_STEPS}
     for name, task in tasks.items():
         gymnasium.register(
             name,
             entry_point=f"{_MODULE}:TaskEnv",
             vector_entry_point=f"{_MODULE}:TaskVectorEnv",
-            max_episode_steps=MAX_EPISODE_STEPS[task],
+            max_episode_steps=EPISODE_STEPS[task],
             kwargs={"task": task},
         )
