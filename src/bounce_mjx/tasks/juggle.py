@@ -8,10 +8,9 @@ from bounce_mjx import task
 from bounce_mjx.config.settings import Finite, Positive
 from bounce_mjx.lazy import jax, jnp
 
-REST = 0.0225
-"""Height of a ball's centre over the paddle's while they touch, m."""
-FLOWN = 0.125
-"""Share of its flight that the last ball has flown at a reset."""
+REST, FLOWN = 0.0225, 0.125
+"""Height of a ball's centre over the paddle's while they touch, m; and the share of its flight that
+the last ball has flown at a reset."""
 SETTLING, MAX_HEIGHT_ERROR = 2.0, 0.1
 """Time since the height was commanded after which apexes count, s; and how near they are, m."""
 
