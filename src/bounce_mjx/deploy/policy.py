@@ -52,7 +52,7 @@ class DeployedPolicy:
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
             raise UserError(
-                f"{source} is no policy of this version of the package ({reason}); give a file "
+                f"{source} is not a policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
         self.reset()
@@ -177,7 +177,9 @@ class DeployedPolicy:
         """Copies of the measurements as arrays, with defaults for optional ones."""
         for name in measurements:
             if name not in self.units:
-                raise UserError(f"{name} is no measurement; a step takes {', '.join(self.units)}")
+                raise UserError(
+                    f"{name} is not a measurement; a step takes {', '.join(self.units)}"
+                )
         missing = [name for name in self.needs if name not in measurements]
         if missing:
             raise UserError(
