@@ -18,6 +18,7 @@ from bounce_mjx.deploy.metadata import (
     MEASURED,
     NEXT,
     UNITS,
+    CommandLimits,
     CommandRange,
     Hinge,
     Input,
@@ -43,7 +44,7 @@ _INPUT_NAMES = {"action": "past_actions"}
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
     "where base is the joint angles of the same observation; with max_lead, it is the last servo "
-    "target within max_lead of them"
+    "target within max_lead of them; with limits, the command moves toward it within them"
 )
 
 
@@ -147,6 +148,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         action=_ACTION,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
+        limits=_limits(env),
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
@@ -167,6 +169,14 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
     )
+
+
+def _limits(env: WorldConfig) -> CommandLimits | None:
+    """The limits of the commands, None without."""
+    limits = env.robot.limits
+    if limits.velocity is None:
+        return None
+    return CommandLimits(limits.velocity, limits.acceleration, limits.jerk)
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
