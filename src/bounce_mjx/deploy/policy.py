@@ -1,6 +1,6 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -234,8 +234,13 @@ class DeployedPolicy:
             users["joint_angles"] |= users["ball_position"]
         return tuple(name for name in users if users[name] & reads)
 
-    def checked(self, measurements: Mapping[str, Any]) -> Measurements:
+    def checked(
+        self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
+    ) -> Measurements:
         """Copies of the measurements as arrays, with defaults for optional ones.
+
+        Args:
+          needs: those that may not be missing; by default, `needs`.
 
         Raises:
           UserError: as `step`.
@@ -243,11 +248,12 @@ class DeployedPolicy:
         for name in measurements:
             if name not in self.units:
                 raise UserError(f"{name} is no measurement; a step takes {', '.join(self.units)}")
-        missing = [name for name in self.needs if name not in measurements]
+        needs = self.needs if needs is None else needs
+        missing = [name for name in needs if name not in measurements]
         if missing:
             raise UserError(
-                f"the measurement {missing[0]} is missing; this policy needs "
-                f"{', '.join(self.needs)} in every step"
+                f"the measurement {missing[0]} is missing; this policy needs {', '.join(needs)} in "
+                "every step"
             )
         checked = {"ball_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
         checked["ball_angular_velocity"] = np.zeros(3)

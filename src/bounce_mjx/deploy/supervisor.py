@@ -100,37 +100,41 @@ class Supervisor:
             `ball_age` a picture is as old as the time since the ball's position last changed.
 
         Raises:
-          UserError: the first measurements are wrong, so that no command is known.
+          UserError: the first joint angles are wrong, so that no command is known.
         """
         policy = self._policy
-        try:
-            measured = policy.checked(measurements)
-        except UserError as error:
-            if policy.targets is None:
-                raise
-            self.stop(str(error))
-            measured = {}
-        fault = self._fault(measured) if self.state == "running" else None
-        if fault is None and self.state == "running":
-            try:
-                policy.step(measurements)
-                fault = self._wrong_target(measured)
-            except UserError as error:
-                fault = str(error)
+        if self.state == "running":
+            fault = self._step(measurements)
             if fault is None:
                 return policy.commands(self._rate)
-        if fault is not None:
             self.stop(fault)
+        angles = None
+        if policy.targets is None:
+            # Only the first command starts from the measured angles; no camera is needed for it.
+            given = {k: v for k, v in measurements.items() if k == "joint_angles"}
+            angles = policy.checked(given, ("joint_angles",))["joint_angles"]
         if self.state == "homing":
-            self._go_home(measured)
+            self._go_home(angles)
         else:
-            policy.hold(measured.get("joint_angles"))
+            policy.hold(angles)
             if self.state == "braking" and policy.is_still:
                 self.state = "stopped"
         return policy.commands(self._rate)
 
-    def _go_home(self, measured: Measurements) -> None:
-        policy, angles = self._policy, measured.get("joint_angles")
+    def _step(self, measurements: Mapping[str, Any]) -> str | None:
+        """A step of the policy; what is wrong with it, if anything is."""
+        try:
+            measured = self._policy.checked(measurements)
+            fault = self._fault(measured)
+            if fault is None:
+                self._policy.step(measurements)
+                fault = self._wrong_target()
+        except UserError as error:
+            fault = str(error)
+        return fault
+
+    def _go_home(self, angles: np.ndarray | None) -> None:
+        policy = self._policy
         home = np.array(policy.metadata.default_joint_angles)
         at = angles if policy.targets is None else policy.targets
         if np.abs(at - home).max() > _HOME_TOLERANCE:
@@ -167,7 +171,7 @@ class Supervisor:
             return f"a joint has {np.abs(speeds).max():.3g} rad/s"
         return None
 
-    def _wrong_target(self, measured: Measurements) -> str | None:
+    def _wrong_target(self) -> str | None:
         """What is wrong with the command at the end of the control step."""
         if self._box is None:
             return None
