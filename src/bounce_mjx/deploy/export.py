@@ -44,8 +44,9 @@ _INPUT_NAMES = {"action": "past_actions"}
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
     "where base is the joint angles of the same observation; with max_lead, it is the last servo "
-    "target within max_lead of them; with limits, the command moves toward it within them"
+    "target within max_lead of them"
 )
+_LIMITED = "; the command moves toward it within limits"
 
 
 def export_onnx(checkpoint: Checkpoint) -> bytes:
@@ -145,7 +146,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         velocity=velocity if filtered or velocity != "filter" else "measured",
         estimator=filter_constants(env, m) if filtered else None,
         control_dt=env.control_dt,
-        action=_ACTION,
+        action=_ACTION if env.robot.limits.velocity is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
         limits=_limits(env),

@@ -143,8 +143,12 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name."""
-    return {name: json.dumps(value, allow_nan=False) for name, value in _plain(metadata).items()}
+    """JSON texts of the metadata by field name. Limits that there are not have no entry, so that
+    files from before them are as new."""
+    plain = _plain(metadata)
+    if metadata.limits is None:
+        del plain["limits"]
+    return {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
