@@ -1,14 +1,17 @@
 """A policy in the control loop of a simulated robot with a late and noisy camera.
 
-`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX.
+`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX. With `--log`,
+it writes the log from which `bounce-mjx identify` estimates the robot's world.
 """
 
 import argparse
+import contextlib
 
 import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.resources import resource_path
 
@@ -36,7 +39,9 @@ class Camera:
         return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
 
 
-def simulate(policy, camera: Camera, seconds: float, height: float) -> list[tuple[int, float]]:
+def simulate(
+    policy, camera: Camera, seconds: float, target_height: float, recorder: Recorder | None = None
+) -> list[tuple[int, float]]:
     """Bounces and length (s) of each episode; after a loss of the ball, the arm starts again."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
@@ -46,17 +51,20 @@ def simulate(policy, camera: Camera, seconds: float, height: float) -> list[tupl
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
         joint.qpos = angle
     policy.reset()
+    camera.look(data.time, ball.qpos[:3])
     arm = policy.supervise(rate=1.0 / model.opt.timestep, box=((0.2, -0.5, -0.2), (1.0, 0.5, 0.6)))
     episodes, begun, bounces, falling = [], 0.0, 0, False
     while data.time < seconds - 1e-6:
         measured = {
             "joint_angles": [joint.qpos[0] for joint in joints],
             "joint_velocities": [joint.qvel[0] for joint in joints],
-            "target_height": height,
+            "target_height": target_height,
             "time": data.time,
+            **camera.measure(data.time),
         }
-        camera.look(data.time, ball.qpos[:3])
-        commands = arm.commands(measured | camera.measure(data.time))
+        commands = arm.commands(measured)
+        if recorder is not None:
+            recorder.step(measured, commands[-1])
         if arm.state == "ready":
             arm.start()
             begun, bounces, falling = data.time, 0, False
@@ -64,7 +72,6 @@ def simulate(policy, camera: Camera, seconds: float, height: float) -> list[tupl
             episodes.append((bounces, data.time - begun))
             arm.restart()
         for command in commands:
-            camera.look(data.time, ball.qpos[:3])
             data.ctrl[:] = command
             mujoco.mj_step(model, data)
             if arm.state != "running" and arm.state != "braking":
@@ -72,6 +79,7 @@ def simulate(policy, camera: Camera, seconds: float, height: float) -> list[tupl
                 ball.qpos[:], ball.qvel[:] = held, 0.0
             bounces += falling and ball.qvel[2] > 0.0
             falling = ball.qvel[2] < 0.0
+            camera.look(data.time, ball.qpos[:3])
     return [*episodes, (int(bounces), data.time - begun)] if arm.state == "running" else episodes
 
 
@@ -80,8 +88,13 @@ if __name__ == "__main__":
     parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--target-height", type=float, default=0.5, help="m")
+    parser.add_argument("--log", help="CSV file for the log, which must not exist")
     given = parser.parse_args()
-    with exit_on_user_error():
-        robot = load_policy(given.policy)
-        for count, lasted in simulate(robot, Camera(), given.seconds, given.target_height):
-            print(f"{count} bounces in {lasted:.1f} s of {given.seconds:g} s")
+    with exit_on_user_error(), contextlib.ExitStack() as files:
+        robot, recorder = load_policy(given.policy), None
+        if given.log:
+            joints = robot.metadata.joint_names
+            recorder = files.enter_context(Recorder(given.log, joints, {"target_height": "m"}))
+        seconds, height = given.seconds, given.target_height
+        for count, lasted in simulate(robot, Camera(), seconds, height, recorder):
+            print(f"{count} bounces in {lasted:.1f} s of {seconds:g} s")

@@ -11,16 +11,19 @@ import pydantic
 import pytest
 from rich.console import Console
 
+from bounce_mjx import BounceBall, load_policy
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.learning.policy import act, make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_policy
 
 FOLDER = resource_path("pretrained")
@@ -47,6 +50,24 @@ def measured() -> Report:
 @pytest.fixture
 def console() -> Console:
     return Console(width=200, no_color=True)
+
+
+RELEASES = sorted((Path(__file__).parent / "releases").iterdir())
+
+
+@pytest.mark.parametrize("release", RELEASES, ids=lambda path: path.name)
+def test_what_a_release_wrote_is_loaded(release: Path) -> None:
+    """The promise in CHANGELOG.md: a run's config, results and checkpoint, and an exported policy.
+    The last two give the same action."""
+    config, results = load_run_config(release), load_results(release)
+    assert results is not None and results.best.passed
+    env = BounceBall(config.env)
+    observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    expected = act(networks, read_policy(best_checkpoint(release), config), observation)
+    deployed = load_policy(release / "policy.onnx")
+    measured = {name: observation[env.layout[name]] for name in deployed.needs}
+    np.testing.assert_allclose(deployed.step(measured), expected, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ class OnnxNetwork:
     next step."""
 
     def __init__(self, model: bytes):
-        """Loads an ONNX file; any exception means that it is no policy."""
+        """Loads an ONNX file; any exception means that it is not a policy."""
         with needed("onnxruntime", "onnxruntime"):
             import onnxruntime
         options = onnxruntime.SessionOptions()

@@ -55,7 +55,7 @@ class DeployedPolicy:
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
             raise UserError(
-                f"{source} is no policy of this version of the package ({reason}); give a file "
+                f"{source} is not a policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
         self.reset()
@@ -247,7 +247,9 @@ class DeployedPolicy:
         """
         for name in measurements:
             if name not in self.units:
-                raise UserError(f"{name} is no measurement; a step takes {', '.join(self.units)}")
+                raise UserError(
+                    f"{name} is not a measurement; a step takes {', '.join(self.units)}"
+                )
         needs = self.needs if needs is None else needs
         missing = [name for name in needs if name not in measurements]
         if missing:
