@@ -544,6 +544,37 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     assert set(range(env.layout.size)) - reached <= still
 
 
+def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) -> None:
+    """In rows or one after another, from noisy and late pictures."""
+    env = {
+        "observation": {"ball_position": 2, "velocity": "differences"},
+        "randomization": {"ball_position_noise": (0.001, 0.001), "ball_latency": (0.01, 0.02)},
+        "action_scale": 1e-3,
+    }
+    run = make_run(tmp_path / "run", env, "juggle")
+    env, policy = Env(load_run_config(run).env), load_policy(run)
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
+    nexts = set()
+    for i in range(40):
+        now = state.pipeline_state
+        sensing = now.memory.sensing
+        balls = np.asarray(sensing.picture.position)
+        measured = {
+            "joint_angles": sensing.seen["joint_angles"][0],
+            "joint_velocities": sensing.seen["joint_velocities"][0],
+            "ball_position": balls if i % 2 else balls.ravel(),
+        }
+        action = policy.step(measured | now.command)
+        np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
+        nexts.add(bool(policy.observation[env.layout["next_ball"]][3] > 0.0))
+        state = step(state, jnp.asarray(action, jnp.float32))
+    # Each ball was the next one.
+    assert policy.metadata.num_balls == 2 and len(nexts) == 2
+    for wrong in (np.zeros(3), np.zeros((3, 2))):
+        with pytest.raises(UserError, match="ball_position has the shape .*; give 6 numbers"):
+            policy.step(measured | now.command | {"ball_position": wrong})
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     seed: int, tmp_path: Path

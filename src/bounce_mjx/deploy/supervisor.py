@@ -18,6 +18,8 @@ Box = tuple[Sequence[float], Sequence[float]]
 # Of a joint, for a policy without limits: the training ends an episode there, rad/s.
 _FASTEST = 6.283
 _HOME_TOLERANCE = 2e-3
+# Below the paddle, a ball is lost, m.
+_LOST = 0.1
 
 
 class Supervisor:
@@ -163,8 +165,10 @@ class Supervisor:
         angles, speeds = measured.get("joint_angles"), measured.get("joint_velocities")
         if angles is not None:
             paddle, _ = self._chain.paddle(angles)
-            if "ball_position" in measured and measured["ball_position"][2] < paddle[2] - 0.1:
-                return "the ball is lost"
+            if "ball_position" in measured:
+                lowest = np.min(measured["ball_position"].reshape(-1, 3)[:, 2])
+                if lowest < paddle[2] - _LOST:
+                    return "the ball is lost"
             if np.abs(self._policy.targets - angles).max() > self._max_error:
                 return f"a joint is more than {self._max_error:g} rad behind its command"
         if speeds is not None and np.any(np.abs(speeds) > self._fastest):
