@@ -37,6 +37,9 @@ Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
 Limit = Annotated[float, (1e-6, 1e9)]
 
+# Entries that older files lack: their targets jump, and they are of one ball.
+_LATER = {"limits": "null", "num_balls": "1"}
+
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
 first step; what precedes a quantity's newest value; and what precedes an output for the input of
@@ -154,12 +157,11 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name. Limits that there are not have no entry, so that
-    files from before them are as new."""
+    """JSON texts of the metadata by field name; without the entries that older files lack, if they
+    are as in these, so that such a file is as new."""
     plain = _plain(metadata)
-    if metadata.limits is None:
-        del plain["limits"]
-    return {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+    texts = {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+    return {name: text for name, text in texts.items() if _LATER.get(name) != text}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
@@ -170,8 +172,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
             raise ValueError(f"its format is {given}, not {FORMAT}")
         command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
         entries = entries | {"commands": json.dumps({"target_height": command})}
-    # In older files, actions add to the measured angle, targets jump, and there is one ball.
-    entries = {"max_lead": "null", "limits": "null", "num_balls": "1"} | entries
+    # The actions of older files add to the measured angle.
+    entries = {"max_lead": "null"} | _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):
