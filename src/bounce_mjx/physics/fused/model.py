@@ -24,7 +24,6 @@ from bounce_mjx.physics.fused.scalars import (
     scale,
     vadd,
 )
-from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
@@ -111,15 +110,8 @@ class FusedModel:
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
-    """Constants of a compiled model.
-
-    Raises:
-      UnsupportedModelError: the fused engine does not support a feature of the model; the text
-        names it.
-    """
-    addresses = find_addresses(mj_model)
-    check_supported(mj_model, addresses)
-    m = mj_model
+    """Constants of a compiled model that has no `unsupported_feature`."""
+    m, addresses = mj_model, find_addresses(mj_model)
     links, frames = _read_links(m, addresses)
     compensated = _compensated_share(m, addresses)
     if compensated is not None:
