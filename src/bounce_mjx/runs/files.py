@@ -88,16 +88,27 @@ def writable(path: Path, advice: str) -> Iterator[None]:
         raise UserError(f"{path} cannot be written ({error.strerror}); {advice}") from error
 
 
-def check_output(path: Path | None, flag: str) -> None:
+def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -> None:
     """Fails before the work if a file that the user named with a flag could not be written.
 
+    Args:
+      suffixes: the ends of the name that it may have; by default, any.
+
     Raises:
-      UserError: it is a folder, or in one that does not exist.
+      UserError: it has another suffix, may not be written, is a folder, or is in one that does not
+        exist.
     """
-    if path is not None and not os.path.isdir(path.absolute().parent):
+    if path is None:
+        return
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
+    folder = path.absolute().parent
+    if not os.path.isdir(folder):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
-    if path is not None and os.path.isdir(path):
+    if os.path.isdir(path):
         raise UserError(f"{flag} {path} is a folder; give a file")
+    if not os.access(path if os.path.exists(path) else folder, os.W_OK):
+        raise UserError(f"{flag} {path} may not be written; give another file")
 
 
 def sync(path: Path) -> None:
