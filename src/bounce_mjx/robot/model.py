@@ -17,6 +17,7 @@ from bounce_mjx.robot.arm import (
     PADDLE_GEOM_NAME,
     build_arm,
     compile_spec,
+    joint_name,
     locate,
     read_spec,
 )
@@ -239,11 +240,6 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
 
 def _has_body(mj_model: mujoco.MjModel, name: str) -> bool:
     return mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
-
-
-def joint_name(mj_model: mujoco.MjModel, joint: int) -> str:
-    """Name of a joint; an unnamed joint has its index for a name."""
-    return mj_model.joint(joint).name or f"joint{joint}"
 
 
 def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:

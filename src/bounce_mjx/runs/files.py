@@ -49,6 +49,23 @@ def read_json(path: Path, model: type[ModelT]) -> ModelT:
         raise ValueError(f"{path.name} is nested too deeply") from error
 
 
+def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
+    """The content of a JSON file that a command wrote; None if there is none.
+
+    Args:
+      remedy: the end of the error.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return read_json(path, model)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({error}); {remedy}") from error
+
+
 def first_mistake(error: pydantic.ValidationError) -> str:
     """First validation error in stored data, on one line: its place and the expected type."""
     first = error.errors(include_url=False, include_input=False)[0]
