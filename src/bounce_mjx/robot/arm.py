@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.errors import UserError, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.limits import check_files
@@ -94,13 +94,8 @@ def _in_package(name: str) -> Path:
 
 
 def _in_menagerie(name: str) -> Path:
-    try:
+    with needed("mujoco-menagerie", "'bounce_mjx[robots]'"):
         import mujoco_menagerie
-    except ImportError as error:
-        raise UserError(
-            f"the package mujoco-menagerie is missing, which menagerie:{shorten(name)} needs; "
-            "pip install 'bounce_mjx[robots]'"
-        ) from error
     robot, _, entry = name.partition("/")
     try:
         found = mujoco_menagerie.get(robot)
