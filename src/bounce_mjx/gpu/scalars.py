@@ -411,18 +411,10 @@ def _atan2(y: Scalar, x: Scalar) -> Scalar:
     return jnp.where((x != x) | (y != y), jnp.nan, angle)
 
 
-def _asin(x: Scalar) -> Scalar:
-    return _atan2(x, _sqrt((1.0 - x) * (1.0 + x)))
-
-
-def _acos(x: Scalar) -> Scalar:
-    return _atan2(_sqrt((1.0 - x) * (1.0 + x)), x)
-
-
 # Operations that Mosaic GPU does not compile, expressed with operations that it does.
 _REWRITTEN: dict[str, Callable[..., Scalar]] = {
-    "acos": _acos,
-    "asin": _asin,
+    "acos": lambda x: _atan2(_sqrt((1.0 - x) * (1.0 + x)), x),
+    "asin": lambda x: _atan2(x, _sqrt((1.0 - x) * (1.0 + x))),
     "atan": _atan,
     "atan2": _atan2,
     "ceil": lambda x: -_floor(-x),
