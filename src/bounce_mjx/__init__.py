@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
     from bounce_mjx.tasks.bounce_ball import BounceBall
 
-    __version__: str
+__version__ = "0.1.0"
 
 __all__ = ["BounceBall", "EnvConfig", "__version__", "load_policy"]
 
@@ -26,8 +26,6 @@ register_when_imported()
 def __getattr__(name: str) -> Any:
     """Imports the public names on first use (PEP 562): JAX takes two seconds to import, and a
     deployed policy does not need it."""
-    if name == "__version__":
-        return importlib.import_module("importlib.metadata").version("bounce_mjx")
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, attribute = _PUBLIC[name]
