@@ -155,7 +155,9 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     """Writes a pytree of arrays as `reading.open_array` opens them, all in one go."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     with tensorstore.Transaction() as together:
-        options = dict(create=True, write=True, transaction=together)
+        # With a context of its own, each array would be written, and flushed, on its own.
+        shared = dict(context=tensorstore.Context(), transaction=together)
+        options = shared | dict(create=True, write=True)
         opening = [open_array(folder, path, leaf, **options) for path, leaf in leaves]
         writing = [x.result().write(leaf) for x, (_, leaf) in zip(opening, leaves, strict=True)]
         for each in writing:
