@@ -27,7 +27,7 @@ MIN_JOINTS = 3
 
 _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
-_HIDDEN_GROUP = 3
+HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
 _RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
@@ -79,7 +79,7 @@ def locate(mjcf: Path) -> Path:
     else:
         path = mjcf
     if not path.is_file():
-        wrong = "is no file" if path.exists() else "does not exist"
+        wrong = "is not a file" if path.exists() else "does not exist"
         raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
     return path
 
@@ -106,7 +106,7 @@ def _in_menagerie(name: str) -> Path:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         reason = reason_of(error)
         raise UserError(
-            f"menagerie:{shorten(name)} cannot be had ({shorten(reason, 300)}); give a model of "
+            f"menagerie:{shorten(name)} cannot be loaded ({shorten(reason, 300)}); give a model of "
             "MuJoCo Menagerie, and connect to the network for its first use"
         ) from error
 
@@ -270,8 +270,7 @@ class _Builder:
         idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator of its own on {_listed(idle)}; add one, or name the acting joints "
-                "with --joints"
+                f"no actuator on {_listed(idle)}; add one, or name the acting joints with --joints"
             )
         return actuators
 
@@ -295,7 +294,7 @@ class _Builder:
         """Bodies on the links beyond the last acting joint that joints move.
 
         Raises:
-          UserError: the model has driven joints beside the arm.
+          UserError: the model has driven joints in addition to the arm.
         """
         model = self._model
         beyond = chain[chain.index(model.jnt_bodyid[joints[-1]]) :]
@@ -312,7 +311,7 @@ class _Builder:
         ]
         if beside:
             raise UserError(
-                f"{len(beside)} driven joints ({_listed(beside)}) beside the arm "
+                f"{len(beside)} driven joints ({_listed(beside)}) in addition to the arm "
                 f"{_listed(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
                 "one arm on a fixed base"
             )
@@ -329,7 +328,7 @@ class _Builder:
         for i in np.flatnonzero(coupled | loops):
             raise UserError(
                 f"the equality constraint {model.equality(i).name or f'number {i}'} on the arm, so "
-                "it is no serial chain; remove it, or give a serial arm"
+                "it is not a serial chain; remove it, or give a serial arm"
             )
 
     def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
@@ -380,7 +379,7 @@ class _Builder:
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         self._remove("keyframes", arm.keys)
         self._remove("sensors", arm.sensors)
-        self._remove("actuators beside the arm's", others)
+        self._remove("actuators that do not drive the arm", others)
         self._remove("tendons", arm.tendons)
         self._remove("equality constraints", arm.equalities)
         self._remove("contact pairs and exclusions", [*arm.pairs, *arm.excludes])
@@ -428,7 +427,7 @@ class _Builder:
             for geom, touches in zip(body.geoms, touching, strict=True):
                 # Where a link has both kinds of shapes, the others are its picture.
                 if touches and i > 0 and not all(touching):
-                    geom.group = _HIDDEN_GROUP
+                    geom.group = HIDDEN_GROUP
                 geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")

@@ -83,7 +83,7 @@ def load_results(run: Path) -> Results | None:
     Raises:
       UserError: the file is damaged.
     """
-    return read_stored(run / RESULTS_FILE, Results, "delete it to go on without it")
+    return read_stored(run / RESULTS_FILE, Results, "delete it to continue without it")
 
 
 class Progress(_Evaluations):
