@@ -535,7 +535,7 @@ Env.step = from_variable
 loss = ppo.loss
 def from_script(*args):
     total, metrics = loss(*args)
-    return LOSS * total, metrics
+    return total + (LOSS - 1.0) * metrics["loss/value"], metrics
 ppo.loss = from_script
 main(sys.argv[1:])
 names = "compile_requests_use_cache", "cache_hits"
