@@ -200,8 +200,10 @@ class Env:
         world, parameters, memory_rng = {}, PhysicsParameters(), None
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
-            share = self.config.randomization.share if share is None else share
-            world = draw_world(ranges, world_rng, jnp.result_type(float), self.action_size, share)
+            own_share, shares = self.config.randomization.share, self.config.randomization.shares
+            share, shares = (own_share, shares) if share is None else (share, {})
+            dtype = jnp.result_type(float)
+            world = draw_world(ranges, world_rng, dtype, self.action_size, share, shares)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
@@ -226,7 +228,7 @@ class Env:
         }
         no_action = jnp.zeros(self.action_size, draws.dtype)
         state = EnvState(physics, command, no_action, parameters=parameters, world=world)
-        if self.config.action.base == "target":
+        if self._keeps_targets:
             state = state._replace(ctrl=self.servo_targets(physics, no_action))
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, own))
@@ -314,11 +316,11 @@ class Env:
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
-            targets = self.servo_targets(before.physics, action, last=before.ctrl)
+            targets = self.servo_targets(before.physics, action, last=self._base(before))
             return self._with_targets(state, targets), Control(targets)
         # The same noise as in the observation from which the policy chose the action.
         error = sensing.joint_angle_noise(world, memory.counter, self.action_size, action.dtype)
-        targets = self.servo_targets(before.physics, action, error, before.ctrl)
+        targets = self.servo_targets(before.physics, action, error, self._base(before))
         control, queue = actuation.delayed(
             world, memory.actuation, targets, config.control_dt, config.num_substeps
         )
@@ -341,9 +343,13 @@ class Env:
         before = before._replace(command=command, memory=memory)
         return self._with_targets(state.replace(pipeline_state=before), targets), control
 
+    def _base(self, state: EnvState) -> jax.Array | None:
+        """The last servo targets [nu], if an action adds to them."""
+        return state.ctrl if self.config.action.base == "target" else None
+
     def _with_targets(self, state: State, targets: jax.Array) -> State:
         """A state that keeps the servo targets [nu] if the next action adds to them."""
-        if self.config.action.base == "measured":
+        if not self._keeps_targets:
             return state
         return state.replace(pipeline_state=state.pipeline_state._replace(ctrl=targets))
 
@@ -585,9 +591,25 @@ class Env:
             "paddle_position": paddle,
             **_entries(state.command),
             "action": state.last_action,
+            **self._servo_lead(state, angles),
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
+
+    @property
+    def _keeps_targets(self) -> bool:
+        """Whether the next action or the policy needs the last servo targets."""
+        return self.config.action.base == "target" or self.config.observation.servo_lead > 0
+
+    def _servo_lead(self, state: EnvState, angles: jax.Array) -> dict[str, jax.Array]:
+        """Distance of the last servo targets from the measured joint angles [n], if it is seen."""
+        if not self.config.observation.servo_lead:
+            return {}
+        # The servo shares the offset of the encoder's zero.
+        angles = angles - state.world.get("encoder_bias", 0.0)
+        gears = self.mj_model.actuator_gear[:, 0]
+        sent = [state.ctrl[i] / float(gears[i]) for i in self._addresses.actuators]
+        return {"servo_lead": jnp.stack(sent) - angles}
 
     def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
         """qpos [nq] with measured joint angles [n]."""
