@@ -11,9 +11,9 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import PolicyCommand, parse_with_commands
+from bounce_mjx.commands.run_options import PolicyCommand, WorldCommand, parse_with_commands
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
     DEFAULT_EPISODES,
     DEFAULT_SEED,
@@ -28,7 +28,7 @@ from bounce_mjx.interrupt import interruptible
 _SILENT_SECONDS = 10.0
 
 
-class EvalCommand(PolicyCommand):
+class EvalCommand(WorldCommand, PolicyCommand):
     """Measures the results of a trained policy."""
 
     episodes: Count = DEFAULT_EPISODES
@@ -59,6 +59,8 @@ def main(args: Sequence[str]) -> None:
     check_output(command.json_file, "--json")
     console = Console()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
+    if command.nominal and command.world is not None:
+        raise UserError("--nominal and --world exclude each other; leave one out")
     config = command.config(checkpoint.run)
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))

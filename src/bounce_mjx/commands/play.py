@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import RunCommand, parse_with_commands
+from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from bounce_mjx.viewers.show import Shown
 
 
-class PlayCommand(RunCommand):
+class PlayCommand(WorldCommand):
     """Shows a trained policy, or several side by side."""
 
     checkpoints: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()

@@ -26,6 +26,10 @@ from bounce_mjx.resources import resource_path
 class RobustnessCommand(PolicyCommand):
     """Measures the results of a trained policy in perturbed worlds."""
 
+    world: Path | None = None
+    """World that each condition changes, in place of the model's own: a YAML file, or the name of
+    one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
+    numbers is a condition too."""
     suite: Path | None = None
     """YAML file of the perturbations; the default is configs/robustness.yaml."""
     episodes: Count = DEFAULT_CONDITION_EPISODES
@@ -54,6 +58,7 @@ def main(args: Sequence[str]) -> None:
             robustness_figure,
             robustness_table,
         )
+        from bounce_mjx.runs.config import in_world
         from bounce_mjx.runs.files import to_json, writable, write_output
         from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
         from bounce_mjx.runs.reading import read_policy
@@ -63,7 +68,11 @@ def main(args: Sequence[str]) -> None:
     checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
     config = command.config(checkpoint.run)
     suite = command.suite or resource_path("configs/robustness.yaml")
-    conditions = load_suite(suite, config.env)
+    world, assumed = None, None
+    if command.world is not None:
+        there, named = in_world(config, command.world)
+        world, assumed = there.env, named.doubled()
+    conditions = load_suite(suite, config.env, world, assumed)
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
     policy = read_policy(checkpoint, config)
     shipped = checkpoint.run in map(resource_path, SHIPPED.values())

@@ -9,7 +9,7 @@ import tyro
 from bounce_mjx.config.command_line import flag_of, flags_of, parse, unknown_argument
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
+from bounce_mjx.runs.config import TrainConfig, in_world, load_run_config, runs_folder
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
 from bounce_mjx.training.command import early_flag
 from bounce_mjx.world.config import WorldConfig
@@ -37,6 +37,23 @@ class RunCommand(StrictModel):
           UserError: as `load_run_config`.
         """
         return load_run_config(run, self.task)
+
+
+class WorldCommand(RunCommand):
+    """A command line that simulates a run's policy, in its world or in another one."""
+
+    world: Path | None = None
+    """World in place of that of the training: a YAML file, or the name of one in configs/worlds/
+    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo)."""
+
+    def config(self, run: Path) -> TrainConfig:
+        """The config of a run in the given world.
+
+        Raises:
+          UserError: as `load_run_config` and `in_world`.
+        """
+        config = super().config(run)
+        return config if self.world is None else in_world(config, self.world)[0]
 
 
 class PolicyCommand(RunCommand):

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from bounce_mjx.config.files import differing_keys, read_mapping
-from bounce_mjx.config.settings import Finite, StrictModel
+from bounce_mjx.config.settings import Finite, StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.tasks.registry import find_task, is_file
@@ -94,11 +94,20 @@ class Condition(NamedTuple):
         }
 
 
-def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
+def load_suite(
+    path: Path,
+    trained: WorldConfig,
+    world: WorldConfig | None = None,
+    assumed: dict[str, dict[str, Any]] | None = None,
+) -> list[Condition]:
     """Reads the conditions of a suite file, the nominal condition first.
 
     Args:
       trained: config of the policy's training; each condition replaces its randomisation.
+      world: config of the policy in a named world, which each condition changes; by default, the
+        policy's without randomisation.
+      assumed: nested settings of `env` by the name of the world's assumption that they double. Each
+        is a condition, after the nominal one.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -106,7 +115,12 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
     values = read_mapping(path, "suite", "configs/robustness.yaml")
     suite = validate(Suite, values, str(path))
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
-    names, conditions = {NOMINAL}, [_condition(nominal, None, trained, NOMINAL)]
+    world = world or trained.model_copy(update={"randomization": RandomizationConfig()})
+    names, conditions = {NOMINAL}, [_condition(nominal, None, trained, world, NOMINAL)]
+    for key, settings in (assumed or {}).items():
+        twice = Perturbation(name=f"twice {key}", group="twice the assumed")
+        doubled = validate(type(world), merged(world.model_dump(), settings), twice.name)
+        conditions.append(_condition(twice, None, trained, doubled, twice.name))
     for perturbation in suite.perturbations:
         source = f"{shorten(path.name, 30)}, perturbation {shorten(perturbation.name, 30)!r}"
         if not perturbation.name.strip() or perturbation.name in names:
@@ -120,7 +134,7 @@ def load_suite(path: Path, trained: WorldConfig) -> list[Condition]:
             continue
         for strength in perturbation.strengths or (None,):
             place = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
-            conditions.append(_condition(perturbation, strength, trained, place.rstrip()))
+            conditions.append(_condition(perturbation, strength, trained, world, place.rstrip()))
     return conditions
 
 
@@ -193,27 +207,37 @@ def _check_keys(p: Perturbation, known: Sequence[str], source: str) -> None:
 
 
 def _condition(
-    perturbation: Perturbation, strength: float | None, trained: WorldConfig, source: str
+    perturbation: Perturbation,
+    strength: float | None,
+    trained: WorldConfig,
+    world: WorldConfig,
+    source: str,
 ) -> Condition:
     scale = UNITS[perturbation.unit]
     value = None if strength is None else strength * scale
-    plain = trained.model_copy(update={"randomization": RandomizationConfig()})
+    without = {"randomization": RandomizationConfig()}
+    plain = world.model_copy(update=without)
     env = _with_changes(plain, _filled_in(perturbation.settings, value), source)
+    n = trained.num_joints
     if perturbation.trained_ranges:
-        config = trained.randomization
-        n = trained.num_joints
-        ranges = {name: _shaped(name, n, *getattr(config, name)) for name in config.terms}
+        ranges = _ranges_of(trained)
         ranges |= {name: _shaped(name, n, c.low, c.high) for name, c in trained.commands.items()}
     else:
-        ranges = {
-            term: _bounds(term, trained.num_joints, entry, source)
+        ranges = _ranges_of(world) | {
+            term: _bounds(term, n, entry, source)
             for term, entry in _filled_in(perturbation.terms, value).items()
         }
     _check_limits(env, ranges, source)
-    contained = not differing_keys(env, plain) and all(
+    contained = not differing_keys(env, trained.model_copy(update=without)) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
     )
     return Condition(perturbation, strength, env, ranges, contained)
+
+
+def _ranges_of(world: WorldConfig) -> dict[str, Bounds]:
+    """The range of each term of a world's randomisation."""
+    drawn = world.randomization
+    return {name: _shaped(name, world.num_joints, *getattr(drawn, name)) for name in drawn.terms}
 
 
 def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:

@@ -38,10 +38,13 @@ from bounce_mjx.tasks.registry import (
     task_name,
 )
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.named import NamedWorld, read_world
 
 CONFIG_FILE = "config.yaml"
 ROBOTS = "configs/robots"
 """Folder of the package with configs of robots."""
+WORLDS = "configs/worlds"
+"""Folder of the package with named worlds."""
 
 _EXAMPLE = "configs/default.yaml"
 
@@ -158,13 +161,16 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
     return config
 
 
-def load_config(path: Path, robot: Path | None = None, task: str | None = None) -> TrainConfig:
+def load_config(
+    path: Path, robot: Path | None = None, task: str | None = None, world: Path | None = None
+) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
     MJCF file starts at the folder of the YAML file.
 
     Args:
       robot: config of a robot, whose keys win over those of the file.
       task: the task as the user names it; by default, the file's.
+      world: file of a named world, which replaces that of the file and may have a robot.
 
     Raises:
       UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
@@ -179,10 +185,54 @@ def load_config(path: Path, robot: Path | None = None, task: str | None = None) 
         )
     config_class = train_config(find_task(name))
     values["task"] = name
-    if robot is None:
-        return validate(config_class, values, str(path))
-    own = _robot_for(config_class().env.task, robot)
-    return validate(config_class, merged(values, own), f"{path} with {robot}")
+    named = None if world is None else read_world(world)
+    if named is not None and named.robot is not None:
+        if robot is not None:
+            raise UserError(
+                f"the world {world} is of the robot {named.robot}, and a robot is given too; leave "
+                "--robot out"
+            )
+        robot = _robot_of(named, world)
+    if robot is not None:
+        values = merged(values, _robot_for(config_class().env.task, robot))
+    source = str(path) if robot is None else f"{path} with {robot}"
+    config = validate(config_class, values, source)
+    if named is None:
+        return config
+    values["env"] = named.applied(values.get("env") or {}, training=True)
+    return validate(config_class, values, f"{source} in the world {world}")
+
+
+def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]:
+    """A run's config in a named world, with the observation and the actions of its policy.
+
+    Args:
+      world: a file, or the name of a file in configs/worlds/.
+
+    Raises:
+      UserError: the world is wrong, or of another robot than the run.
+    """
+    path = named_file(world, WORLDS)
+    named, env = read_world(path), config.env
+    values = env.model_dump()
+    if named.robot is not None:
+        robot = _robot_of(named, path)
+        own = load_config(resource_path(_EXAMPLE), robot).env
+        files = {(arm.mjcf or Path()).name for arm in (own, env)}
+        if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
+            raise UserError(
+                f"the world {world} is of the robot {named.robot}, and the policy was trained with "
+                "another arm or start pose; give a world without a robot, such as fast_servo"
+            )
+        values["robot"] = merged(values["robot"], own.robot.model_dump(exclude_unset=True))
+    changed = validate(type(env), named.applied(values), f"the world {path}")
+    return config.model_copy(update={"env": changed}), named
+
+
+def _robot_of(world: NamedWorld, path: Path) -> Path:
+    """The file of a world's robot: one of the package's, or a file beside the world's."""
+    robot = named_file(Path(world.robot), ROBOTS)
+    return robot if robot != Path(world.robot) else path.parent / robot
 
 
 def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
@@ -208,7 +258,10 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
 
 
 def read_preset(
-    path: Path | None, robot: Path | None = None, task: str | None = None
+    path: Path | None,
+    robot: Path | None = None,
+    task: str | None = None,
+    world: Path | None = None,
 ) -> TrainConfig:
     """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
     this machine. A task may have its own preset of that name, in the folder of configs/ that has
@@ -218,6 +271,8 @@ def read_preset(
       robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
         in configs/robots/.
       task: the task as the user names it; by default, the preset's.
+      world: a named world, which replaces the preset's: a YAML file, or the name of a file in
+        configs/worlds/.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -225,7 +280,8 @@ def read_preset(
     if path is None:
         path = default_preset(has_accelerator())
     path = named_file(named_file(path, f"configs/{task or DEFAULT}"), "configs")
-    return load_config(path, robot and named_file(robot, ROBOTS), task)
+    robot, world = robot and named_file(robot, ROBOTS), world and named_file(world, WORLDS)
+    return load_config(path, robot, task, world)
 
 
 def default_preset(accelerator: bool) -> Path:

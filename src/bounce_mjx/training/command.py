@@ -35,6 +35,9 @@ class TrainingCommand(TrainConfig):
     robot: Path | None = None
     """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
     one in configs/robots/ (ur5e, panda or iiwa)."""
+    world: Path | None = None
+    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
+    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
     resume: Path | None = None
     """Folder of a run, or latest for the newest run, to continue in place from its latest
     checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
@@ -66,8 +69,9 @@ def read_training(
         stay the same.
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
-    robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
-    for given, flag in ((config_path, "--config"), (robot, "--robot")):
+    robot, world = path_flag(args, "--robot"), path_flag(args, "--world")
+    task = early_flag(args, "--task")
+    for given, flag in ((config_path, "--config"), (robot, "--robot"), (world, "--world")):
         if given and resume:
             raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
     if resume:
@@ -83,12 +87,12 @@ def read_training(
                 "it, name the run's copy, or start a new run"
             )
     else:
-        base = read_preset(config_path or preset, robot, task)
+        base = read_preset(config_path or preset, robot, task, world)
     start = base
     if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
         start = base.model_copy(update={"stop_when_solved": False})
     own_class = train_config(base.env.task, command_class)
-    default = own_class(**dict(start), config=config_path, robot=robot, resume=resume)
+    default = own_class(**dict(start), config=config_path, robot=robot, world=world, resume=resume)
     command = parse(own_class, args, prog=prog, default=default)
     if resume:
         command = command.model_copy(update={"resume": resume, "task": base.task})

@@ -1,0 +1,156 @@
+"""Named worlds: the numbers of a real robot and its camera in a YAML file, each with its source."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from bounce_mjx.config.files import read_mapping
+from bounce_mjx.config.settings import StrictModel, merged
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import shorten
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+
+KEYS = (
+    "physics_dt",
+    "control_dt",
+    "friction",
+    "action_scale",
+    "max_joint_velocity",
+    "robot",
+    "estimator",
+    "randomization",
+)
+"""The settings of `env` that a world may have: those of the robot and its sensors, and none of the
+task or of what the policy sees."""
+
+CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
+"""Keys of the randomisation that describe the training, not the world."""
+
+WorldSettings = pydantic.create_model(
+    "WorldSettings",
+    __base__=StrictModel,
+    **{
+        name: (field.annotation, field)
+        for name, field in WorldConfig.model_fields.items()
+        if name in KEYS
+    },
+)
+
+
+class NamedWorld(StrictModel):
+    """The content of a world's file."""
+
+    robot: str | None = None
+    """Name of a robot in configs/robots/, or its file, beside the world's; null for any robot."""
+    env: WorldSettings = WorldSettings()
+    """Settings of the environment. Its randomisation is the whole one: a term that it does not have
+    is as in the model."""
+    sources: dict[str, str] = {}
+    """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
+    assumed: tuple[str, ...] = ()
+    """Keys whose numbers nobody has measured; their source is the reason for the number."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_sources(self):
+        given = dict(_leaves(self.settings))
+        groups = {key[:i] for key in given for i, char in enumerate(key) if char == "."}
+        for key, source in self.sources.items():
+            if key not in given and key not in groups:
+                raise ValueError(
+                    f"{shorten(key)} has a source, but env has no such key; give env that key, or "
+                    "remove the source"
+                )
+            if not source.strip():
+                raise ValueError(f"{key} has an empty source; write one sentence")
+        for key in self.assumed:
+            if key not in given:
+                raise ValueError(
+                    f"{shorten(key)} is assumed, but env has no such key; give one of "
+                    f"{', '.join(given) or 'none'}"
+                )
+            if not _is_numeric(given[key]):
+                raise ValueError(f"{key} is assumed, but is no number; remove it from assumed")
+        for key in given:
+            if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
+                continue
+            if not any(key == source or key.startswith(f"{source}.") for source in self.sources):
+                raise ValueError(
+                    f"{key} has no source; say in one sentence where its number comes from, or why "
+                    "it is assumed"
+                )
+        return self
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The given settings of `env`, nested."""
+        return self.env.model_dump(exclude_unset=True)
+
+    def applied(self, env: dict[str, Any], training: bool = False) -> dict[str, Any]:
+        """The settings of an environment in this world.
+
+        Args:
+          env: the settings, nested.
+          training: whether the curriculum of their randomisation stays unless the world has one.
+        """
+        before = env.get("randomization", {}) if training else {}
+        kept = {key: value for key, value in before.items() if key in CURRICULUM}
+        return merged(env | {"randomization": kept}, self.settings)
+
+    def doubled(self) -> dict[str, dict[str, Any]]:
+        """For each assumed key, the nested settings of `env` in which alone its number is doubled.
+
+        A term of the randomisation goes twice as far from the model's value, within its limits; a
+        rate, an interval, or a limit, of which less is harder, is halved.
+        """
+        given = dict(_leaves(self.settings))
+        return {key: _nested(key, _doubled(key, given[key])) for key in self.assumed}
+
+
+def read_world(path: Path) -> NamedWorld:
+    """Reads a world's file.
+
+    Raises:
+      UserError: the file is missing or wrong.
+    """
+    values = read_mapping(path, "world", "configs/worlds/ur5e_rtde.yaml")
+    return validate(NamedWorld, values, str(path))
+
+
+def _leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The dotted keys of nested settings, and their values."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    """Nested settings with one value, by its dotted key."""
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return value
+
+
+def _is_numeric(value: Any) -> bool:
+    values = value if isinstance(value, tuple) else (value,)
+    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+
+
+def _doubled(key: str, value: Any) -> Any:
+    group, _, name = key.rpartition(".")
+    factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
+    if group == "randomization":
+        nominal, (least, most) = TERMS[name].nominal, TERMS[name].limits
+        factor, centre = (0.5, 0.0) if nominal is None else (2.0, nominal)
+    elif group == "robot.limits":
+        factor = 0.5
+
+    def changed(number: float) -> float:
+        return min(max(centre + factor * (number - centre), least), most)
+
+    return tuple(map(changed, value)) if isinstance(value, tuple) else changed(value)

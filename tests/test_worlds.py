@@ -1,0 +1,138 @@
+"""Named worlds: their files, and the commands that take one."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bounce_mjx import EnvConfig
+from bounce_mjx.commands.main import main
+from bounce_mjx.commands.train import read_command
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.suite import load_suite
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
+from bounce_mjx.world.named import read_world
+from bounce_mjx.world.randomization import TERMS
+
+NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
+WORLD = {
+    "env": {"randomization": {"action_latency": [0.01, 0.02], "frame_drop": [0.0, 0.1]}},
+    "sources": {"randomization": "An example."},
+    "assumed": ["randomization.frame_drop"],
+}
+
+
+def written(folder: Path, **changes: object) -> Path:
+    path = folder / "world.yaml"
+    path.write_text(yaml.safe_dump(WORLD | changes), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None:
+    world = read_world(resource_path(f"configs/worlds/{name}.yaml"))
+    terms = world.settings["randomization"]
+    assert {f"randomization.{term}" for term in terms} <= world.sources.keys()
+    assert all(
+        len(source.split()) > 3 and source.endswith(".") for source in world.sources.values()
+    )
+    assert {"action_latency", "ball_latency", "camera_rate"} <= terms.keys()
+    # A number that nobody measured is no measurement with a source on the web.
+    assert not any("issue" in world.sources[key] for key in world.assumed)
+
+
+@pytest.mark.parametrize(
+    "changes, wrong",
+    [
+        ({"name": "mine"}, "unknown key name"),
+        ({"env": {"observation": {"action": 3}}}, "unknown key env.observation"),
+        ({"env": {"randomization": {"latency": [0, 1]}}}, "unknown key env.randomization.latency"),
+        ({"env": {"randomization": {"frame_drop": [0.5, 0.1]}}}, "frame_drop"),
+        ({"sources": {"randomization": "x", "robot": "y"}}, "robot has a source, but env has no"),
+        ({"sources": {"randomization": " "}}, "randomization has an empty source"),
+        (
+            {"sources": {"randomization.action_latency": "A measurement."}},
+            "randomization.frame_drop has no source",
+        ),
+        ({"assumed": ["frame_drop"]}, "frame_drop is assumed, but env has no such key"),
+        ({"sources": {}, "assumed": []}, "randomization.action_latency has no source"),
+    ],
+)
+def test_a_mistake_is_one_sentence(tmp_path: Path, changes: dict, wrong: str) -> None:
+    path = written(tmp_path, **changes)
+    with pytest.raises(UserError) as caught:
+        read_world(path)
+    assert wrong in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_training_has_the_world_in_place_of_the_presets(tmp_path: Path) -> None:
+    world = written(tmp_path)
+    preset = read_preset(Path("transfer")).env
+    command = read_command(
+        ["--config", "transfer", "--world", str(world), "--randomization.frame-drop", "0", "0.2"]
+    )
+    drawn = command.env.randomization
+    assert preset.randomization.terms != drawn.terms == ("action_latency", "frame_drop")
+    assert (drawn.action_latency, drawn.frame_drop) == ((0.01, 0.02), (0.0, 0.2))
+    assert drawn.share == preset.randomization.share
+    assert command.env.observation == preset.observation
+
+
+def test_a_world_brings_its_robot() -> None:
+    command = read_command(["--config", "cpu", "--world", "ur5e_rtde"])
+    assert command.env.mjcf.name == "ur5e.xml"
+    assert command.env.robot.site == "attachment_site"
+    assert command.env.robot.servo_stiffness[0] > 1e4
+    with pytest.raises(UserError, match="is of the robot ur5e, and a robot is given too"):
+        read_command(["--world", "ur5e_rtde", "--robot", "panda"])
+
+
+def test_a_policy_is_measured_in_the_world_alone() -> None:
+    trained = read_preset(Path("transfer"))
+    there, named = in_world(trained, Path("fast_servo"))
+    drawn = there.env.randomization
+    assert set(drawn.terms) == set(named.settings["randomization"])
+    assert drawn.share == 1.0 and drawn.camera_rate == (150.0, 203.0)
+    assert there.env.observation == trained.env.observation
+    assert there.env.action_scale == trained.env.action_scale
+    with pytest.raises(UserError, match="fast_servo"):
+        in_world(trained, Path("ur5e_rtde"))
+
+
+def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:
+    trained = TrainConfig(env=EnvConfig(randomization={"servo_lag": (0.0, 0.1)}))
+    there, named = in_world(trained, Path("fast_servo"))
+    suite = resource_path("configs/robustness.yaml")
+    conditions = load_suite(suite, trained.env, there.env, named.doubled())
+    nominal, *rest = conditions
+    in_the_world = {name: (low, high) for name, (low, high) in nominal.ranges.items()}
+    assert set(in_the_world) == set(there.env.randomization.terms)
+    assert "servo_lag" in in_the_world and nominal.ranges["servo_lag"][1] == 0.005
+    twice = {c.perturbation.name: c for c in rest if c.perturbation.group == "twice the assumed"}
+    assert twice.keys() == {f"twice {key}" for key in named.assumed}
+    for key in named.assumed:
+        term = key.split(".")[1]
+        condition, model = twice[f"twice {key}"], TERMS[term].nominal
+        for end, (before, after) in enumerate(
+            zip(nominal.ranges[term], condition.ranges[term], strict=True)
+        ):
+            expected = min(
+                max(model + 2 * (before.flat[0] - model), TERMS[term].limits[0]),
+                TERMS[term].limits[1],
+            )
+            assert after.flat[0] == pytest.approx(expected), (key, end)
+        unchanged = condition.ranges.keys() - {term}
+        assert all(
+            condition.ranges[t][1].flat[0] == nominal.ranges[t][1].flat[0] for t in unchanged
+        )
+    (late,) = (c for c in rest if c.perturbation.name == "action latency" and c.strength == 40)
+    assert late.ranges["action_latency"][0] == 0.04 and late.ranges["ball_mass"][1] == 1.03
+
+
+def test_nominal_and_a_world_exclude_each_other(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["eval", "pretrained", "--nominal", "--world", "fast_servo"])
+    assert left.value.code == 2
+    assert "exclude each other" in capsys.readouterr().err
