@@ -181,6 +181,41 @@ class WorldConfig(StrictModel):
             )
         return self
 
+    @pydantic.model_validator(mode="after")
+    def _check_limits(self):
+        limits = self.robot.limits
+        for name in type(limits).model_fields:
+            values = getattr(limits, name)
+            if values is not None and len(values) != self.num_joints:
+                raise ValueError(
+                    f"robot.limits.{name} has {len(values)} numbers, but default_joint_angles has "
+                    f"{self.num_joints}; give one for each acting joint"
+                )
+        if limits.velocity is not None and self.action.base == "measured":
+            # A command that follows the measured angle, which follows the command, oscillates.
+            raise ValueError(
+                "robot.limits are of commands that move, to which an action adds, but action.base "
+                "is measured; set action.base to target"
+            )
+        if limits.jerk is not None:
+            for acceleration, jerk in zip(limits.acceleration, limits.jerk, strict=True):
+                if 2.0 * acceleration / jerk > self.control_dt:
+                    raise ValueError(
+                        f"robot.limits.jerk {jerk:g} is too low: the acceleration cannot turn from "
+                        f"{acceleration:g} to the opposite within control_dt {self.control_dt:g}; "
+                        f"give at least {2.0 * acceleration / self.control_dt:g}"
+                    )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_servo_lead(self):
+        if self.observation.servo_lead and self.action.base != "target":
+            raise ValueError(
+                f"observation.servo_lead is {self.observation.servo_lead}, but actions add to the "
+                "measured angles; set action.base to target, or servo_lead to 0"
+            )
+        return self
+
     @pydantic.field_validator("mjcf")
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:

@@ -67,7 +67,8 @@ class ObservationConfig(StrictModel):
     action: Annotated[History, Quantity(None, "", "past")] = 0
     """Actions of the last control steps."""
     servo_lead: Annotated[History, Quantity(None, "rad", "past")] = 0
-    """Distances of the last servo targets from the measured joint angles."""
+    """Distances of the last servo targets from the measured joint angles, for the action's base
+    target."""
     ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
     """Time since the picture of the ball was taken."""
     position: Literal["measured", "filter"] = "measured"
