@@ -82,6 +82,11 @@ ENVS = {
         **LEVEL,
     },
 }
+ENVS["leading targets"] = ENVS["all histories"] | {
+    "observation": ALL | {"servo_lead": 3},
+    "action": {"base": "target", "max_lead": 2e-4},
+    "action_scale": 1e-4,
+}
 
 
 # A task that counts visits below a commanded height, and remembers the ball's highest speed.
@@ -514,7 +519,7 @@ def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
     )
 
 
-@pytest.mark.parametrize("name", ["all histories", "sensors", "another task"])
+@pytest.mark.parametrize("name", ["all histories", "leading targets", "sensors", "another task"])
 def test_histories_are_those_of_the_environment(name: str, runs, policies) -> None:
     """Policy and environment run side by side in a closed loop."""
     env, policy = Env(load_run_config(runs[name]).env), policies[name]
@@ -535,7 +540,7 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
         reached |= set(np.flatnonzero(policy.observation))
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not state.done, i
-    assert len(commands) >= (1 if name == "all histories" else 5)
+    assert len(commands) >= (5 if name in ("sensors", "another task") else 1)
     # The start and at least four bounces or two visits.
     assert min(map(len, own.values())) >= (3 if name == "another task" else 5)
     # Every entry changed, except the ball's orientation and spin.
@@ -551,7 +556,7 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     """History lengths are random, and the ball follows an invented path over a moving paddle."""
     rng = np.random.default_rng(seed)
     lengths = {name: int(rng.integers(0, 5)) for name in QUANTITIES}
-    lengths["bounce_interval"] += 1
+    lengths |= {"bounce_interval": lengths["bounce_interval"] + 1, "servo_lead": 0}
     env = EnvConfig(observation=lengths)
     policy = load_policy(make_run(tmp_path / "run", {"observation": lengths}))
     chain, times = Chain(policy.metadata), np.arange(200) * env.control_dt

@@ -93,7 +93,7 @@ class OnnxNetwork:
         """Raises ValueError if the inputs and the memory do not fit to the metadata."""
         metadata, remembered = self.metadata, self._remembered
         sizes = measurement_sizes(metadata) | {"ball_picture": 3, "paddle_position": 3}
-        sizes |= dict.fromkeys(("action", "past_actions"), len(metadata.joint_names))
+        sizes |= dict.fromkeys(("action", "past_actions", "servo_lead"), len(metadata.joint_names))
         stated = {}
         for part in metadata.observation:
             if part.name not in remembered and part.name not in sizes:

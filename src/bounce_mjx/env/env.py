@@ -658,8 +658,8 @@ class Env:
         }
 
     def _servo_lead(self, state: EnvState, angles: jax.Array) -> dict[str, jax.Array]:
-        """Distances of the last servo targets from the measured joint angles [n], rad; nothing if an
-        action does not add to them."""
+        """Distances of the last servo targets from the measured joint angles [n], rad; nothing if
+        an action does not add to them."""
         if state.ctrl is None:
             return {}
         # The servo shares the offset of the encoder's zero.

@@ -15,6 +15,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
+from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import jax, jnp, mujoco, np
 
 if TYPE_CHECKING:
@@ -172,7 +173,9 @@ class RandomizationConfig(StrictModel):
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
         for name in self.shares.keys() - TERMS.keys():
-            raise ValueError(f"shares names the term {name}, which does not exist; remove it")
+            raise ValueError(
+                f"shares has a probability for {shorten(name)}, which is no term; remove it"
+            )
         for name in self.terms:
             (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
             if not low <= high:
