@@ -15,10 +15,12 @@ _HEAD = """# Config reference
 
 Every setting of a training run of the task bounce; [another task](write-a-task.md) has other
 keys in `env`. A YAML file (`--config FILE`, see [training](training.md)) holds
-the keys as nested groups. Each key is also a flag of `train_jax.py`, and the flag wins over the
-file. Unknown keys and values out of range are refused.
+the keys as nested groups. A preset overrides the defaults, a robot (`--robot`) the preset, and a
+flag of the command line all of them. Unknown keys and values out of range are refused.
 
-![Default, preset, robot and flag: each overrides the one before](images/settings.svg)
+Each section has the keys of one group. The flag of a key is its full name without `env.` or `ppo.`
+and with hyphens: `--num-envs` for `ppo.num_envs`, and `--reward.height.weight` for
+`env.reward.height.weight`.
 
 A whole number may have an exponent (`1e6`). On the command line, the items of a list are separated
 by spaces or commas (`256 256` or `256,256`), and a switch has three forms, such as
@@ -55,11 +57,6 @@ def reference() -> str:
     return _HEAD + "".join(_section(model, prefix) for model, prefix in _groups(_CONFIG, ""))
 
 
-def flag(key: str) -> str:
-    """The flag of a key: --num-envs for ppo.num_envs."""
-    return "--" + key.removeprefix("env.").removeprefix("ppo.").replace("_", "-")
-
-
 def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[StrictModel], str]]:
     """A group of settings and the groups nested in it, each with the prefix of its keys."""
     yield model, prefix
@@ -77,22 +74,16 @@ def _section(model: type[StrictModel], prefix: str) -> str:
             continue
         text = " ".join((field.description or "").split())
         units = _UNIT.findall(text)
-        cells = (
-            f"`{prefix}{name}`",
-            f"`{flag(prefix + name)}`",
-            _type(plain),
-            _default(plain.get("default")),
-            units[-1] if units else "",
-            _range(plain),
-            text,
-        )
+        kind = "" if "enum" in plain else _type(plain)
+        value = " ".join(part for part in (kind, _range(plain)) if part)
+        value += f" ({units[-1]})" if units else ""
+        cells = f"`{name}`", value, _default(plain.get("default")), text
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
     text = " ".join((model.__doc__ or "").split())
     return (
         f"\n## {title}\n\n{text}\n\n"
-        "| key | flag | type | default | unit | range | meaning |\n"
-        "|---|---|---|---|---|---|---|\n" + "".join(rows)
+        "| key | value | default | meaning |\n|---|---|---|---|\n" + "".join(rows)
     )
 
 
@@ -140,8 +131,6 @@ def _range(plain: dict[str, Any]) -> str:
         each = _range(items[0] if items else plain["items"])
         least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
         return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
-    if plain.get("type") == "boolean":
-        return "true, false"
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
     return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")

@@ -69,30 +69,6 @@ class Diagram:
         self.axes.annotate("", end, start, arrowprops=style)
 
 
-def packages():
-    """The package's folders in the order of their imports."""
-    folders = {
-        "config": "types of\nsettings", "gpu": "kernels", "robot": "MJCF of\nthe arm",
-        "physics": "fused,\nMJX", "world": "sensors,\nlatencies", "task": "what a task\nis made of",
-        "env": "reset, step,\nbatches", "tasks": "bouncing", "learning": "PPO,\nnetworks",
-        "evaluation": "episodes,\nresults", "runs": "folders,\ncheckpoints",
-        "deploy": "ONNX,\nload_policy", "reports": "curves,\nfigures", "training": "the job",
-        "viewers": "page,\nvideos", "adapters": "Gymnasium,\nbrax, torch", "commands": "bounce-mjx",
-    }  # fmt: skip
-    diagram = Diagram(54)
-    for i, (name, text) in enumerate(folders.items()):
-        row, column = divmod(i, 6)
-        colour = (GREEN, BLUE, ORANGE)[(i > 3) + (i > 7)]
-        x, y = 1 + column * 16.4, 1 + row * 16
-        diagram.box(x, y, 14.4, 14, name, text, colour)
-        if column:
-            diagram.arrow((x, y + 7), (x - 2, y + 7))
-    diagram.text(
-        50, 51, "A package may import from all packages before it, in reading order.", size=9
-    )
-    return diagram.figure
-
-
 def task():
     """What a task gives to the world, and who asks it for what."""
     diagram = Diagram(46)
@@ -114,155 +90,6 @@ def task():
         diagram.text(84, y, user, size=9)
         diagram.arrow((66, y), (74, y))
     diagram.arrow((31, 20), (36, 20), both=True)
-    return diagram.figure
-
-
-def algorithms():
-    """The interfaces of the environment, and the training job around a trainer."""
-    diagram = Diagram(60)
-    diagram.box(33, 1, 34, 10, "Env", "pure reset and step", GREEN)
-    interfaces = (
-        ("env.vector", "your own loop in JAX,\nPPO of this project", BLUE),
-        ("brax, gymnax", "Playground, PureJaxRL,\nEvosax", BLUE),
-        ("Gymnasium, SB3", "SBX, TorchRL,\nCleanRL, skrl", ORANGE),
-        ("TorchVectorEnv", "rsl_rl, skrl", ORANGE),
-    )
-    for i, (title, text, colour) in enumerate(interfaces):
-        diagram.box(1 + 24.7 * i, 18, 23.5, 13, title, text, colour)
-        diagram.arrow((50 + (i - 1.5) * 7, 11), (12.7 + 24.7 * i, 18))
-    diagram.box(1, 38, 23.5, 20, "Trainer", "state_template, compile,\nstart, run, snapshot", BLUE)
-    steps = ("run a\nblock", "evaluate", "save", "log", "report")
-    for i, step in enumerate(steps):
-        diagram.box(33 + 13.5 * i, 42, 12, 11, step, colour=GREEN)
-        if i:
-            diagram.arrow((31.5 + 13.5 * i, 47.5), (33 + 13.5 * i, 47.5))
-    diagram.arrow((24.5, 47.5), (33, 47.5), both=True)
-    diagram.text(66, 39.5, "the training job, the same for every trainer", size=9)
-    diagram.text(66, 56, "also: resume, signals, seeds, faults, full disks", size=9)
-    return diagram.figure
-
-
-def libraries():
-    """One compiled step behind every adapter."""
-    diagram = Diagram(46)
-    diagram.box(
-        1,
-        13,
-        27,
-        20,
-        "one compiled step",
-        "B environments:\nphysics, task, reward,\nreset of ended episodes",
-        GREEN,
-    )
-    rows = (
-        ("NumPy", "make_vec, make", "Gymnasium, TorchRL, CleanRL, skrl"),
-        ("NumPy", "Sb3VecEnv", "Stable-Baselines3, SBX"),
-        ("tensors", "TorchVectorEnv", "rsl_rl, skrl; shared memory, no copy"),
-        ("arrays", "brax, Playground, gymnax", "their trainers, PureJaxRL, Evosax"),
-    )
-    for i, (kind, title, text) in enumerate(rows):
-        y = 1 + 11.3 * i
-        diagram.box(48, y, 51, 10, title, text, BLUE if kind == "arrays" else ORANGE)
-        start = 17 + 4 * i
-        diagram.arrow((28, start), (48, y + 5))
-        diagram.text(37, 0.55 * start + 0.45 * (y + 5), kind, size=9, backgroundcolor="white")
-    return diagram.figure
-
-
-def settings():
-    """The sources of a setting, from the weakest to the strongest."""
-    diagram = Diagram(27)
-    sources = (
-        ("default", "of the type"), ("preset", "--config FILE"), ("robot", "--robot FILE"),
-        ("flag", "--num-envs 64"), ("config.yaml", "in the run's\nfolder"),
-    )  # fmt: skip
-    for i, (title, text) in enumerate(sources):
-        diagram.box(1 + 20.2 * i, 2, 16.6, 13, title, text, GREEN if i == 4 else BLUE)
-        if i:
-            diagram.arrow((-2.6 + 20.2 * i, 8.5), (1 + 20.2 * i, 8.5))
-    diagram.text(40, 18.5, "each one overrides the one before, key by key", size=9)
-    diagram.arrow((90, 15), (90, 21))
-    diagram.text(98.5, 23.5, "resume, eval, play, export and report read it", size=9, align="right")
-    return diagram.figure
-
-
-def checkpoints():
-    """The course of a training, and how a checkpoint is written."""
-    diagram = Diagram(45)
-    names = (
-        "block",
-        "block",
-        "block",
-        "evaluate",
-        "save",
-        "block",
-        "block",
-        "block",
-        "evaluate",
-        "save",
-    )
-    x = 1.0
-    for name in names:
-        width = {"block": 9.5, "evaluate": 12.2, "save": 8}[name]
-        colour = {"block": BLUE, "evaluate": GREEN, "save": ORANGE}[name]
-        diagram.box(x, 2, width, 9, name, colour=colour)
-        x += width
-    diagram.text(50, 14.5, "time: one evaluation for every eval_every environment steps", size=9)
-    steps = (
-        ("write", "all files, as\n<steps>.partial"), ("sync", "to the disk"),
-        ("rename", "to <steps>:\nnow it counts"), ("remove", "the checkpoint\nbefore it"),
-    )  # fmt: skip
-    for i, (title, text) in enumerate(steps):
-        diagram.box(1 + 25.2 * i, 20, 21.5, 13, title, text, ORANGE)
-        if i:
-            diagram.arrow((-2.7 + 25.2 * i, 26.5), (1 + 25.2 * i, 26.5))
-    diagram.text(37, 37.5, "killed here: the old checkpoint is complete", size=9)
-    diagram.text(83, 37.5, "killed here: the new one is complete", size=9)
-    diagram.arrow((2, 35.2), (73.5, 35.2), both=True)
-    diagram.arrow((75, 35.2), (99, 35.2), both=True)
-    diagram.text(50, 42.5, "--resume continues from checkpoints/latest/<steps>", size=9)
-    return diagram.figure
-
-
-def scaling():
-    """Seeds, devices and hosts."""
-    diagram = Diagram(58)
-    for i, title in enumerate(("--num-seeds 4", "--num-devices 4")):
-        left = 1 + 50.5 * i
-        diagram.text(left + 24, 2.5, title, weight="bold", family="monospace")
-        for j in range(4):
-            x = left + 12.2 * j
-            shared = i == 1
-            title = f"GPU {j}" if shared else f"seed {j}"
-            diagram.box(
-                x, 6, 11.4, 15, title, "a quarter of\nnum_envs" if shared else "num_envs", GREEN
-            )
-            if shared:
-                diagram.arrow((x + 5.7, 21), (x + 5.7, 27))
-            else:
-                diagram.box(x, 26, 11.4, 11, "networks", colour=BLUE)
-                diagram.arrow((x + 5.7, 21), (x + 5.7, 26), both=True)
-    diagram.box(
-        51.5,
-        27,
-        48,
-        10,
-        "the same networks on each GPU",
-        "sum of the gradients, once per minibatch",
-        BLUE,
-    )
-    diagram.text(25, 40, "separate trainings in one program", size=9)
-    diagram.text(75.5, 40, "one training, the same for any number of GPUs", size=9)
-    diagram.box(
-        1,
-        45,
-        98.5,
-        11,
-        "--distributed",
-        "the same over the GPUs of all hosts; process 0 writes the run's folder",
-        ORANGE,
-        mono=True,
-    )
     return diagram.figure
 
 
@@ -304,26 +131,6 @@ def control_step():
     diagram.text(at(33.4), 47.2, "servo_lag", size=9, family="monospace", align="right")
     for step in range(5):
         diagram.text(at(10 * step), 53.5, f"{10 * step} ms", size=9)
-    return diagram.figure
-
-
-def troubleshooting():
-    """The first lines of a training, and the section for each."""
-    diagram = Diagram(36)
-    diagram.axes.add_patch(matplotlib.patches.Rectangle((1, 1), 55, 34, color="#1f2933"))
-    lines = (
-        (4.5, "$ python train_jax.py", "“No module named ...”, a refused flag"),
-        (10.5, "physics: mjx (the fused ...", "slow: a feature that only MJX has"),
-        (16.5, "device: cpu", "the GPU is not used"),
-        (22.5, "0.2M steps  95k steps/s ...", "late: the first start compiles"),
-        (31, "report: not drawn (...)", "the report"),
-    )
-    for y, line, _ in lines:
-        diagram.axes.text(3, y, line, family="monospace", color="white", va="center", size=9.5)
-    diagram.axes.text(3, 26.8, "...", family="monospace", color="white", va="center")
-    for y, line, text in lines:
-        diagram.arrow((62, y), (4.5 + 1.37 * len(line), y), colour=LINES[1])
-        diagram.text(62.8, y, text, size=8.5, align="left")
     return diagram.figure
 
 
@@ -634,8 +441,7 @@ def page():
 
 
 PICTURES = (
-    packages, task, algorithms, libraries, settings, checkpoints, scaling, control_step,
-    troubleshooting, start_times, episode, reward_terms, sensors, two_policies, gradient, arms,
+    task, control_step, start_times, episode, reward_terms, sensors, two_policies, gradient, arms,
     page, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""

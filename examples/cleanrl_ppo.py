@@ -1,6 +1,6 @@
 """CleanRL: the form of its ppo_continuous_action on 256 environments in one step.
 
-python examples/cleanrl_ppo.py
+`python examples/cleanrl_ppo.py` needs the extra `torch`.
 """
 
 import argparse

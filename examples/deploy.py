@@ -1,14 +1,17 @@
 """A policy in the control loop of a simulated robot with a late and noisy camera.
 
-`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX.
+`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX. With `--log`,
+it writes the log from which `bounce-mjx identify` estimates the robot's world.
 """
 
 import argparse
+import contextlib
 
 import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.resources import resource_path
 
@@ -36,7 +39,9 @@ class Camera:
         return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
 
 
-def simulate(policy, camera: Camera, seconds: float, target_height: float) -> tuple[int, float]:
+def simulate(
+    policy, camera: Camera, seconds: float, target_height: float, recorder: Recorder | None = None
+) -> tuple[int, float]:
     """Number of bounces, and time (s) until the ball is lost."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
@@ -50,16 +55,16 @@ def simulate(policy, camera: Camera, seconds: float, target_height: float) -> tu
     for step in range(round(seconds / model.opt.timestep)):
         camera.look(data.time, ball.qpos[:3])
         if step % control_steps == 0:
-            action = policy.step(
-                {
-                    "joint_angles": [joint.qpos[0] for joint in joints],
-                    "joint_velocities": [joint.qvel[0] for joint in joints],
-                    "target_height": target_height,
-                    "time": data.time,
-                    **camera.measure(data.time),
-                }
-            )
-            data.ctrl[:] = policy.servo_targets(action)
+            measurements = {
+                "joint_angles": [joint.qpos[0] for joint in joints],
+                "joint_velocities": [joint.qvel[0] for joint in joints],
+                "target_height": target_height,
+                "time": data.time,
+                **camera.measure(data.time),
+            }
+            data.ctrl[:] = policy.servo_targets(policy.step(measurements))
+            if recorder is not None:
+                recorder.step(measurements, data.ctrl)
         mujoco.mj_step(model, data)
         bounces += falling and ball.qvel[2] > 0.0
         falling = ball.qvel[2] < 0.0
@@ -73,8 +78,12 @@ if __name__ == "__main__":
     parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--target-height", type=float, default=0.5, help="m")
+    parser.add_argument("--log", help="CSV file for the log, which must not exist")
     given = parser.parse_args()
-    with exit_on_user_error():
-        robot = load_policy(given.policy)
-        count, survived = simulate(robot, Camera(), given.seconds, given.target_height)
+    with exit_on_user_error(), contextlib.ExitStack() as files:
+        robot, recorder = load_policy(given.policy), None
+        if given.log:
+            joints = robot.metadata.joint_names
+            recorder = files.enter_context(Recorder(given.log, joints, {"target_height": "m"}))
+        count, survived = simulate(robot, Camera(), given.seconds, given.target_height, recorder)
         print(f"{count} bounces in {survived:.1f} s of {given.seconds:g} s")

@@ -1,6 +1,7 @@
 """Gymnasium: one environment, a policy, and an own target height.
 
-python examples/gymnasium_policy.py [pretrained | robust | RUN]
+`python examples/gymnasium_policy.py [pretrained | robust | RUN]` needs the extras `gymnasium` and
+`deploy`.
 """
 
 import argparse

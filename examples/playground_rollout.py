@@ -1,6 +1,7 @@
 """MuJoCo Playground: a policy in randomised worlds of the environment from its registry, filmed.
 
-`python examples/playground_rollout.py [pretrained | robust | RUN]` needs `pip install playground`.
+`python examples/playground_rollout.py [pretrained | robust | RUN]` needs
+`pip install 'playground<1'` and the extra `deploy`.
 A training is `python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own
 program.
 """
@@ -9,7 +10,6 @@ import functools
 import sys
 from pathlib import Path
 
-import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
 import mediapy
@@ -17,6 +17,7 @@ import numpy as np
 from mujoco_playground import registry, wrapper
 
 import bounce_mjx.adapters.playground
+from bounce_mjx.viewers.video import find_ffmpeg
 
 
 def main(
@@ -42,7 +43,7 @@ def main(
         ]
         state = step(state, jnp.asarray(actions, jnp.float32))
         states.append(jax.tree.map(lambda x: x[0], state))
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    mediapy.set_ffmpeg(find_ffmpeg())
     mediapy.write_video(video, env.render(states, 240, 320, camera="overview"), fps=1.0 / env.dt)
     return state.data.qpos[:, -5]
 

@@ -1,6 +1,6 @@
 """Stable-Baselines3: PPO on 256 environments in one step; then three of the five results.
 
-python examples/sb3_ppo.py
+`python examples/sb3_ppo.py` needs the extra `sb3`.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """SBX, Stable-Baselines3 in JAX: PPO on 256 environments in one step.
 
-python examples/sbx_ppo.py
+`python examples/sbx_ppo.py` needs the extra `sbx`.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """skrl: its PPO on 256 environments in one step.
 
-python examples/skrl_ppo.py
+`python examples/skrl_ppo.py` needs the extra `torch`.
 """
 
 import argparse

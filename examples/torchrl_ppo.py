@@ -1,6 +1,6 @@
 """TorchRL: its tutorial's PPO on 256 environments in one step.
 
-python examples/torchrl_ppo.py
+`python examples/torchrl_ppo.py` needs the extra `torchrl`.
 """
 
 import argparse

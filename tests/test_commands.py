@@ -16,9 +16,13 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.commands import play as play_command
+from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.learning.policy import Policy
@@ -126,6 +130,8 @@ BAD_FLAGS = {
     "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "exclude"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
+    "no such preset": ("--config nope", "no preset is named nope", "cpu, default, robust"),
+    "no such robot": ("--robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     "run missing": ("--resume nowhere", "nowhere", "give a run's folder"),
     "MJCF missing": ("--mjcf a.xml", "a.xml", "does not exist", "give the path"),
 }
@@ -396,6 +402,50 @@ def test_help(main: Callable[[list[str]], None], capsys) -> None:
     assert flag in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    "main", [train_command.main, eval_command.main, play_command.main, plot_command.main]
+)
+def test_help_has_no_empty_default_and_no_nested_brackets(main, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert "usage: " in shown
+    assert "[[" not in shown and "(default: )" not in shown
+
+
+def test_training_ends_at_the_whole_block_nearest_to_its_steps(tmp_path: Path, capsys) -> None:
+    """170 steps are 2.66 blocks of 64, and 80 are 1.25; the training says how many it makes."""
+    for given, trained in ((170, 192), (80, 64)):
+        log_dir = tmp_path / str(given)
+        flags = ["--total-steps", str(given), "--log-dir", str(log_dir), "--no-report"]
+        train_command.main([*TINY, *flags])
+        assert f"steps: {trained}, in blocks of 64\n" in capsys.readouterr().out
+        (results,) = log_dir.glob("*/results.json")
+        assert json.loads(results.read_text())["trained_steps"] == trained
+
+
+@pytest.mark.parametrize(
+    ("compiling", "seconds", "said"),
+    [
+        # The rest of a short evaluation takes less than 10 s, however long it compiled.
+        (60.0, 8.0, []),
+        (0.0, 8.0, []),
+        (60.0, 80.0, ["30% evaluated", "50% evaluated", "70% evaluated"]),
+    ],
+)
+def test_an_evaluation_in_a_pipe_says_only_what_is_worth_a_line(
+    monkeypatch, compiling: float, seconds: float, said: list[str]
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
+    shown = io.StringIO()
+    with eval_command._progress(Console(file=shown)) as progress:
+        for share in (0.1, 0.3, 0.5, 0.7, 0.9, 1.0):
+            now = compiling + share * seconds
+            progress(share)
+    assert shown.getvalue().splitlines() == said
+
+
 def test_presets_are_valid() -> None:
     files = {p.stem: p for p in resource_path("configs").glob("*.yaml")}
     del files["robustness"]
@@ -422,6 +472,9 @@ def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
     results = json.loads((trained / "results.json").read_text())
     assert results["trained_steps"] == STEPS
     assert results["solved_steps"] is None and results["passed"] is False
+    assert results["version"] == bounce_mjx.__version__
+    head = (trained / "config.yaml").read_text().splitlines()[0]
+    assert head == f"# bounce_mjx {bounce_mjx.__version__}"
     best = [p.name for p in (trained / "checkpoints/best").iterdir()]
     assert best == [str(results["best_steps"])]
     assert tuple(result["name"] for result in results["results"]) == RESULT_NAMES

@@ -1,13 +1,16 @@
 """The console script: its commands, its help, and Ctrl-C while it starts."""
 
-import importlib
+import email.message
+import importlib.metadata
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+import yaml
 
 import bounce_mjx
 from bounce_mjx.commands import main as console_script
@@ -44,8 +47,42 @@ def test_unknown_command(args: list[str], words: tuple[str, ...], capsys) -> Non
 def test_version(capsys) -> None:
     console_script.main(["--version"])
     assert capsys.readouterr().out == f"bounce_mjx {bounce_mjx.__version__}\n"
-    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert bounce_mjx.__version__ == project["version"]
+    citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))
+    changes = (CHECKOUT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert bounce_mjx.__version__ == citation["version"]
+    assert f"\n## [{bounce_mjx.__version__}] - " in changes
+
+
+def test_doctor_says_what_an_issue_needs(monkeypatch, capsys) -> None:
+    """Also where packages are missing and JAX does not start."""
+    requires = {
+        "bounce_mjx": [
+            "numpy>=2",
+            "numpy; extra == 'sim'",
+            'jax[gpu]<2; (python_version > "3") and extra == "sim"',
+            "bounce_mjx[sim]; extra == 'all'",
+            "nonesuch; extra == 'all'",
+        ],
+        "jax": ["nonesuch-plugin>=1; extra == 'gpu'", "numpy; extra == 'cpu'"],
+    }
+    provided = email.message.Message()
+    for extra in ("sim", "all"):
+        provided["Provides-Extra"] = extra
+    monkeypatch.setattr(importlib.metadata, "requires", requires.get)
+    monkeypatch.setattr(importlib.metadata, "metadata", lambda name: provided)
+    monkeypatch.setattr(jax, "devices", lambda: (_ for _ in ()).throw(RuntimeError("no\nGPU")))
+    monkeypatch.setenv("JAX_TEST_VARIABLE", "3")
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
+    console_script.main(["doctor"])
+    first, *lines, last = capsys.readouterr().out.splitlines()
+    assert first == last == "```"
+    said = dict(line.split(": ", 1) for line in lines)
+    assert said["bounce_mjx"].startswith(f"{bounce_mjx.__version__} in ")
+    assert f"numpy {np.__version__}" in said["packages"]
+    assert said["devices"] == "none, as JAX does not start (no GPU)"
+    assert "JAX_TEST_VARIABLE=3" in said["variables"]
+    assert said["extra sim"] == "lacks nonesuch-plugin (pip install 'bounce_mjx[sim]')"
+    assert said["extra all"] == "lacks nonesuch-plugin, nonesuch (pip install 'bounce_mjx[all]')"
 
 
 def test_missing_package(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -84,10 +84,10 @@ def test_links_resolve(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
-def test_page_shows_a_picture(page: Path) -> None:
-    pictures = re.findall(r"^!\[[^]]{15,}\]\(([^)]+)\)$", page.read_text("utf-8"), re.MULTILINE)
-    assert pictures
-    for picture in pictures:
+def test_pictures_have_a_description(page: Path) -> None:
+    pictures = re.findall(r"!\[([^]]*)\]\(([^)]+)\)", page.read_text("utf-8"))
+    for description, picture in pictures:
+        assert len(description) >= 15, picture
         assert (page.parent / picture).stat().st_size < 700_000, picture
 
 
@@ -202,8 +202,12 @@ def test_config_reference_is_fresh() -> None:
 
 def reference_rows() -> dict[str, list[str]]:
     """For each key of the config reference, the cells that follow the key."""
-    rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", REFERENCE, re.MULTILINE)
-    return {key: re.split(r" (?<!\\)\| ", cells) for key, cells in rows}
+    rows = {}
+    for section in REFERENCE.split("\n## ")[1:]:
+        group = re.match(r"`([\w.]+)`\n", section)
+        for key, cells in re.findall(r"^\| `(\w+)` \| (.+) \|$", section, re.MULTILINE):
+            rows[f"{group[1]}.{key}" if group else key] = re.split(r" (?<!\\)\| ", cells)
+    return rows
 
 
 def leaves(plain: dict, prefix: str = "") -> dict:
@@ -222,9 +226,10 @@ def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
     )
     defaults = leaves(TrainConfig().model_dump(mode="json"))
     assert rows.keys() == defaults.keys()
-    for key, (flag, kind, default, _, _, meaning) in rows.items():
-        assert flag.strip("`") in flags
-        assert kind and meaning
+    for key, (value, default, meaning) in rows.items():
+        # As the head of the page says.
+        assert "--" + re.sub(r"^(env|ppo)\.", "", key).replace("_", "-") in flags
+        assert value and meaning
         expected = defaults[key]
         # Numbers have six digits, also in a list.
         if isinstance(np.ravel(expected)[0], float):
@@ -249,10 +254,11 @@ def test_config_reference_has_the_true_ranges() -> None:
     """A value just outside a bound is refused, and the error names the key; a value just inside is
     accepted."""
     checked = 0
-    for key, (_, kind, *_, limits, _) in reference_rows().items():
-        if kind not in ("number", "whole number"):
+    for key, (limits, *_) in reference_rows().items():
+        kind = re.match(r"(number|whole number) [<>≤≥]", limits)
+        if kind is None:
             continue
-        step = 1 if kind == "whole number" else 1e-6
+        step = 1 if kind[1] == "whole number" else 1e-6
         for sign, text in re.findall(r"([<>≤≥]) ([\d^.e+-]+)", limits):
             bound = eval(text.replace("^", "**"))
             outward = step if sign in "<≤" else -step
@@ -291,8 +297,9 @@ def test_physics_page_names_the_commands_that_join_loops() -> None:
 
 
 def test_map_has_every_folder_of_the_package() -> None:
-    """README's map: one row for each folder, and every path in it exists."""
-    section = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("## Where things are\n")[1]
+    """CONTRIBUTING's map: one row for each folder, and every path in it exists."""
+    text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = text.split("## Where things are\n")[1]
     rows = re.findall(r"^\| `([^|]+)` \| (.+) \|$", section.split("\n## ")[0], re.MULTILINE)
     described = [name for cell, _ in rows for name in cell.split("`, `")]
     folders = {f"{init.parent.relative_to(CHECKOUT)}/" for init in PACKAGE.glob("*/__init__.py")}
@@ -359,7 +366,8 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
 
 def test_packages_import_in_the_order_of_the_map():
     """The map's promise: each folder of the package imports only from the rows above it."""
-    section = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("## Where things are\n")[1]
+    text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = text.split("## Where things are\n")[1]
     order = re.findall(r"^\| `src/bounce_mjx/(\w+)/`", section, re.MULTILINE)
     package = CHECKOUT / "src" / "bounce_mjx"
     against = []

@@ -1,6 +1,7 @@
 """`BounceBall`: observation, resets, actions, bounces, terminations, faults, and its derivative."""
 
 import functools
+import pickle
 import re
 from pathlib import Path
 
@@ -179,6 +180,15 @@ def test_observation_ends_with_the_target_height(walked):
 
 
 # Reset
+
+
+def test_a_pickled_environment_is_the_same_environment() -> None:
+    env = BounceBall(EnvConfig(target_height_range=(0.7, 0.7)))
+    copy = pickle.loads(pickle.dumps(env))
+    assert type(copy) is BounceBall and copy.config == env.config
+    key = jax.random.PRNGKey(0)
+    np.testing.assert_array_equal(copy.reset(key).obs, env.reset(key).obs)
+
 
 N_RESETS = 2000
 

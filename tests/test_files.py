@@ -1,6 +1,8 @@
 """Files and folders in which someone else may have had a hand."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -73,6 +75,23 @@ def test_a_private_folder_is_for_its_user_alone(tmp_path: Path, monkeypatch) -> 
     with pytest.raises(OSError, match="it is another user's"):
         private_folder(folder)
     assert folder.stat().st_mode & 0o777 == 0o755
+
+
+def test_a_system_without_locks_and_user_numbers(tmp_path: Path) -> None:
+    """As on Windows: the modules are imported anew without `fcntl` and `os.getuid`."""
+    script = f"""
+import os, sys
+from pathlib import Path
+sys.modules["fcntl"] = None
+del os.getuid
+from bounce_mjx.files import private_folder
+from bounce_mjx.runs.lock import lock_run
+run = private_folder(Path({str(tmp_path)!r}) / "run")
+with lock_run(run), lock_run(run):
+    print("two writers")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "two writers\n", done.stderr
 
 
 @pytest.mark.parametrize("linked", [None, "bounce_mjx", "bounce_mjx/jax"])

@@ -56,6 +56,18 @@ def make_vec(mode=AutoresetMode.NEXT_STEP, **settings) -> gymnasium.vector.Vecto
     )
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_time_limit_beyond_gymnasiums_is_told(make) -> None:
+    with pytest.warns(UserWarning, match="3000 steps, but .* 2000; pass max_episode_steps=3000"):
+        make(ENV_ID, episode_seconds=30).close()
+
+
+def test_a_longer_time_limit_with_gymnasiums_is_not_told() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gymnasium.make_vec(ENV_ID, episode_seconds=30, max_episode_steps=3000).close()
+
+
 def make_sync(mode, wrap=lambda env: env) -> SyncVectorEnv:
     """Gymnasium's vector of single environments."""
     made = [lambda: wrap(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parent.parent
+PACKAGE = CHECKOUT / "src" / "bounce_mjx"
 
 # An editable install puts the checkout on the path of every interpreter of this environment.
 HIDE_CHECKOUT = f"""
@@ -115,8 +116,67 @@ except ImportError as error:
     print(isinstance(error, UserError), error)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    sentence = r"True .+ cannot be imported \(.+\); install it with pip install .+\n"
+    sentence = r"True .+ cannot be imported \(.+\); install it with: pip install .+\n"
     assert re.fullmatch(sentence, done.stdout), done.stdout + done.stderr
+
+
+def test_another_playground_is_refused_in_one_sentence() -> None:
+    """Version 1.0 has the name, and is another program."""
+    script = """
+import importlib.metadata, sys, types
+version = importlib.metadata.version
+importlib.metadata.version = lambda name: "1.0.2" if name == "playground" else version(name)
+sys.modules["mujoco_playground"] = types.ModuleType("mujoco_playground")
+from bounce_mjx.errors import UserError
+try:
+    import bounce_mjx.adapters.playground
+except ImportError as error:
+    print(isinstance(error, UserError), error)
+"""
+    environ = {k: v for k, v in os.environ.items() if k != "UV_RUN_RECURSION_DEPTH"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environ
+    )
+    assert done.stdout == (
+        "True MuJoCo Playground 1.0.2 is installed, but this adapter needs a version below 1; "
+        "install it with: pip install 'playground<1'\n"
+    ), done.stderr
+
+
+# Documented, although they begin with a line: of named tuples, and of the module os.
+DOCUMENTED = {"_replace", "_asdict", "_fields", "_exit"}
+
+
+def private_names() -> set[str]:
+    """Names of other libraries that begin with a line and that the package uses: modules, and
+    attributes that the package does not define itself."""
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    modules, used, own = set(), set(), set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.module.startswith("bounce_mjx"):
+            modules |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Attribute):
+            (own if isinstance(node.ctx, ast.Store) else used).add(node.attr)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            own.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            own.add(node.id)
+    modules = {name for name in modules if re.search(r"(^|\.)_[a-z]", name)}
+    return modules | {name for name in used - own - DOCUMENTED if re.match("_[a-zA-Z]", name)}
+
+
+def test_private_names_of_other_libraries_are_listed() -> None:
+    """CONTRIBUTING.md lists them all, and none that is gone."""
+    text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = text.split("## Private names\n")[1].split("\n## ")[0]
+    listed = set(re.findall(r"^\| [^|]+ \| `([^`]+)` \|", section, re.MULTILINE))
+    sources = "".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    names = {name.rpartition(".")[2] for name in private_names()}
+    assert names <= {name.rpartition(".")[2] for name in listed}
+    assert all(name.rpartition(".")[2] in sources for name in listed)
 
 
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
@@ -183,6 +243,7 @@ def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
         names = set(archive.namelist())
     source = CHECKOUT / "src"
     expected = {str(p.relative_to(source)) for p in (source / "bounce_mjx").rglob("*.py")}
+    expected |= {"bounce_mjx/py.typed"}
     for folder in ("mjcf", "configs", "pretrained"):
         data = [p for p in (CHECKOUT / folder).rglob("*") if p.is_file()]
         assert data

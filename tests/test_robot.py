@@ -1,8 +1,10 @@
 """Adoption of arms: unsuitable models are refused in one sentence, suitable ones become the task's
 scene with a level paddle and stable servos."""
 
+import importlib.util
 import os
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import yaml
 from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
+from bounce_mjx.commands import view as view_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
@@ -200,7 +203,7 @@ def test_an_unsuitable_model_is_refused(name, tmp_path, monkeypatch, capfd) -> N
     monkeypatch.chdir(tmp_path)
     Path("robot.xml").write_text(text)
     with pytest.raises(SystemExit) as exited:
-        adopt_command.main(["robot.xml", "--site", site, "--no-view"])
+        adopt_command.main(["robot.xml", "--site", site])
     out, err = capfd.readouterr()
     assert (exited.value.code, out) == (2, "")
     assert re.fullmatch(r"error: .+\n", err) and "robot.xml" in err
@@ -245,7 +248,7 @@ def written(tmp_path_factory) -> dict[str, Path]:
     configs = {}
     for name, path, site in (("small", small, "tool"), ("ur5e", ur5e(), "attachment_site")):
         configs[name] = folder / f"{name}.yaml"
-        adopt_command.main([str(path), "--site", site, "--out", str(configs[name]), "--no-view"])
+        adopt_command.main([str(path), "--site", site, "--out", str(configs[name])])
     return configs
 
 
@@ -481,8 +484,34 @@ def test_a_name_with_a_line_break_stays_in_the_configs_comment(tmp_path) -> None
     mjcf_file = tmp_path / "my\narm.xml"
     mjcf_file.write_text(ARM)
     out = tmp_path / "arm.yaml"
-    adopt_command.main([str(mjcf_file), "--site", "tool", "--out", str(out), "--no-view"])
+    adopt_command.main([str(mjcf_file), "--site", "tool", "--out", str(out)])
     assert load_config(out).env.mjcf == mjcf_file
+
+
+def test_adopting_ends_by_itself_and_view_shows_the_arm(tmp_path, monkeypatch, capsys) -> None:
+    shown = []
+    monkeypatch.setattr(view_command, "main", shown.append)
+    (tmp_path / "arm.xml").write_text(ARM)
+    args = [f"{tmp_path}/arm.xml", "--site", "tool", "--out", f"{tmp_path}/arm.yaml"]
+    adopt_command.main(args)
+    assert not shown
+    (command,) = re.findall(r"see it: bounce-mjx view (.+)", capsys.readouterr().out)
+    adopt_command.main([*args, "--view"])
+    assert shown == [shlex.split(command)]
+
+
+def test_a_missing_package_of_a_robot_names_the_command_of_the_docs(monkeypatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
+    page = (Path(__file__).parents[1] / "docs/other-robots.md").read_text(encoding="utf-8")
+    mjcf_file = Path("package:robosuite/models/assets/robots/panda/robot.xml")
+    for variable, command in (({}, "pip install"), ({"UV_RUN_RECURSION_DEPTH": "1"}, "uv pip")):
+        for name, value in variable.items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(UserError) as refused:
+            locate(mjcf_file)
+        _, _, hint = str(refused.value).partition("install it with: ")
+        assert hint.startswith(command) and hint.removeprefix("uv ") in page
 
 
 def test_compiling_leaves_the_standard_output_to_other_threads() -> None:
@@ -512,9 +541,7 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
     """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
     base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'
     (tmp_path / "arm.xml").write_text(mjcf(base, motors("lift roll pitch", 60.0)))
-    adopt_command.main(
-        f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --no-view".split()
-    )
+    adopt_command.main(f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml".split())
     env = BounceBall(load_config(tmp_path / "arm.yaml").env)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     after = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((3,), np.float32))

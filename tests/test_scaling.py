@@ -388,6 +388,12 @@ def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
         hosts.join(num_processes=2)
 
 
+def test_several_hosts_are_refused_on_windows(monkeypatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(UserError, match="on Windows; use Linux"):
+        hosts.join("127.0.0.1:1", 1, 0)
+
+
 PEER = """
 import sys, time
 from bounce_mjx.training.peers import Peers

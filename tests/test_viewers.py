@@ -66,6 +66,7 @@ from bounce_mjx.viewers.simulation import (
     of_environment,
     resample,
 )
+from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 from bounce_mjx.viewers.watch import TrainingPage, _Panel, results_list
 from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
 from bounce_mjx.world.config import WorldConfig
@@ -1049,6 +1050,16 @@ def leaning() -> Simulation:
 def still() -> Simulation:
     env = Env(StillConfig(physics="fused"))
     return Simulation(env, make_zero_controller(env), 1, seed=0)
+
+
+def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_path) -> None:
+    assert Path(find_ffmpeg()) == Path(imageio_ffmpeg.get_ffmpeg_exe())
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=r"ffmpeg, which is not found; install it, or the extra"):
+        VideoWriter(tmp_path / "a.mp4", (64, 64), None)
+    (tmp_path / "ffmpeg").touch(mode=0o755)
+    assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
 
 
 def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatch) -> None:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
     from bounce_mjx.tasks.bounce_ball import BounceBall
 
-    __version__: str
+__version__ = "0.1.0"
 
 __all__ = ["BounceBall", "EnvConfig", "__version__", "load_policy"]
 
@@ -27,10 +27,6 @@ def __getattr__(name: str) -> Any:
         from bounce_mjx.tasks.bounce import BounceConfig
 
         return BounceConfig
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("bounce_mjx")
     if name == "load_policy":
         from bounce_mjx.deploy.loading import load_policy
 

@@ -1,8 +1,10 @@
 """The exception that a user's mistake raises, and how a command reports it."""
 
 import contextlib
+import importlib.metadata
 import io
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from typing import NoReturn
@@ -24,18 +26,50 @@ def needed(package: str, install: str) -> Iterator[None]:
     """Around the import of an optional package.
 
     Args:
-      install: what pip installs, such as 'bounce_mjx[brax]'.
+      install: its name on the package index, as for `install_command`.
 
     Raises:
       MissingPackage: the package cannot be imported.
     """
     try:
         yield
+    except MissingPackage:
+        raise
     except ImportError as error:
         raise MissingPackage(
-            f"{package} cannot be imported ({reason_of(error)}); install it with "
-            f"pip install {install}"
+            f"{package} cannot be imported ({reason_of(error)}); install it with: "
+            f"{install_command(install)}"
         ) from error
+
+
+def check_version(package: str, distribution: str, below: int) -> None:
+    """Refuses a major version of an optional package that is another program; a missing package is
+    left to its import.
+
+    Raises:
+      MissingPackage: the installed version is too new.
+    """
+    try:
+        version = importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return
+    if int(version.partition(".")[0]) >= below:
+        command = install_command(f"{distribution}<{below}")
+        raise MissingPackage(
+            f"{package} {version} is installed, but this adapter needs a version below {below}; "
+            f"install it with: {command}"
+        )
+
+
+def install_command(*words: str) -> str:
+    """The command that installs a package where this process runs.
+
+    Args:
+      words: options, and its name on the package index or an extra such as "bounce_mjx[brax]".
+    """
+    # `uv run` sets the variable, and its environment has no pip.
+    uv = "uv " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""
+    return f"{uv}pip install {shlex.join(words)}"
 
 
 @contextlib.contextmanager

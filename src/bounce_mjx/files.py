@@ -62,7 +62,8 @@ def private_folder(path: Path) -> Path:
     status = path.lstat()
     if not stat.S_ISDIR(status.st_mode):
         raise NotADirectoryError(errno.ENOTDIR, "it is a link or a file", str(path))
-    if status.st_uid != os.getuid():
+    # Windows has no such numbers; there, only the user can open a folder under the home.
+    if hasattr(os, "getuid") and status.st_uid != os.getuid():
         raise PermissionError(errno.EPERM, "it is another user's", str(path))
     path.chmod(0o700)
     return path

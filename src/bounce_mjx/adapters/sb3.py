@@ -7,7 +7,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError, needed
 
-with needed("Stable-Baselines3", "'bounce_mjx[sb3]'"):
+with needed("Stable-Baselines3", "bounce_mjx[sb3]"):
     import gymnasium
     from gymnasium.vector import AutoresetMode
     from stable_baselines3.common.monitor import Monitor

@@ -1,6 +1,7 @@
 """Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,7 +30,7 @@ DEFAULT_SITE = "attachment_site"
 class AdoptCommand(StrictModel):
     """Finds the start pose and the servos of an arm, and writes its config."""
 
-    mjcf: Annotated[Path, tyro.conf.Positional]
+    mjcf: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MJCF")]
     """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
     menagerie:NAME for a model of MuJoCo Menagerie."""
     site: str = DEFAULT_SITE
@@ -42,8 +43,8 @@ class AdoptCommand(StrictModel):
     """File for the config; by default, my_arm.yaml for my_arm.xml."""
     paddle: PaddleConfig = PaddleConfig()
     """The paddle; a given position or quaternion fixes the mount, which is searched otherwise."""
-    view: bool = True
-    """Show the arm afterwards."""
+    view: bool = False
+    """Show the arm afterwards, until Ctrl-C."""
 
 
 @interruptible
@@ -77,7 +78,10 @@ def main(args: Sequence[str]) -> None:
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     with writable(out, "choose another --out"):
         write_output(out, f"# {on_one_line(head)}\n{text}")
-    console.print(f"config: {out}  (bounce-mjx train --robot {out})", markup=False)
+    console.print(f"config: {out}", markup=False)
+    quoted = shlex.quote(str(out))
+    console.print(f"see it: bounce-mjx view --robot {quoted} --actions zero", markup=False)
+    console.print(f"train it: bounce-mjx train --robot {quoted}", markup=False)
     if command.view:
         # The viewers import seconds of libraries.
         from bounce_mjx.commands import view

@@ -24,7 +24,7 @@ from bounce_mjx.evaluation.config import (
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 
-# An evaluation that is not slower needs no lines about its progress.
+# Lines about the progress are left out where less time than this is left.
 _SILENT_SECONDS = 10.0
 
 
@@ -81,7 +81,7 @@ def main(args: Sequence[str]) -> None:
     for warning in warnings:
         console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(report, "the results"))
-    console.print(details_line(report), highlight=False)
+    console.print(details_line(report), highlight=False, soft_wrap=True)
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
@@ -93,17 +93,21 @@ def main(args: Sequence[str]) -> None:
 @contextlib.contextmanager
 def _progress(console: Console) -> Iterator[Callable[[float], None]]:
     """A function that shows the share of the evaluation that is done, from 0 to 1: as a bar on a
-    terminal; elsewhere, as a line after each tenth of a slow evaluation."""
-    said, said_at = 0.0, time.monotonic()
+    terminal; elsewhere, as a line after each tenth of an evaluation whose rest is slow."""
+    # The first call follows the compilation.
+    said, first, started = 0.0, 0.0, None
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=1.0)
 
         def show(share: float) -> None:
-            nonlocal said, said_at
+            nonlocal said, first, started
             bar.update(task, completed=share, description="evaluating")
-            slow = time.monotonic() - said_at >= _SILENT_SECONDS
-            if not console.is_terminal and slow and share - said >= 0.1:
-                said, said_at = share, time.monotonic()
+            if started is None:
+                first, started = share, time.monotonic()
+            spent, left = time.monotonic() - started, 1.0 - share
+            slow = spent * left >= _SILENT_SECONDS * (share - first)
+            if not console.is_terminal and slow and left and share - max(said, first) >= 0.1:
+                said = share
                 console.print(f"{share:.0%} evaluated", highlight=False)
 
         yield show

@@ -1,6 +1,6 @@
 """The console script.
 
-`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|train-torch`
+`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|excite|doctor|train-torch`
 """
 
 import difflib
@@ -23,6 +23,8 @@ COMMANDS = {
     "plot": "draw the learning curves of runs, and an evaluation",
     "report": "write the report of a run, report.html",
     "export": "write a trained policy as an ONNX file",
+    "excite": "plan a motion from which an arm can be identified",
+    "doctor": "print versions, devices and what is missing",
     "train-torch": "train with a PyTorch library",
 }
 _HELP = """usage: bounce-mjx COMMAND [ARGUMENTS]

@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 class PlayCommand(WorldCommand):
     """Shows a trained policy, or several side by side."""
 
-    checkpoints: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    checkpoints: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="[CHECKPOINT ...]", help_behavior_hint=""),
+    ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained or robust. Several are shown side by side. The
     default is the newest run, or pretrained if there is no run."""

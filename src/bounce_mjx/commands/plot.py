@@ -17,7 +17,11 @@ from bounce_mjx.interrupt import interruptible
 class PlotCommand(RunCommand):
     """Draws the learning curves of runs, and the evaluation of a checkpoint."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    runs: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="[RUN ...]", help_behavior_hint=""),
+    ] = ()
     """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one
     checkpoint in it, the evaluation is drawn too."""

@@ -16,7 +16,7 @@ from bounce_mjx.interrupt import interruptible
 class ReportCommand(RunCommand):
     """Writes the report of a run, report.html in its folder."""
 
-    run: Annotated[Path | None, tyro.conf.Positional] = None
+    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
     """A run's folder; latest, the default, is the newest run."""
 
 

@@ -59,7 +59,9 @@ class WorldCommand(RunCommand):
 class PolicyCommand(RunCommand):
     """A command line about a trained policy."""
 
-    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    checkpoint: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
+    ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained or robust. The default is the newest run, or
     pretrained if there is no run."""

@@ -20,6 +20,9 @@ from bounce_mjx.errors import UserError
 
 CommandT = TypeVar("CommandT")
 
+NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
+"""Marks a setting whose help names no default value, as it is empty."""
+
 
 def parse(
     command_class: type[CommandT],

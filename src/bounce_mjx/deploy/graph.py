@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.gpu.places import INDICES, evaluated, source_places
 
-EXTRA = "'bounce_mjx[export]'"
+EXTRA = "bounce_mjx[export]"
 """What pip installs for an export."""
 
 Value = str | np.ndarray

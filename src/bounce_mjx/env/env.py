@@ -134,6 +134,10 @@ class Env:
             else None
         )
 
+    def __reduce__(self) -> tuple:
+        """Pickled as its settings; a copy is built again."""
+        return type(self), (self.config, self._randomize)
+
     def _check_joints(self) -> None:
         given, acting = self.config.num_joints, joint_names(self.mj_model)
         if given != len(acting):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.errors import UserError, install_command, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.limits import check_files
@@ -32,6 +32,8 @@ _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddl
 _RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _SILENCE = threading.Lock()
+# Without what only its simulations need; a later version may move its files.
+_INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
@@ -86,9 +88,10 @@ def _in_package(name: str) -> Path:
     package, _, file = name.partition("/")
     found = importlib.util.find_spec(package) if package.isidentifier() else None
     if found is None or not found.submodule_search_locations:
+        words = _INSTALLED_AS.get(package) or (shorten(package.replace("_", "-")),)
         raise UserError(
             f"the package {shorten(package)!r} is not installed, which package:{shorten(name)} "
-            f"names; install it (pip install {shorten(package.replace('_', '-'))})"
+            f"names; install it with: {install_command(*words)}"
         )
     return Path(found.submodule_search_locations[0]) / file
 
@@ -99,7 +102,7 @@ def _in_menagerie(name: str) -> Path:
     except ImportError as error:
         raise UserError(
             f"the package mujoco-menagerie is missing, which menagerie:{shorten(name)} needs; "
-            "pip install 'bounce_mjx[robots]'"
+            f"install it with: {install_command('bounce_mjx[robots]')}"
         ) from error
     robot, _, entry = name.partition("/")
     try:
@@ -495,9 +498,7 @@ class _Builder:
             )
 
 
-def _add_paddle(
-    paddle: mujoco._specs.MjsBody, config: RobotConfig, default: mujoco._specs.MjsDefault
-) -> None:
+def _add_paddle(paddle: mujoco.MjsBody, config: RobotConfig, default: mujoco.MjsDefault) -> None:
     """Adds the blade, with all the mass, and a handle for pictures to the paddle's body."""
     blade = config.paddle
     common = {"contype": 0, "conaffinity": 0, "friction": [0, 0, 0], "default": default}

@@ -69,7 +69,7 @@ class TrainConfig(StrictModel):
     """Devices that share the environments (with several seeds: the seeds). The default is one, or
     all on several hosts. It does not affect the training's result."""
     total_steps: Steps = 50_000_000
-    """Environment steps to train for, rounded up to whole blocks."""
+    """Environment steps to train for, rounded to whole blocks, at least one."""
     block_steps: Steps = 1_000_000
     """Environment steps between two progress reports, rounded to whole iterations."""
     eval_every: Steps = 2_000_000
@@ -212,7 +212,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
     Raises:
       UserError: the world is wrong, or of another robot than the run.
     """
-    path = named_file(world, WORLDS)
+    path = _named(world, WORLDS, "world")
     named, env = read_world(path), config.env
     values = env.model_dump()
     if named.robot is not None:
@@ -279,9 +279,25 @@ def read_preset(
     """
     if path is None:
         path = default_preset(has_accelerator())
-    path = named_file(named_file(path, f"configs/{task or DEFAULT}"), "configs")
-    robot, world = robot and named_file(robot, ROBOTS), world and named_file(world, WORLDS)
+    path = _named(named_file(path, f"configs/{task or DEFAULT}"), "configs", "preset")
+    robot, world = (
+        robot and _named(robot, ROBOTS, "robot"),
+        world and _named(world, WORLDS, "world"),
+    )
     return load_config(path, robot, task, world)
+
+
+def _named(path: Path, folder: str, kind: str) -> Path:
+    """`named_file`, which refuses a word that is neither a file nor a name in the folder."""
+    found = named_file(path, folder)
+    if found == path and str(path) == path.stem and not os.path.exists(path):
+        names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
+        names = [name for name in names if name != "robustness"]
+        raise UserError(
+            f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or the path "
+            "of a YAML file"
+        )
+    return found
 
 
 def default_preset(accelerator: bool) -> Path:

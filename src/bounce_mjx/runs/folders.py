@@ -31,6 +31,7 @@ from typing import Literal, NamedTuple
 
 from rich.console import Console
 
+import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
@@ -104,7 +105,8 @@ def save_config(run: Path, config: TrainConfig) -> None:
         # The run's folder may be moved.
         env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
         config = config.model_copy(update={"env": env})
-    write_atomically(run / CONFIG_FILE, dump_config(config))
+    head = f"# bounce_mjx {bounce_mjx.__version__}\n"
+    write_atomically(run / CONFIG_FILE, head + dump_config(config))
 
 
 def seed_folder(run: Path, seed: int) -> Path:

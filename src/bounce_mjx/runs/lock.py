@@ -1,23 +1,31 @@
 """Lock that gives a run's folder a single writer."""
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from bounce_mjx.errors import UserError
 
+try:
+    import fcntl
+except ImportError:
+    # On Windows.
+    fcntl = None
+
 
 @contextlib.contextmanager
 def lock_run(run: Path) -> Iterator[None]:
     """Holds the lock of a run's folder; the kernel releases it when the process dies.
 
-    On a file system without locks on folders, such as NFS, every process gets the lock.
+    On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
 
     Raises:
       UserError: another process holds the lock, or the folder cannot be opened.
     """
+    if fcntl is None:
+        yield
+        return
     try:
         descriptor = os.open(run, os.O_RDONLY)
     except OSError as error:

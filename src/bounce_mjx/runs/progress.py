@@ -57,6 +57,8 @@ class Results(_Evaluations):
 
     best: Report
     device: str
+    version: str = ""
+    """Version of this package that trained last."""
     trained_steps: _Steps = 0
     seconds: dict[str, _Seconds] = {}
     fresh_resets: bool = False

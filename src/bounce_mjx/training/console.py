@@ -95,8 +95,7 @@ class Reporter:
     def _time_left(self, steps: int) -> str:
         """The time until the last step, at the mean speed so far with its evaluations; an upper
         bound if the training may end earlier."""
-        # The last block may exceed the total.
-        share = max(0, self._config.total_steps - steps) / (steps - self._first_step)
+        share = (self._config.total_steps - steps) / (steps - self._first_step)
         left = f"{share * (time.monotonic() - self._started):.0f} s left"
         return f"at most {left}" if self._config.stop_when_solved else left
 

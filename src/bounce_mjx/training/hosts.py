@@ -73,6 +73,8 @@ def join(
             f"{', '.join(f for f in given if f not in missing)} needs {', '.join(missing)} as well;"
             " give all three, or only --distributed under Slurm, Open MPI or Kubernetes"
         )
+    if sys.platform == "win32":
+        raise UserError("several hosts cannot train together on Windows; use Linux, such as WSL 2")
     _divert_native_output()
 
     def connect() -> Peers | None:

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+import bounce_mjx
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.results import Report
@@ -35,7 +36,14 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import TensorBoardLog, open_log
-from bounce_mjx.training.trainer import JAX, Snapshot, Trainer, Watcher, iterations_per_block
+from bounce_mjx.training.trainer import (
+    JAX,
+    Snapshot,
+    Trainer,
+    Watcher,
+    in_whole_blocks,
+    iterations_per_block,
+)
 
 Tree = TypeVar("Tree")
 
@@ -107,6 +115,7 @@ def train(
       TrainingStopped: SIGINT or SIGTERM came; the state is saved.
     """
     hosts.agree(config, options.resume)
+    config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         job = _Job(config, console, make_trainer, options, stop, stack)
@@ -164,6 +173,8 @@ class _Job:
             say(console, f"warning: {warning}")
         library = "" if self.trainer.library == JAX else f"library: {self.trainer.library}  "
         say(console, f"device: {self.device}  {library}run: {self.run}")
+        bound = "at most " if config.stop_when_solved else ""
+        say(console, f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
         self.clock.lap("setup")
 
     @property
@@ -488,6 +499,7 @@ class _Job:
             trained_steps=self.steps,
             seconds=self.clock.seconds,
             device=self.device,
+            version=bounce_mjx.__version__,
             library=self.trainer.library,
         )
 

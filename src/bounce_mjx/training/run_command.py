@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError, reason_of
+from bounce_mjx.errors import UserError, install_command, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table
 from bounce_mjx.runs.config import TrainConfig
@@ -40,7 +40,8 @@ def run_command(
     """
     if command.wandb is not None and importlib.util.find_spec("wandb") is None:
         raise UserError(
-            "--wandb needs the package wandb; install it with: pip install 'bounce_mjx[wandb]'"
+            "--wandb needs the package wandb; install it with: "
+            f"{install_command('bounce_mjx[wandb]')}"
         )
     console = Console(quiet=not hosts.is_leader())
     # A later command has to name the task's file again.

@@ -31,6 +31,14 @@ def iterations_per_block(config: TrainConfig) -> int:
     return max(1, round(config.block_steps / config.ppo.batch_steps))
 
 
+def in_whole_blocks(config: TrainConfig) -> TrainConfig:
+    """The config with the `total_steps` that are trained: the nearest number of whole blocks."""
+    block = iterations_per_block(config) * config.ppo.batch_steps
+    return config.model_copy(
+        update={"total_steps": block * max(1, round(config.total_steps / block))}
+    )
+
+
 class Trainer(Protocol):
     """S independent trainings of one algorithm, the seeds of a run.
 

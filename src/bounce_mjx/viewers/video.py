@@ -1,16 +1,16 @@
 """Videos of an episode: MP4, or an animated GIF for a web page."""
 
 import contextlib
+import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import MissingPackage, UserError, install_command
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.viewers.files import new_output
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
@@ -41,6 +41,26 @@ _ENCODINGS = {
 }
 
 
+def find_ffmpeg() -> str:
+    """Path of ffmpeg: of the extra `video`, if it is installed, else the system's, which may lack
+    an encoder.
+
+    Raises:
+      MissingPackage: there is none.
+    """
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError as error:
+        found = shutil.which("ffmpeg")
+        if found is None:
+            raise MissingPackage(
+                "a video needs the program ffmpeg, which is not found; install it, or the extra "
+                f"video: {install_command('bounce_mjx[video]')}"
+            ) from error
+        return found
+    return get_ffmpeg_exe()
+
+
 class VideoWriter:
     """Writes recordings as a video; the constructor checks everything that can be checked in
     advance."""
@@ -53,7 +73,8 @@ class VideoWriter:
           fps: frames per second; None for 60, or 25 for a GIF.
 
         Raises:
-          UserError: the size or the rate does not fit the format, or OpenGL does not work.
+          UserError: the size or the rate does not fit the format, there is no ffmpeg, or no
+            OpenGL library works.
         """
         self._path, self._size = path, size
         self.fps = fps or _DEFAULT_FPS[path.suffix.lower()]
@@ -64,6 +85,7 @@ class VideoWriter:
                 f"--fps {self.fps} does not suit a GIF, which counts time in 1/100 s; give 10, "
                 "20, 25 or 50"
             )
+        self._ffmpeg = find_ffmpeg()
         choose_opengl()
 
     def write(self, simulation: Simulation, recording: EnvFrame) -> None:
@@ -100,7 +122,7 @@ class VideoWriter:
         width, height = self._size
         pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
         encoding = _ENCODINGS[path.suffix.lower()]
-        ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+        ffmpeg = [self._ffmpeg, "-y", "-loglevel", "error"]
         return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
     def _pictures(self, env: Env, frames: EnvFrame) -> Iterator[np.ndarray]:

@@ -44,7 +44,7 @@ class TrainingPage:
         console: Console,
         allowed: Collection[str] = (),
     ):
-        """Starts the thread, which first compiles the simulation.
+        """Starts the thread, which serves the page and compiles the simulation.
 
         Args:
           allowed: see `open_server`.
@@ -83,12 +83,12 @@ class TrainingPage:
     def _serve(self) -> None:
         try:
             with _on_cpu():
-                simulation = self._simulate()
                 with open_server(*self._address) as server:
+                    self._say(f"watch: {self._address.url}")
                     side = server.gui.add_panel()
                     panel = _Panel(server.gui, side, self._config)
+                    simulation = self._simulate()
                     page = LivePage(server, simulation, PageStart("training"), side)
-                    self._say(f"watch: {self._address.url}")
                     page.run(None, lambda: self._tell(simulation, panel))
         # The training goes on without its page.
         except Exception as error:

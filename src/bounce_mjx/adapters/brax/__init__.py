@@ -8,7 +8,7 @@ Then `brax.envs.get_environment("bounce_ball", episode_seconds=30)` returns a
 from bounce_mjx.errors import needed
 from bounce_mjx.lazy import silence_mjx
 
-with needed("brax", "'bounce_mjx[brax]'"):
+with needed("brax", "bounce_mjx[brax]"):
     silence_mjx()
     import brax.envs
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
@@ -95,6 +96,12 @@ class Batch:
         if "episode_seconds" in settings:
             limits.append(self.config.episode_steps)
         self._limit = min(limits)
+        steps, made = self.config.episode_steps, max_episode_steps or MAX_EPISODE_STEPS
+        if "episode_seconds" in settings and 0 < made < steps:
+            gymnasium.logger.warn(
+                f"episode_seconds={self.config.episode_seconds:g} is {steps} steps, but gymnasium "
+                f"ends an episode after {made}; pass max_episode_steps={steps} too"
+            )
         self._episodes: _Episodes | None = None
 
     @property

@@ -34,8 +34,8 @@ from bounce_mjx.tasks.registry import DEFAULT
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment.
 
-    `gymnasium.make` ends its episodes after `max_episode_steps` steps. Without it, only a given
-    `episode_seconds` limits them.
+    `gymnasium.make` ends its episodes after `max_episode_steps` steps, 2,000 by default, also where
+    a given `episode_seconds` is longer. Without it, only a given `episode_seconds` limits them.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -129,8 +129,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     """B environments in one compiled step.
 
     Given the same seeds and actions, they return the same as a `gymnasium.vector.SyncVectorEnv` of
-    B single environments, in every autoreset mode. In the same-step mode, `info["final_info"]` also
-    has the entry `episode` of Gymnasium's `RecordEpisodeStatistics`.
+    B single environments up to float32 rounding, in every autoreset mode. In the same-step mode,
+    `info["final_info"]` also has the entry `episode` of Gymnasium's `RecordEpisodeStatistics`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}

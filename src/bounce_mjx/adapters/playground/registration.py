@@ -19,25 +19,28 @@ from bounce_mjx.robot.model import load_model
 def register() -> None:
     """Adds the environment, its domain randomisation and its PPO parameters.
 
-    Playground's registry has no function for the last two. It also fetches the robots of its own
+    Playground's registry has no functions for the last two. It also fetches the robots of its own
     environments over the network before it loads any environment; this one does not need them.
     """
-    if ENV_NAME in manipulation._envs:
+    if ENV_NAME in manipulation.ALL_ENVS:
         return
     manipulation.register_environment(ENV_NAME, PlaygroundBounceBall, default_config)
-    manipulation._randomizer[ENV_NAME] = domain_randomize
     registry.ALL_ENVS = (*registry.ALL_ENVS, ENV_NAME)
-    load, ppo_parameters = manipulation.load, manipulation_params.brax_ppo_config
+    load, randomizer = manipulation.load, manipulation.get_domain_randomizer
+    ppo_parameters = manipulation_params.brax_ppo_config
 
     def load_any(env_name: str, config: Any = None, config_overrides: Any = None) -> Any:
         if env_name == ENV_NAME:
             return PlaygroundBounceBall(config or default_config(), config_overrides)
         return load(env_name, config, config_overrides)
 
+    def randomizer_of_any(env_name: str) -> Any:
+        return domain_randomize if env_name == ENV_NAME else randomizer(env_name)
+
     def parameters_of_any(env_name: str, impl: str | None = None) -> config_dict.ConfigDict:
         return brax_ppo_config() if env_name == ENV_NAME else ppo_parameters(env_name, impl)
 
-    manipulation.load = load_any
+    manipulation.load, manipulation.get_domain_randomizer = load_any, randomizer_of_any
     manipulation_params.brax_ppo_config = parameters_of_any
 
 

@@ -2,7 +2,7 @@
 
 from bounce_mjx.errors import needed
 
-with needed("PyTorch", "'bounce_mjx[torch]'"):
+with needed("PyTorch", "bounce_mjx[torch]"):
     import torch  # noqa: F401
 
 from bounce_mjx.adapters.torch.vector_env import StepResult, TorchVectorEnv

@@ -7,7 +7,7 @@ import torch
 
 from bounce_mjx.errors import needed
 
-with needed("Gymnasium", "'bounce_mjx[gymnasium]'"):
+with needed("Gymnasium", "bounce_mjx[gymnasium]"):
     import gymnasium
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space

@@ -39,7 +39,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import SUM
 from bounce_mjx.learning.policy import Policy
 
-with needed("rsl_rl", "'bounce_mjx[torch]'"):
+with needed("rsl_rl", "bounce_mjx[torch]"):
     from rsl_rl.algorithms import PPO
     from rsl_rl.env import VecEnv
     from rsl_rl.models import MLPModel

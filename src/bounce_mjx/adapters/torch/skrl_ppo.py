@@ -34,7 +34,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import max_learning_rate
 
-with needed("skrl", "'bounce_mjx[torch]'"):
+with needed("skrl", "bounce_mjx[torch]"):
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.envs.wrappers.torch import Wrapper
     from skrl.envs.wrappers.torch import wrap_env as _skrls_wrap_env

@@ -1,0 +1,129 @@
+"""Prints what a report of a problem needs: `bounce-mjx doctor`."""
+
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import bounce_mjx
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import exit_on_user_error, install_command, reason_of
+from bounce_mjx.interrupt import interruptible
+
+_DISTRIBUTION = "bounce_mjx"
+# Versions on which the results of a simulation and a training depend.
+_PACKAGES = "jax jaxlib mujoco mujoco-mjx numpy flax optax orbax-checkpoint".split()
+_VARIABLES = ("JAX_", "XLA_", "MUJOCO_GL", "CUDA_VISIBLE_DEVICES")
+_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[([\w,-]+)\])?.*?(?:;.*\bextra == ['\"]([\w-]+)['\"].*)?$")
+
+
+class DoctorCommand(StrictModel):
+    """Prints versions, devices, the cache, and what each extra lacks, to paste into an issue."""
+
+
+@interruptible
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
+    """Runs the command line."""
+    parse(DoctorCommand, args, prog="bounce-mjx doctor")
+    print("```")
+    for name, text in described():
+        print(f"{name}: {text}", flush=True)
+    print("```")
+
+
+def described() -> Iterator[tuple[str, str]]:
+    """The lines, each a name and a text."""
+    yield "bounce_mjx", f"{bounce_mjx.__version__} in {Path(bounce_mjx.__file__).parent}"
+    yield "python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}"
+    yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in _PACKAGES)
+    plugins = importlib.metadata.entry_points(group="jax_plugins")
+    yield "plugins of jax", ", ".join(sorted({plugin.name for plugin in plugins})) or "none"
+    chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
+    yield "variables", ", ".join(f"{n}={v}" for n, v in sorted(chosen.items())) or "none"
+    yield "processors", f"{os.cpu_count()}"
+    yield "devices", _devices()
+    yield "cache", _cache()
+    yield "pictures", _opengl()
+    yield "videos", _ffmpeg()
+    for extra, packages in sorted(extras().items()):
+        missing = [package for package in packages if version_of(package) is None]
+        command = install_command(f"{_DISTRIBUTION}[{extra}]")
+        state = f"lacks {', '.join(missing)} ({command})" if missing else "installed"
+        yield f"extra {extra}", state
+
+
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None if it is missing."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def extras() -> dict[str, list[str]]:
+    """The packages of each extra; none where the package runs without being installed."""
+    try:
+        names = importlib.metadata.metadata(_DISTRIBUTION).get_all("Provides-Extra", [])
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    return {extra: list(_packages(_DISTRIBUTION, extra)) for extra in names}
+
+
+def _packages(distribution: str, extra: str) -> Iterator[str]:
+    """The packages of an installed package's extra, with those of the extras that it includes."""
+    for requirement in importlib.metadata.requires(distribution) or []:
+        name, included, of_extra = _REQUIREMENT.match(requirement).groups()
+        if of_extra == extra:
+            yield name
+            if version_of(name) is not None:
+                for inner in included.split(",") if included else ():
+                    yield from _packages(name, inner)
+
+
+def _devices() -> str:
+    # Imported late, as all of these: a broken installation is what this command is for.
+    try:
+        import jax
+
+        return ", ".join(f"{device.device_kind} ({device})" for device in jax.devices())
+    except Exception as error:
+        return f"none, as JAX does not start ({reason_of(error)})"
+
+
+def _cache() -> str:
+    try:
+        import jax
+
+        from bounce_mjx.training.setup import cache_compilations
+
+        cache_compilations()
+        folder = jax.config.jax_compilation_cache_dir
+        if folder is None:
+            return "none"
+        sizes = [path.stat().st_size for path in Path(folder).glob("*") if path.is_file()]
+    except Exception as error:
+        return f"unknown ({reason_of(error)})"
+    return f"{folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB"
+
+
+def _opengl() -> str:
+    try:
+        from bounce_mjx.viewers.offscreen import choose_backend
+
+        return choose_backend()
+    except Exception as error:
+        return f"none ({reason_of(error)})"
+
+
+def _ffmpeg() -> str:
+    try:
+        from bounce_mjx.viewers.video import find_ffmpeg
+
+        return find_ffmpeg()
+    except Exception as error:
+        return f"none ({reason_of(error)})"

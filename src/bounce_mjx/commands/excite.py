@@ -1,0 +1,54 @@
+"""Plans a motion from which an arm can be identified: `bounce-mjx excite --robot R --out FILE`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import Finite, Positive, StrictModel
+from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
+from bounce_mjx.runs.config import read_preset
+
+
+class ExciteCommand(StrictModel):
+    """Plans a motion of the arm without a ball, from which bounce-mjx identify estimates the arm:
+    each joint slow and fast, then all together, free of contacts."""
+
+    robot: Path | None = None
+    """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
+    configs/robots/ (ur5e, panda or iiwa); the project's own arm by default."""
+    out: Path = Path("excitation.csv")
+    """CSV file for the servo targets over time."""
+    seconds: Positive = 20.0
+    """Length, s."""
+    max_velocity: Positive = 1.0
+    """Largest speed of a joint's target, rad/s; give less than the robot's own limit."""
+    table_height: Finite | None = None
+    """Height of a table that the arm must not touch, m; the floor is at 0."""
+    simulated: Path | None = None
+    """CSV file for the log that the simulated arm gives, as a rehearsal of bounce-mjx identify."""
+
+
+@interruptible
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
+    """Runs the command line; exits with 2 on a mistake."""
+    command = parse(ExciteCommand, args, prog="bounce-mjx excite")
+    with no_garbage_collection():
+        from bounce_mjx.identify.excitation import excite, simulate_arm, to_csv
+        from bounce_mjx.runs.files import writable, write_output
+
+    config = read_preset(Path("default"), command.robot).env
+    motion = excite(config, command.seconds, command.max_velocity, command.table_height)
+    with writable(command.out, "choose another --out"):
+        write_output(command.out, to_csv(motion))
+    console = Console(soft_wrap=True, highlight=False)
+    for name, amplitude in zip(motion.joint_names, motion.amplitudes, strict=True):
+        console.print(f"  {name}: up to {amplitude:.3f} rad from the start pose", markup=False)
+    console.print(f"motion: {command.out} ({motion.times[-1]:.0f} s)", markup=False)
+    if command.simulated is not None:
+        simulate_arm(config, motion, command.simulated)
+        console.print(f"log: {command.simulated}", markup=False)

@@ -1,0 +1,267 @@
+"""Motions of the arm without a ball that show its servos: each joint alone, slow and fast, then all
+together, without contacts."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.arm import compile_spec
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
+from bounce_mjx.world.config import WorldConfig
+
+MARGIN = 0.01
+"""Least distance between two parts of the arm, and from the arm to the floor or a table, m."""
+_LARGEST_AMPLITUDE = 0.3
+_SMALLEST_AMPLITUDE = 0.005
+_SLOW = 0.25
+# Height by which the paddle is lifted first, m, and the time for it and for the way back, s.
+_LIFT = 0.2
+_LIFTING = 1.5
+_FAST = (0.6, 4.0)
+_RAMP = 0.5
+_TOGETHER = (0.53, 0.71, 0.89, 1.13, 1.37, 1.61, 1.83, 2.11)
+# Time between two poses that are checked for contacts, s.
+_CHECKED = 0.02
+
+
+class Excitation(NamedTuple):
+    """Servo targets over time."""
+
+    joint_names: tuple[str, ...]
+    times: np.ndarray
+    """Times [T], s."""
+    targets: np.ndarray
+    """Servo targets [T, n], rad."""
+    amplitudes: np.ndarray
+    """Largest distance [n] of each joint from the start pose, rad."""
+
+
+def excite(
+    config: WorldConfig,
+    seconds: float,
+    max_velocity: float | Sequence[float],
+    table_height: float | None = None,
+) -> Excitation:
+    """Plans an excitation that starts and ends at `config.default_joint_angles`.
+
+    The arm first lifts the paddle, for room above the floor. The joints' amplitudes are halved
+    until no pose has a contact.
+
+    Args:
+      max_velocity: largest speed of a target, of each joint or of all, rad/s.
+      table_height: height of a table under the arm, m; None for the floor alone.
+
+    Raises:
+      UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
+    """
+    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    addresses, n = find_addresses(model), config.num_joints
+    home = np.array(config.default_joint_angles)
+    speeds = np.broadcast_to(np.asarray(max_velocity, float), (n,))
+    ranges = model.jnt_range[list(addresses.arm_joints)]
+    limited = ranges[:, 0] < ranges[:, 1]
+    centre = _lifted(model, home)
+    room = np.where(limited, np.min(np.abs(ranges - centre[:, None]), axis=1) - 0.02, np.inf)
+    amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
+    contacts = _Contacts(config, table_height)
+    if touching := contacts.at(home):
+        raise UserError(
+            f"the start pose has {touching}; change default_joint_angles or --table-height"
+        )
+    times = np.arange(round(seconds / config.control_dt)) * config.control_dt
+    every = max(round(_CHECKED / config.control_dt), 1)
+    names = joint_names(model)
+    lifting = np.maximum(_LIFTING, 1.5 * np.max(np.abs(centre - home) / speeds))
+    if times[-1] < 2.0 * lifting + 1.0 * n:
+        raise UserError(
+            f"{seconds:g} s are too short to move {n} joints; give at least "
+            f"{2.0 * lifting + 1.0 * n:.0f} s"
+        )
+    lift = _smooth(np.minimum(times, times[-1] - times) / lifting)[:, None] * (centre - home)
+    inner = times[(times >= lifting) & (times <= times[-1] - lifting)]
+    while True:
+        targets = home + lift
+        moving = np.isin(times, inner)
+        targets[moving] += _motion(inner - inner[0], amplitudes, speeds)
+        hit = next((t for t in range(0, len(times), every) if contacts.at(targets[t])), None)
+        if hit is None:
+            return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
+        moved = np.abs(targets[hit] - home - lift[hit]) > 1e-3
+        amplitudes = np.where(moved, 0.5 * amplitudes, amplitudes)
+        if not np.any(moved) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
+            raise UserError(
+                f"{names[int(np.argmin(amplitudes))]} cannot move around the start pose without "
+                f"{contacts.at(targets[hit])}; change default_joint_angles or --table-height"
+            )
+
+
+def _lifted(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
+    """Joint angles [n] at which the paddle is higher, by steps of the pseudo-inverse."""
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    body = model.geom_bodyid[addresses.paddle_geom]
+    limits = model.jnt_range[list(addresses.arm_joints)]
+    limited = limits[:, 0] < limits[:, 1]
+    low, high = (np.where(limited, limits[:, i], side) for i, side in ((0, -np.inf), (1, np.inf)))
+    dofs, angles, jacobian = list(addresses.arm_qvel), home.copy(), np.zeros((3, model.nv))
+    for _ in range(20):
+        data.qpos[list(addresses.arm_qpos)] = angles
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[addresses.paddle_geom], body)
+        part = jacobian[:, dofs]
+        damped = part @ part.T + 1e-3 * np.eye(3)
+        step = part.T @ np.linalg.solve(damped, [0.0, 0.0, _LIFT / 20])
+        angles = np.clip(angles + step, low + 0.02, high - 0.02)
+    return angles
+
+
+def _smooth(share: np.ndarray) -> np.ndarray:
+    """A step from 0 to 1 without a jump of speed, clipped outside."""
+    share = np.clip(share, 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+def _motion(times: np.ndarray, amplitudes: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Displacements [T, n]: a slot of each joint alone, slow and then fast; then one of all."""
+    n, length = len(amplitudes), times[-1] + times[1] - times[0]
+    alone = 0.7 * length / n
+    moved = np.zeros((len(times), n))
+    for j in range(n):
+        t = times - j * alone
+        slow = (t >= 0.0) & (t < 0.5 * alone)
+        fast = (t >= 0.5 * alone) & (t < alone)
+        moved[:, j] += slow * _slow(t, 0.5 * alone, amplitudes[j], speeds[j])
+        moved[:, j] += fast * _sweep(t - 0.5 * alone, 0.5 * alone, amplitudes[j], speeds[j])
+    t = times - n * alone
+    ramp = _smooth(np.minimum(t, length - n * alone - t) / _RAMP)
+    for j in range(n):
+        rates = 2.0 * np.pi * np.array(_TOGETHER[j % 4 :: 4])
+        wave = np.sum(np.sin(rates * t[:, None] + j), axis=1) / len(rates)
+        size = 0.5 * min(amplitudes[j], 0.6 * speeds[j] / float(np.max(rates)))
+        moved[:, j] += (t >= 0.0) * ramp * size * wave
+    return moved
+
+
+def _slow(t: np.ndarray, length: float, amplitude: float, speed: float) -> np.ndarray:
+    """A triangle there and back at a quarter of the speed, which shows dry friction."""
+    size = min(amplitude, 0.25 * speed * _SLOW * length)
+    return size * 2.0 / np.pi * np.arcsin(0.9999 * np.sin(2.0 * np.pi * t / length))
+
+
+def _sweep(t: np.ndarray, length: float, amplitude: float, speed: float) -> np.ndarray:
+    """A sine of rising frequency, whose speed stays within the limit."""
+    low, high = _FAST
+    rate = low + (high - low) * np.clip(t / length, 0.0, 1.0)
+    phase = 2.0 * np.pi * (low * t + 0.5 * (high - low) * t * t / length)
+    window = np.clip(np.minimum(t, length - t) / (0.2 * length), 0.0, 1.0)
+    size = np.minimum(amplitude, 0.7 * speed / (2.0 * np.pi * rate))
+    return size * window * np.sin(phase)
+
+
+class _Contacts:
+    """Contacts of the arm with itself, the floor and a table, by MuJoCo's collision."""
+
+    def __init__(self, config: WorldConfig, table_height: float | None):
+        spec, path = scene_spec(config.mjcf, config.robot)
+        for pair in list(spec.pairs):
+            spec.delete(pair)
+        for geom in spec.geoms:
+            geom.contype = geom.conaffinity = int(geom.type != mujoco.mjtGeom.mjGEOM_PLANE)
+            geom.margin = MARGIN
+        heights = {"floor": 0.0} | ({} if table_height is None else {"table": table_height})
+        for name, height in heights.items():
+            spec.worldbody.add_geom(
+                name=f"bounce_mjx {name}",
+                type=mujoco.mjtGeom.mjGEOM_PLANE,
+                size=[5.0, 5.0, 0.1],
+                pos=[0.0, 0.0, height],
+                contype=1,
+                conaffinity=1,
+                margin=0.0,
+            )
+        self._model = compile_spec(spec, path)
+        self._data = mujoco.MjData(self._model)
+        self._planes = {
+            self._model.geom(f"bounce_mjx {name}").id: f"the {name}" for name in heights
+        }
+        addresses = find_addresses(self._model)
+        self._qpos = list(addresses.arm_qpos)
+        self._ball = addresses.ball_geom
+        self._home: set[tuple[int, int]] = set()
+        # Parts of one arm that overlap in its start pose are drawn so.
+        self._home = {
+            pair
+            for pair in self._pairs(np.array(config.default_joint_angles))
+            if not self._planes.keys() & set(pair)
+        } | self._base_pairs()
+
+    def at(self, joint_angles: np.ndarray) -> str:
+        """The first contact at joint angles [n], in words; empty for none."""
+        for pair in self._pairs(joint_angles):
+            if pair not in self._home and not self._are_neighbours(pair):
+                return "a contact of " + " and ".join(self._name(geom) for geom in pair)
+        return ""
+
+    def _pairs(self, joint_angles: np.ndarray) -> list[tuple[int, int]]:
+        model, data = self._model, self._data
+        data.qpos[:] = model.qpos0
+        data.qpos[self._qpos] = joint_angles
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        pairs = {tuple(sorted(map(int, contact.geom))) for contact in data.contact}
+        return sorted(pair for pair in pairs if self._ball not in pair)
+
+    def _base_pairs(self) -> set[tuple[int, int]]:
+        """Pairs of a plane and a geom that no joint moves, such as the base on the floor."""
+        fixed = [g for g in range(self._model.ngeom) if self._is_fixed(g)]
+        return {tuple(sorted((plane, geom))) for plane in self._planes for geom in fixed}
+
+    def _are_neighbours(self, pair: tuple[int, int]) -> bool:
+        """Whether a joint connects both parts; MuJoCo checks those of a fixed base."""
+        m = self._model
+        bodies = [int(m.body_weldid[m.geom_bodyid[geom]]) for geom in pair]
+        parents = [int(m.body_weldid[m.body_parentid[body]]) for body in bodies]
+        joined = bodies[0] == parents[1] or bodies[1] == parents[0]
+        return joined and not self._planes.keys() & set(pair)
+
+    def _is_fixed(self, geom: int) -> bool:
+        m = self._model
+        return int(m.body_weldid[m.geom_bodyid[geom]]) == 0
+
+    def _name(self, geom: int) -> str:
+        body = self._model.geom_bodyid[geom]
+        return self._planes.get(geom) or self._model.body(body).name or f"body {body}"
+
+
+def to_csv(motion: Excitation) -> str:
+    """The motion as CSV: a column for the time and one for each joint's target."""
+    titles = ["time [s]", *(f"servo_targets.{joint} [rad]" for joint in motion.joint_names)]
+    rows = np.column_stack([motion.times, motion.targets])
+    lines = [",".join(titles), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def simulate_arm(config: WorldConfig, motion: Excitation, path: Path) -> None:
+    """Writes the log of a motion on the model's own arm, on MuJoCo's C engine.
+
+    Raises:
+      UserError: the log exists or cannot be made.
+    """
+    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    qpos, qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
+    servos = list(addresses.actuators)
+    data.qpos[qpos] = config.default_joint_angles
+    with Recorder(path, motion.joint_names) as recorder:
+        for time, target in zip(motion.times, motion.targets, strict=True):
+            measured = {"time": time, "joint_angles": data.qpos[qpos]}
+            recorder.step(measured | {"joint_velocities": data.qvel[qvel]}, target)
+            data.ctrl[servos] = target * model.actuator_gear[servos, 0]
+            for _ in range(config.num_substeps):
+                mujoco.mj_step(model, data)
