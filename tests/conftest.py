@@ -61,7 +61,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     marked = pyfuncitem.get_closest_marker("separate_loops") is not None
     if not marked or OPTION not in os.environ["XLA_FLAGS"]:
         return None
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", pyfuncitem.nodeid]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", pyfuncitem.nodeid]
     flags = os.environ["XLA_FLAGS"].replace(OPTION, "")
     done = subprocess.run(
         command,

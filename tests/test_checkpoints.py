@@ -104,7 +104,7 @@ def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -
     writer.close()
     checkpoint = find_checkpoint(run)
     assert_identical(read_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
-    with pytest.raises(UserError, match="holds no training state to go on from"):
+    with pytest.raises(UserError, match="holds no training state to continue from"):
         load_training_state(checkpoint, state)
 
 

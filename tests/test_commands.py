@@ -198,7 +198,7 @@ BAD_MJCF = {
     ),
     "motor": (
         re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
-        "an actuator on Joint2 that is no position servo",
+        "an actuator on Joint2 that is not a position servo",
         '<position joint="Joint2"/>',
     ),
 }

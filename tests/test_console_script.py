@@ -25,6 +25,9 @@ def test_help_lists_the_commands(capsys) -> None:
     assert re.findall(r"^  ([\w-]+) +\w", text, re.MULTILINE) == list(console_script.COMMANDS)
     console_script.main([])
     assert capsys.readouterr().out == text
+    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    (listed,) = re.findall(r"`bounce-mjx ((?:[a-z-]+\|)+[a-z-]+)`", readme)
+    assert sorted(listed.split("|")) == sorted(console_script.COMMANDS)
 
 
 @pytest.mark.parametrize(

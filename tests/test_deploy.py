@@ -549,6 +549,37 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     assert set(range(env.layout.size)) - reached <= still
 
 
+def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) -> None:
+    """In rows or one after another, from noisy and late pictures."""
+    env = {
+        "observation": {"ball_position": 2, "velocity": "differences"},
+        "randomization": {"ball_position_noise": (0.001, 0.001), "ball_latency": (0.01, 0.02)},
+        "action_scale": 1e-3,
+    }
+    run = make_run(tmp_path / "run", env, "juggle")
+    env, policy = Env(load_run_config(run).env), load_policy(run)
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
+    nexts = set()
+    for i in range(40):
+        now = state.pipeline_state
+        sensing = now.memory.sensing
+        balls = np.asarray(sensing.picture.position)
+        measured = {
+            "joint_angles": sensing.seen["joint_angles"][0],
+            "joint_velocities": sensing.seen["joint_velocities"][0],
+            "ball_position": balls if i % 2 else balls.ravel(),
+        }
+        action = policy.step(measured | now.command)
+        np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
+        nexts.add(bool(policy.observation[env.layout["next_ball"]][3] > 0.0))
+        state = step(state, jnp.asarray(action, jnp.float32))
+    # Each ball was the next one.
+    assert policy.metadata.num_balls == 2 and len(nexts) == 2
+    for wrong in (np.zeros(3), np.zeros((3, 2))):
+        with pytest.raises(UserError, match="ball_position has the shape .*; give 6 numbers"):
+            policy.step(measured | now.command | {"ball_position": wrong})
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     seed: int, tmp_path: Path
@@ -684,7 +715,7 @@ def policies_layout(policy: DeployedPolicy) -> dict[str, tuple[int, int]]:
 
 WRONG = {
     "missing": ({"ball_position": None}, "ball_position is missing", "needs joint_angles"),
-    "unknown": ({"ball_positon": [0, 0, 0]}, "ball_positon is no measurement", "ball_position"),
+    "unknown": ({"ball_positon": [0, 0, 0]}, "ball_positon is not a measurement", "ball_position"),
     "short": ({"joint_angles": [0.0] * 5}, "joint_angles has the shape [5]", "6 numbers (rad)"),
     "batch": ({"ball_position": [[0, 0, 1]]}, "has the shape [1, 3]", "3 numbers (m)"),
     "words": ({"target_height": "high"}, "target_height is 'high'", "one number (m)"),
@@ -797,7 +828,9 @@ def test_load_policy_refuses_other_files(tmp_path: Path, monkeypatch) -> None:
     }
     for reason, content in broken.items():
         (tmp_path / "a.onnx").write_bytes(content)
-        with pytest.raises(UserError, match="a.onnx is no policy .*bounce-mjx export") as refusal:
+        with pytest.raises(
+            UserError, match="a.onnx is not a policy .*bounce-mjx export"
+        ) as refusal:
             load_policy(tmp_path / "a.onnx")
         assert " " not in reason or reason in str(refusal.value)
     monkeypatch.setattr(loading, "resource_path", lambda name: tmp_path / name)
@@ -852,7 +885,7 @@ def edited(model: onnx.ModelProto, name: str, text: str) -> bytes:
 @pytest.mark.parametrize("name", WRONG_ENTRIES)
 def test_a_wrong_entry_is_refused_by_name(name: str, filtered: onnx.ModelProto) -> None:
     for value in WRONG_ENTRIES[name]:
-        with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file") as refusal:
+        with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file") as refusal:
             DeployedPolicy(edited(filtered, name, json.dumps(value)), "a.onnx")
         reason = str(refusal.value)
         words = (name, "estimator", "joints", "input", "length than 1", "measurement")
@@ -896,7 +929,7 @@ def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.Mode
         try:
             policy = DeployedPolicy(edited(filtered, name, text), "a.onnx")
         except UserError as error:
-            assert "a.onnx is no policy" in str(error) and "\n" not in str(error), (name, text)
+            assert "a.onnx is not a policy" in str(error) and "\n" not in str(error), (name, text)
             continue
         ranges = [limits or (-math.inf, math.inf) for limits in policy.metadata.joint_ranges]
         low, high = np.transpose(ranges)
@@ -918,7 +951,7 @@ def test_a_network_that_gives_no_number_is_refused(filtered: onnx.ModelProto) ->
         # The biases of the last layer are among them.
         if array.shape == (6,) and array.dtype == np.float32:
             tensor.CopyFrom(onnx.numpy_helper.from_array(array * np.nan, tensor.name))
-    with pytest.raises(UserError, match="a.onnx is no policy .*not finite"):
+    with pytest.raises(UserError, match="a.onnx is not a policy .*not finite"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
@@ -957,7 +990,7 @@ def retype(model: onnx.ModelProto, kind: int) -> None:
 def test_a_memory_of_another_size_is_refused(edit, filtered: onnx.ModelProto) -> None:
     copy = onnx.ModelProto.FromString(filtered.SerializeToString())
     edit(copy)
-    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
+    with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
@@ -965,7 +998,7 @@ def test_an_unknown_output_is_refused(filtered: onnx.ModelProto) -> None:
     copy = onnx.ModelProto.FromString(filtered.SerializeToString())
     copy.graph.output.append(onnx.helper.make_empty_tensor_value_info("more"))
     copy.graph.node.append(onnx.helper.make_node("Identity", ["action"], ["more"]))
-    with pytest.raises(UserError, match="^a.onnx is no policy .*; give a file"):
+    with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 

@@ -119,6 +119,6 @@ def test_compiled_programs_are_kept_in_a_private_folder(
         assert {p.stat().st_mode & 0o777 for p in (folder, folder.parent)} == {0o700}
     else:
         assert used is None
-        assert said.startswith("warning: compiled programs are not kept, as ")
+        assert said.startswith("warning: compiled programs are not cached, as ")
         assert said.count("\n") == 1 and f"{tmp_path}/cache/{linked}" in said
         assert not list(target.iterdir()) and target.stat().st_mode & 0o777 == 0o755

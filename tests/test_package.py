@@ -324,31 +324,24 @@ print(len(load_deployed("pretrained").needs))
     assert (action, needs) == ("6 True", "5")
 
 
-README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
-    "number, printed",
+    ("page", "number", "printed", "needs"),
     [
-        (0, "(64, 29) "),
-        (1, "torch.Size([64, 29]) "),
-        (2, "(29,) (480, 640, 3) (64, 29)\n"),
-        (3, "(64, 29) 0"),
+        ("README.md", 0, "(64, 29) ", None),
+        ("docs/libraries.md", 0, "(29,) (480, 640, 3) (64, 29)\n", "opengl"),
+        ("docs/libraries.md", 1, "torch.Size([64, 29]) ", "torch_libraries"),
+        ("docs/jax.md", 0, "(64, 29) 0", None),
     ],
-    ids=["jax", "torch", "gymnasium", "brax"],
+    ids=["jax", "gymnasium", "torch", "brax"],
 )
-def test_readme_example_runs(number, printed, request, capsys):
-    """The README's examples for each kind of user run unchanged."""
-    needs = {1: "torch_libraries", 2: "opengl"}
-    if number in needs:
-        request.getfixturevalue(needs[number])
-    example = README.split("```python\n")[1 + number].split("```")[0]
-    exec(compile(example, "README.md", "exec"), {})
+def test_example_of_a_page_runs(page, number, printed, needs, request, capsys):
+    """The first examples for each kind of user run unchanged."""
+    if needs:
+        request.getfixturevalue(needs)
+    text = (CHECKOUT / page).read_text(encoding="utf-8")
+    example = text.split("```python\n")[1 + number].split("```")[0]
+    exec(compile(example, page, "exec"), {})
     assert capsys.readouterr().out.startswith(printed)
-
-
-def test_readme_has_no_other_examples():
-    assert README.count("```python\n") == 4
 
 
 def test_imports_beside_a_compilation_leave_the_environment_alone() -> None:

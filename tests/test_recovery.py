@@ -253,7 +253,7 @@ def test_edited_config_is_refused_by_name(run: Path, capfd, key: str, old: str, 
 
 def resume_command(said: str) -> list[str]:
     """The arguments in the command that a stopped training prints."""
-    return shlex.split(re.search(r"go on with: bounce-mjx train (.+)", said)[1])
+    return shlex.split(re.search(r"continue with: bounce-mjx train (.+)", said)[1])
 
 
 @pytest.mark.slow
@@ -716,7 +716,7 @@ def test_a_solved_run_is_told_as_such(solved: Path, capsys) -> None:
 
 def test_a_solved_run_goes_on_to_new_total_steps(solved: Path, straight: Path, capsys) -> None:
     resume(solved, "--total-steps", str(STEPS))
-    assert "it goes on to 256 steps" in capsys.readouterr().out
+    assert "it continues to 256 steps" in capsys.readouterr().out
     assert not load_run_config(solved).stop_when_solved
     ours, theirs = arrays(latest_checkpoint(solved)), arrays(latest_checkpoint(straight))
     for name in theirs:
@@ -760,11 +760,11 @@ def tmpfs(folder: Path) -> Iterator[None]:
 
 
 def finish_once_there_is_room(training: Job, make_room: Callable[[], None], reason: str) -> None:
-    training.wait_until_said("the training goes on")
-    training.wait_until_said("it is kept in memory")
+    training.wait_until_said("the training continues")
+    training.wait_until_said("it stays in memory")
     make_room()
     assert training.wait() == 0, training.said
-    for sentence in ("the training goes on", "it is kept in memory", "the state is saved again"):
+    for sentence in ("the training continues", "it stays in memory", "the state is saved again"):
         assert training.said.count(sentence) == 1
     assert f"cannot be written ({reason})" in training.said
     assert "Traceback" not in training.said
@@ -832,7 +832,7 @@ def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
     with StopRequest() as stop:
         with pytest.raises(UserError, match=r"Not a directory.*make room, and resume"):
             training_job._wait_until_saved([writer], reporter, stop)
-    assert len(said) == 1 and "it is kept in memory" in said[0]
+    assert len(said) == 1 and "it stays in memory" in said[0]
 
 
 # Numbers that are not finite

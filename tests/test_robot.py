@@ -106,12 +106,12 @@ BROKEN = {
     "two arms": (
         mjcf(arm() + arm("r_", base="0 1 .2"), motors(f"{ARM_JOINTS} r_j1 r_j2")),
         "tool",
-        "2 driven joints (r_j1, r_j2) beside the arm",
+        "2 driven joints (r_j1, r_j2) in addition to the arm",
     ),
     "mobile base": (MOBILE, "tool", "wheel_l, wheel_r", "on a fixed base"),
     "no actuators": (mjcf(arm(), ""), "tool", "no actuators", "<position>"),
     "idle joint": (mjcf(arm(), motors("j1 j2 j3 j5 j6")), "tool", "on j4", "--joints"),
-    "tendon": (TENDON, "tool", "no actuator of its own on j6"),
+    "tendon": (TENDON, "tool", "no actuator on j6"),
     "weak motors": (mjcf(arm(), motors(ARM_JOINTS, 2.0)), "tool", "no servo strong enough"),
     "missing mesh": (
         mjcf(
@@ -225,7 +225,7 @@ def test_a_file_of_a_package_is_found_by_name() -> None:
 def test_a_folder_or_a_pipe_is_no_mjcf_file(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe.xml")
     for path in (tmp_path, tmp_path / "pipe.xml"):
-        with pytest.raises(UserError, match=f"{path} is no file; give the path"):
+        with pytest.raises(UserError, match=f"{path} is not a file; give the path"):
             locate(path)
 
 

@@ -202,7 +202,7 @@ def test_the_library_of_a_run_is_one_word_of_the_command(
     monkeypatch.setattr(job, "read_record", lambda _: record)
     with pytest.raises(UserError) as error_info:
         job.check_library(Checkpoint(tmp_path, tmp_path, 64), "jax")
-    command = shlex.split(str(error_info.value).split("go on with: ")[1])
+    command = shlex.split(str(error_info.value).split("continue with: ")[1])
     assert command[:3] == ["bounce-mjx", "train-torch", "--library"]
     assert command[3][:90] == library[:90] and command[4:] == ["--resume", str(tmp_path)]
     assert len(str(error_info.value)) < 1000

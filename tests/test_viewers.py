@@ -280,7 +280,7 @@ def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
     ended = np.zeros((11, 1), bool)
     ended[list(over)] = True
     command, metrics = {"height": value}, {"count": value}
-    return EnvFrame(value * 0.01, wide, wide, wide, command, metrics, ended, ended)
+    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
 
 
 def test_resampling_interpolates_positions() -> None:
@@ -288,7 +288,7 @@ def test_resampling_interpolates_positions() -> None:
     assert len(frames.time) == 6
     times = np.arange(6) / 60
     np.testing.assert_allclose(frames.time[:, 0], times)
-    for positions in (frames.qpos, frames.ball, frames.paddle):
+    for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
     # Commands and metrics come from the last step.
     for values in (frames.command["height"], frames.metrics["count"]):
@@ -901,9 +901,15 @@ def test_results_are_shown_as_they_are_met() -> None:
 def test_the_page_of_a_training_shows_its_newest_policy(
     exchangeable: Simulation, monkeypatch
 ) -> None:
-    """The training only puts the news into a queue."""
-    monkeypatch.setattr(TrainingPage, "_simulate", lambda page: exchangeable)
-    stop = threading.Event()
+    """The training only puts the news into a queue. The address is printed before the simulation is
+    compiled."""
+    printed, stop = io.StringIO(), threading.Event()
+
+    def simulate(page: TrainingPage) -> Simulation:
+        assert "watch: " in printed.getvalue()
+        return exchangeable
+
+    monkeypatch.setattr(TrainingPage, "_simulate", simulate)
 
     def step(simulation) -> None:
         if stop.is_set():
@@ -912,7 +918,6 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     watch(monkeypatch, Simulation, "step", step)
     points: list[tuple[float, ...]] = []
     watch(monkeypatch, _Panel, "draw", lambda panel: points.extend(panel._points))
-    printed = io.StringIO()
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
@@ -929,7 +934,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     # A page that fails leaves the training alone.
     stop.set()
     wait_until(
-        lambda: "the page is not served (the end); the training goes on" in printed.getvalue()
+        lambda: "the page is not served (the end); the training continues" in printed.getvalue()
     )
     training.wait()
 
@@ -1027,7 +1032,7 @@ class Lean(Still):
         twice = 2.0 * step.command["lean_angle"]
         return super().step(state, step)._replace(metrics={"twice": twice})
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: dict, metrics: dict) -> tuple[task.Marker, ...]:
         place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
         wall = task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0))
         dots = (task.Marker(f"dot {i}", (0.1 * i, 0.0, 0.5), size, (0, 0, 1, 1)) for i in range(3))
@@ -1425,7 +1430,7 @@ MISTAKES = {
     "unknown viewer": ("--viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("--viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
     "speed": ("--speed 0", "--speed is 0", "0.1"),
-    "no host": ("--allow-host http://a", "'http://a' is no name of a host", "without http://"),
+    "no host": ("--allow-host http://a", "'http://a' is not the name of a host", "without http://"),
 }
 
 

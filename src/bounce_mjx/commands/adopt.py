@@ -112,7 +112,7 @@ def described(adoption: "Adoption") -> list[str]:
 
     pose, arm = adoption.pose, adoption.arm
     x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
-    strength = f"{pose.acceleration:.0f} m/s^2 upward beside holding the arm"
+    strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     kind = "kept" if adoption.are_kept else "made from the reflected inertia"
     lines = [
         f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",

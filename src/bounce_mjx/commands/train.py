@@ -31,7 +31,7 @@ class TrainCommand(TrainingCommand):
     process_id: Annotated[int, Field(ge=0)] | None = None
     """Number of this process, from 0; with coordinator-address."""
     watch: bool = False
-    """Serve a page beside the training, with the newest policy, the curves and the results."""
+    """Serve a page during the training, with the newest policy, the curves and the results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
     watch_allow_host: Annotated[tuple[HostName, ...], NO_DEFAULT] = ()

@@ -31,7 +31,7 @@ PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
 
 def _check_host(name: str) -> str:
     if not re.fullmatch(r"[\w.-]+", name):
-        raise ValueError(f"{name!r} is no name of a host; give it without http:// and port")
+        raise ValueError(f"{name!r} is not the name of a host; give it without http:// and port")
     return name
 
 

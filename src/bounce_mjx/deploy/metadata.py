@@ -25,6 +25,14 @@ UNITS = {
 }
 """Measurements that every policy accepts, and their units. A task's commands are further ones."""
 
+PER_BALL = {
+    "ball_position": 3,
+    "ball_velocity": 3,
+    "ball_quaternion": 4,
+    "ball_angular_velocity": 3,
+}
+"""Measurements of each ball, and their numbers of entries for one."""
+
 Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
 
@@ -79,6 +87,8 @@ class Metadata(NamedTuple):
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
+    num_balls: Annotated[int, (1, 3)]
+    """Number of balls, each of which is measured."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
     position: Literal["measured", "filter"]
@@ -120,10 +130,11 @@ class Metadata(NamedTuple):
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
-    """Number of entries of each measurement, in the order of `UNITS`, and of each command."""
+    """Number of entries of each measurement, in the order of `UNITS`, and of each command; of
+    several balls, one after another."""
     joints = dict.fromkeys(("joint_angles", "joint_velocities"), len(metadata.joint_names))
-    vectors = dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), 3)
-    sizes = joints | vectors | {"ball_quaternion": 4}
+    balls = {name: size * metadata.num_balls for name, size in PER_BALL.items()}
+    sizes = joints | balls
     return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 
@@ -140,8 +151,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
             raise ValueError(f"its format is {given}, not {FORMAT}")
         command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
         entries = entries | {"commands": json.dumps({"target_height": command})}
-    # The actions of older files add to the measured angle.
-    entries = {"max_lead": "null"} | entries
+    # In older files, the actions add to the measured angle, and there is one ball.
+    entries = {"max_lead": "null", "num_balls": "1"} | entries
     missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):

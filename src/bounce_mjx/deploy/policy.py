@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bounce_mjx.deploy.histories import Histories, Measurements
-from bounce_mjx.deploy.metadata import UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
 from bounce_mjx.deploy.network import OnnxNetwork
 from bounce_mjx.errors import MissingPackage, UserError
 
@@ -52,7 +52,7 @@ class DeployedPolicy:
         except Exception as error:
             reason = (str(error).strip().splitlines() or [repr(error)])[0][:200]
             raise UserError(
-                f"{source} is no policy of this version of the package ({reason}); give a file "
+                f"{source} is not a policy of this version of the package ({reason}); give a file "
                 "that bounce-mjx export wrote"
             ) from error
         self.reset()
@@ -78,7 +78,8 @@ class DeployedPolicy:
             `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
             (rad/s; default 0); each command in `metadata.commands`; `time` of any clock (s). The
             measurements in `needs` are required. Without `time`, a step is one control step after
-            the last one.
+            the last one. Of several balls (`metadata.num_balls`), each quantity has one row per
+            ball [B, 3], or the rows one after another.
 
             With `time`, the elapsed time is rounded to control steps. A call less than half a
             control step after the last one, or before it, is a repetition: it changes nothing and
@@ -184,19 +185,23 @@ class DeployedPolicy:
         """Copies of the measurements as arrays, with defaults for optional ones."""
         for name in measurements:
             if name not in self.units:
-                raise UserError(f"{name} is no measurement; a step takes {', '.join(self.units)}")
+                raise UserError(
+                    f"{name} is not a measurement; a step takes {', '.join(self.units)}"
+                )
         missing = [name for name in self.needs if name not in measurements]
         if missing:
             raise UserError(
                 f"the measurement {missing[0]} is missing; this policy needs "
                 f"{', '.join(self.needs)} in every step"
             )
-        checked = {"ball_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
-        checked["ball_angular_velocity"] = np.zeros(3)
+        count = self.metadata.num_balls
+        checked = {"ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], count)}
+        checked["ball_angular_velocity"] = np.zeros(3 * count)
         for name, value in measurements.items():
             limit = np.inf if name == "time" else _LARGEST
             label = f"the measurement {name}"
-            checked[name] = _array(label, value, (self._sizes[name],), self.units[name], limit)
+            size, rows = self._sizes[name], count if name in PER_BALL else 1
+            checked[name] = _array(label, value, (size,), self.units[name], limit, rows)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
@@ -214,13 +219,18 @@ class DeployedPolicy:
         return max(0, round(elapsed / self.metadata.control_dt))
 
 
-def _array(label: str, value: Any, shape: tuple[int, ...], unit: str, limit: float) -> np.ndarray:
-    """A user's numbers as an array; UserError for another shape or numbers beyond a limit."""
+def _array(
+    label: str, value: Any, shape: tuple[int], unit: str, limit: float, rows: int = 1
+) -> np.ndarray:
+    """A user's numbers, which may come in rows, as an array; UserError for another shape or numbers
+    beyond a limit."""
     count = "one number" if shape == (1,) else f"{shape[0]} numbers"
     try:
         array = np.array(value, float)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
+    if rows > 1 and array.shape == (rows, shape[0] // rows):
+        array = array.ravel()
     if array.shape != shape and not (shape == (1,) and array.shape == ()):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
     wrong = ~(np.isfinite(array) & (np.abs(array) <= limit + 1e-6))

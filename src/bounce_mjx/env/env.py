@@ -232,11 +232,11 @@ class Env:
         count = size + len(commands) + self.task.num_draws
         draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
         own = 0.5 * (draws[size + len(commands) :] + 1.0)
-        physics = self._first_physics(draws[:size], world, self.task.throw(own))
         command = {
             name: low + (high - low) * 0.5 * (draws[size + i] + 1.0)
             for i, (name, (low, high)) in enumerate(ends.items())
         }
+        physics = self._first_physics(draws[:size], world, self.task.throw(own, command))
         no_action = jnp.zeros(self.action_size, draws.dtype)
         state = EnvState(physics, command, no_action, parameters=parameters, world=world)
         if self.config.action.base == "target":

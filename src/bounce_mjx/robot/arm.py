@@ -79,7 +79,7 @@ def locate(mjcf: Path) -> Path:
     else:
         path = mjcf
     if not path.is_file():
-        wrong = "is no file" if path.exists() else "does not exist"
+        wrong = "is not a file" if path.exists() else "does not exist"
         raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
     return path
 
@@ -111,7 +111,7 @@ def _in_menagerie(name: str) -> Path:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         reason = reason_of(error)
         raise UserError(
-            f"menagerie:{shorten(name)} cannot be had ({shorten(reason, 300)}); give a model of "
+            f"menagerie:{shorten(name)} cannot be loaded ({shorten(reason, 300)}); give a model of "
             "MuJoCo Menagerie, and connect to the network for its first use"
         ) from error
 
@@ -273,8 +273,7 @@ class _Builder:
         idle = [_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator of its own on {_listed(idle)}; add one, or name the acting joints "
-                "with --joints"
+                f"no actuator on {_listed(idle)}; add one, or name the acting joints with --joints"
             )
         return actuators
 
@@ -298,7 +297,7 @@ class _Builder:
         """Bodies on the links beyond the last acting joint that joints move.
 
         Raises:
-          UserError: the model has driven joints beside the arm.
+          UserError: the model has driven joints in addition to the arm.
         """
         model = self._model
         beyond = chain[chain.index(model.jnt_bodyid[joints[-1]]) :]
@@ -315,7 +314,7 @@ class _Builder:
         ]
         if beside:
             raise UserError(
-                f"{len(beside)} driven joints ({_listed(beside)}) beside the arm "
+                f"{len(beside)} driven joints ({_listed(beside)}) in addition to the arm "
                 f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
                 "arm on a fixed base"
             )
@@ -332,7 +331,7 @@ class _Builder:
         for i in np.flatnonzero(coupled | loops):
             raise UserError(
                 f"the equality constraint {model.equality(i).name or f'number {i}'} on the arm, so "
-                "it is no serial chain; remove it, or give a serial arm"
+                "it is not a serial chain; remove it, or give a serial arm"
             )
 
     def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
@@ -383,7 +382,7 @@ class _Builder:
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         self._remove("keyframes", arm.keys)
         self._remove("sensors", arm.sensors)
-        self._remove("actuators beside the arm's", others)
+        self._remove("actuators that do not drive the arm", others)
         self._remove("tendons", arm.tendons)
         self._remove("equality constraints", arm.equalities)
         self._remove("contact pairs and exclusions", [*arm.pairs, *arm.excludes])

@@ -230,7 +230,7 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
         if not is_position_servo:
             name = joint_name(mj_model, joint)
             raise UserError(
-                f"an actuator on {name} that is no position servo; drive it by "
+                f"an actuator on {name} that is not a position servo; drive it by "
                 f'<position joint="{name}"/>'
             )
 

@@ -156,8 +156,8 @@ class _Search:
         if not strong:
             most = max(0.0, *(p.acceleration for p in able))
             raise UserError(
-                "no servo strong enough: beside holding the arm, the actuators accelerate the "
-                f"paddle upward by {most:.1f} m/s^2 at most, and the task needs "
+                "no servo strong enough: in addition to holding the arm, the actuators accelerate "
+                f"the paddle upward by {most:.1f} m/s^2 at most, and the task needs "
                 f"{_LEAST_ACCELERATION:g}; raise the force limits of {self._names()}"
             )
         return max(strong, key=lambda pose: pose.score)

@@ -89,7 +89,7 @@ def load_results(run: Path) -> Results | None:
     try:
         return read_json(path, Results)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} is damaged ({error}); delete it to go on without it") from error
+        raise UserError(f"{path} is damaged ({error}); delete it to continue without it") from error
 
 
 class Progress(_Evaluations):

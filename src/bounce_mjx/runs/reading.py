@@ -74,7 +74,7 @@ def load_training_state(
     """
     if not (checkpoint.folder / "training").is_dir():
         raise UserError(
-            f"the checkpoint {checkpoint.folder} holds no training state to go on from, only a "
+            f"the checkpoint {checkpoint.folder} holds no training state to continue from, only a "
             "policy; give a run that bounce-mjx train made"
         )
     record = read_record(checkpoint)

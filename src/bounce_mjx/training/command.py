@@ -42,11 +42,11 @@ class TrainingCommand(TrainConfig):
     """Folder of a run, or latest for the newest run, to continue in place from its latest
     checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
     screening-episodes, eval-seed, stop-when-solved, num-devices and log-dir. With total-steps, a
-    run that has met all results goes on."""
+    run that has met all results continues."""
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
-    """Project of Weights & Biases to log to, beside TensorBoard; needs the extra wandb."""
+    """Project of Weights & Biases to log to, in addition to TensorBoard; needs the extra wandb."""
 
 
 CommandT = TypeVar("CommandT", bound=TrainingCommand)

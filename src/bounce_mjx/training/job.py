@@ -88,7 +88,7 @@ class Options:
     report: bool = True
     """Whether to import the modules of the report during the compilation."""
     wandb: str | None = None
-    """Project of Weights & Biases to log to, beside TensorBoard."""
+    """Project of Weights & Biases to log to, in addition to TensorBoard."""
     watcher: Watcher | None = None
     """Receives the progress of the first seed."""
 
@@ -179,7 +179,7 @@ class _Job:
 
     @property
     def _go_on(self) -> str:
-        return f"go on with: {self.options.command} --resume {shlex.quote(str(self.run))}"
+        return f"continue with: {self.options.command} --resume {shlex.quote(str(self.run))}"
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process."""
@@ -236,8 +236,8 @@ class _Job:
             say(self.console, f"{self.run} has been trained to its end, {steps}; {how}")
         elif self._is_solved():
             met = f"{self.run} has met all results after {steps}"
-            goes_on = f"it goes on to {total}"
-            say(self.console, f"{met}; {how if self.config.stop_when_solved else goes_on}")
+            continues = f"it continues to {total}"
+            say(self.console, f"{met}; {how if self.config.stop_when_solved else continues}")
 
     def compile(self) -> None:
         """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
@@ -516,7 +516,7 @@ def check_library(checkpoint: folders.Checkpoint, library: str) -> None:
         began = shorten(began)
         command = "train" if began == JAX else f"train-torch --library {shlex.quote(began)}"
         raise UserError(
-            f"{checkpoint.run} was trained with {began}, not with {library}; go on with: "
+            f"{checkpoint.run} was trained with {began}, not with {library}; continue with: "
             f"bounce-mjx {command} --resume {shlex.quote(str(checkpoint.run))}"
         )
 
@@ -542,7 +542,7 @@ def _wait_until_saved(
                     f"{problem}, so the end of the training is lost; make room, and resume"
                 )
             reporter.saving_problem(
-                problem, "it is kept in memory, and saved as soon as there is room"
+                problem, "it stays in memory, and is saved as soon as there is room"
             )
             time.sleep(RETRY_SECONDS)
             writer.retry()

@@ -3,7 +3,7 @@
 On a CPU, XLA emits one loop for each result by default, and repeats the intermediate values that
 results share. With its option for multi-output fusion, one loop computes several results: the
 programs compile in about half the time, and the physics runs several times as fast (figures in
-benchmarks/RESULTS.md). XLA aborts the process on a few programs with it, such as MJX's step.
+benchmarks/notes.md). XLA aborts the process on a few programs with it, such as MJX's step.
 """
 
 import os

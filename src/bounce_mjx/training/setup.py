@@ -42,7 +42,7 @@ def cache_compilations() -> None:
             jax.config.update("jax_compilation_cache_dir", str(folder))
         except OSError as error:
             print(
-                f"warning: compiled programs are not kept, as {error.filename} cannot be used "
+                f"warning: compiled programs are not cached, as {error.filename} cannot be used "
                 f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to a folder of yours",
                 file=sys.stderr,
             )

@@ -90,10 +90,10 @@ class TrainingPage:
                     simulation = self._simulate()
                     page = LivePage(server, simulation, PageStart("training"), side)
                     page.run(None, lambda: self._tell(simulation, panel))
-        # The training goes on without its page.
+        # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)
-            self._say(f"the page is not served ({reason}); the training goes on without it")
+            self._say(f"the page is not served ({reason}); the training continues without it")
 
     def _simulate(self) -> Simulation:
         config = self._config

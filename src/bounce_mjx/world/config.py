@@ -24,6 +24,10 @@ PADDLE_HOME = (0.58856, 0.0, 0.05)
 """Where the project's own arm holds the paddle at a reset, m."""
 
 
+NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)]
+"""Number of balls."""
+
+
 class Command(NamedTuple):
     """A number that is wished of the policy: drawn at a reset and after each interval
     (`randomization.command_interval`), or set by a user."""
@@ -126,7 +130,7 @@ class WorldConfig(StrictModel):
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
-    num_balls: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)] = 1
+    num_balls: NumBalls = 1
     """Number of balls; those that the MJCF lacks are copies of its first one."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
     """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""

@@ -73,7 +73,7 @@ class NamedWorld(StrictModel):
                     f"{', '.join(given) or 'none'}"
                 )
             if not _is_numeric(given[key]):
-                raise ValueError(f"{key} is assumed, but is no number; remove it from assumed")
+                raise ValueError(f"{key} is assumed, but is not a number; remove it from assumed")
         for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue

@@ -1,0 +1,86 @@
+"""A release: the wheel and the sdist, each installed alone in a new environment, train a policy,
+evaluate and export it, and another folder loads it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tiny_runs import TIMEOUT, TINY
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("uv") is None, reason="uv is not installed"),
+]
+
+
+def call(*words: object, folder: Path, status: int = 0, **variables: str) -> str:
+    """The output of a program."""
+    hidden = ("PYTHONPATH", "VIRTUAL_ENV", "UV_RUN_RECURSION_DEPTH")
+    environ = {name: value for name, value in os.environ.items() if name not in hidden}
+    done = subprocess.run(
+        [str(word) for word in words],
+        cwd=folder,
+        env=environ | variables,
+        capture_output=True,
+        text=True,
+        timeout=2 * TIMEOUT,
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("dist")
+    call("uv", "build", "--quiet", "--out-dir", folder, CHECKOUT, folder=folder)
+    return {"wheel": next(folder.glob("*.whl")), "sdist": next(folder.glob("*.tar.gz"))}
+
+
+@pytest.mark.parametrize(
+    ("kind", "version"),
+    [("wheel", HERE), ("sdist", HERE), *(("wheel", v) for v in ("3.12", "3.13") if v != HERE)],
+)
+def test_an_installed_release_trains_evaluates_exports_and_acts(
+    kind: str, version: str, built: dict[str, Path], tmp_path: Path
+) -> None:
+    found = subprocess.run(
+        ["uv", "python", "find", "--no-project", "--no-python-downloads", version],
+        capture_output=True,
+    )
+    if found.returncode:
+        pytest.skip(f"Python {version} is not installed")
+    call("uv", "venv", "--quiet", "--python", version, tmp_path / "env", folder=tmp_path)
+    bin_folder = next(p for p in (tmp_path / "env/bin", tmp_path / "env/Scripts") if p.exists())
+    python, command = bin_folder / "python", bin_folder / "bounce-mjx"
+    file = f"bounce_mjx[deploy,export] @ {built[kind].as_uri()}"
+    call("uv", "pip", "install", "--quiet", "--python", python, file, folder=tmp_path)
+
+    work, other = tmp_path / "work", tmp_path / "other"
+    work.mkdir()
+    other.mkdir()
+    log_dir = work / "runs"
+    said = call(command, "train", *TINY, "--total-steps", 128, "--log-dir", log_dir, folder=work)
+    (run,) = log_dir.iterdir()
+    assert "consecutive bounces" in said and (run / "report.html").is_file()
+    # An untrained policy misses results, which is status 1.
+    said = call(command, "eval", run, "--episodes", 4, folder=other, status=1)
+    assert "FAIL" in said
+    call(command, "play", run, "--html", "replay.html", "--seconds", 1, folder=other)
+    assert (other / "replay.html").is_file()
+    call(command, "export", run, "--onnx", other / "policy.onnx", folder=work)
+    acts = (
+        "import numpy, bounce_mjx; p = bounce_mjx.load_policy('policy.onnx')\n"
+        "shapes = {'joint_angles': 6, 'joint_velocities': 6, 'target_height': ()}\n"
+        "values = {name: numpy.zeros(shapes.get(name, 3)) for name in p.needs}\n"
+        "print(bounce_mjx.__file__, p.step(values).shape)"
+    )
+    package, shape = call(python, "-c", acts, folder=other).split(maxsplit=1)
+    assert Path(package).is_relative_to(tmp_path / "env") and shape == "(6,)\n"
+    assert f"in {Path(package).parent}" in call(command, "doctor", folder=other)
