@@ -18,6 +18,7 @@ from bounce_mjx.deploy.metadata import (
     MEASURED,
     NEXT,
     UNITS,
+    CommandLimits,
     CommandRange,
     Hinge,
     Input,
@@ -45,6 +46,7 @@ _ACTION = (
     "where base is the joint angles of the same observation; with max_lead, it is the last servo "
     "target within max_lead of them"
 )
+_LIMITED = "; the command moves toward it within limits"
 
 
 def export_onnx(checkpoint: Checkpoint) -> bytes:
@@ -140,9 +142,10 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         velocity=velocity if filtered or velocity != "filter" else "measured",
         estimator=filter_constants(env, m) if filtered else None,
         control_dt=env.control_dt,
-        action=_ACTION,
+        action=_ACTION if env.robot.limits.velocity is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
+        limits=_limits(env),
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
@@ -163,6 +166,14 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
     )
+
+
+def _limits(env: WorldConfig) -> CommandLimits | None:
+    """The limits of the commands, None without."""
+    limits = env.robot.limits
+    if limits.velocity is None:
+        return None
+    return CommandLimits(limits.velocity, limits.acceleration, limits.jerk)
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:

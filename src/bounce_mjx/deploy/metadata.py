@@ -35,6 +35,10 @@ PER_BALL = {
 
 Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
+Limit = Annotated[float, (1e-6, 1e9)]
+
+# Entries that older files lack: their targets jump, and they are of one ball.
+_LATER = {"limits": "null", "num_balls": "1"}
 
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
@@ -79,6 +83,17 @@ class CommandRange(NamedTuple):
     """Unit; empty for a pure number."""
 
 
+class CommandLimits(NamedTuple):
+    """The arm's limits of each joint's command."""
+
+    velocity: tuple[Limit, ...]
+    """rad/s."""
+    acceleration: tuple[Limit, ...]
+    """rad/s^2."""
+    jerk: tuple[Limit, ...] | None
+    """rad/s^3; None for no limit."""
+
+
 class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
@@ -106,6 +121,9 @@ class Metadata(NamedTuple):
     max_lead: Annotated[float, (0.0, 1e3)] | None
     """Largest distance from the measured angle to the last servo target, to which an action adds,
     rad; None if it adds to the measured angle."""
+    limits: CommandLimits | None
+    """Limits of the commands, which then move between two actions (`robot.setpoints`); None for a
+    servo target that jumps."""
     joint_ranges: tuple[tuple[float, float] | None, ...]
     """Range of each servo target, rad; None for a joint without one."""
     servo_stiffness: tuple[float, ...]
@@ -139,8 +157,11 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name."""
-    return {name: json.dumps(value, allow_nan=False) for name, value in _plain(metadata).items()}
+    """JSON texts of the metadata by field name; without the entries that older files lack, if they
+    are as in these, so that such a file is as new."""
+    plain = _plain(metadata)
+    texts = {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+    return {name: text for name, text in texts.items() if _LATER.get(name) != text}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
@@ -151,8 +172,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
             raise ValueError(f"its format is {given}, not {FORMAT}")
         command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
         entries = entries | {"commands": json.dumps({"target_height": command})}
-    # In older files, the actions add to the measured angle, and there is one ball.
-    entries = {"max_lead": "null", "num_balls": "1"} | entries
+    # The actions of older files add to the measured angle.
+    entries = {"max_lead": "null"} | _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):
@@ -188,6 +209,11 @@ def _check(metadata: Metadata) -> None:
     ):
         if len(getattr(metadata, name)) != count:
             raise ValueError(f"its {name} are not of {count} joints")
+    for name, values in (metadata.limits or CommandLimits((), (), None))._asdict().items():
+        if values and len(values) != count:
+            raise ValueError(f"its limits of the {name} are not of {count} joints")
+    if metadata.limits is not None and metadata.max_lead is None:
+        raise ValueError("its limits have no max_lead")
     if taken := metadata.commands.keys() & UNITS.keys():
         raise ValueError(f"its command {min(taken)} has the name of a measurement")
     if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):
