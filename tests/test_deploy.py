@@ -82,10 +82,12 @@ ENVS = {
         **LEVEL,
     },
 }
+LIMITS = "velocity", "acceleration", "jerk"
 ENVS["leading targets"] = ENVS["all histories"] | {
     "observation": ALL | {"servo_lead": 3},
     "action": {"base": "target", "max_lead": 2e-4},
     "action_scale": 1e-4,
+    "robot": {"limits": {n: (x,) * 6 for n, x in zip(LIMITS, (5e-3, 0.5, 200.0), strict=True)}},
 }
 
 
