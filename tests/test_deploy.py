@@ -87,7 +87,7 @@ ENVS["leading targets"] = ENVS["all histories"] | {
     "observation": ALL | {"servo_lead": 3},
     "action": {"base": "target", "max_lead": 2e-4},
     "action_scale": 1e-4,
-    "robot": {"limits": {n: (x,) * 6 for n, x in zip(LIMITS, (5e-3, 0.5, 200.0), strict=True)}},
+    "robot": {"limits": {n: (x,) * 6 for n, x in zip(LIMITS, (9e-3, 0.5, 200.0), strict=True)}},
 }
 
 
@@ -535,7 +535,9 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
         if name == "sensors":
             measured["ball_age"] = state_now.memory.sensing.picture.age
         action = policy.step(measured | {"time": 7.0 + i * env.dt})
-        np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
+        # The environment's targets add up in single precision.
+        tolerance = 1e-5 + (1e-7 * i if name == "leading targets" else 0.0)
+        np.testing.assert_allclose(policy.observation, state.obs, 0, tolerance, err_msg=f"{i}")
         for quantity, values in own.items():
             values.add(tuple(policy.observation[env.layout[quantity]]))
         commands |= set(map(float, state_now.command.values()))
@@ -572,7 +574,9 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
             "ball_position": balls if i % 2 else balls.ravel(),
         }
         action = policy.step(measured | now.command)
-        np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
+        # The environment's targets add up in single precision.
+        tolerance = 1e-5 + (1e-7 * i if name == "leading targets" else 0.0)
+        np.testing.assert_allclose(policy.observation, state.obs, 0, tolerance, err_msg=f"{i}")
         nexts.add(bool(policy.observation[env.layout["next_ball"]][3] > 0.0))
         state = step(state, jnp.asarray(action, jnp.float32))
     # Each ball was the next one.
