@@ -23,7 +23,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.adapters.brax import (
     BraxBounceBall,
     device_put_replicated,
-    load_policy,
+    load_brax_policy,
     pmap_support,
 )
 from bounce_mjx.errors import UserError
@@ -237,6 +237,7 @@ def ppo_example(tmp_path_factory):
     return folder, history
 
 
+@pytest.mark.slow
 def test_brax_ppo_trains_and_evaluates(ppo_example):
     folder, history = ppo_example
     assert len(history) == 2
@@ -245,6 +246,7 @@ def test_brax_ppo_trains_and_evaluates(ppo_example):
     assert "viewer.js" in (folder / "rollout.html").read_text()
 
 
+@pytest.mark.slow
 def test_brax_checkpoint_has_the_trained_policy(ppo_example):
     """The action of the loaded policy equals that of a network written out in NumPy."""
     folder, _ = ppo_example
@@ -258,15 +260,16 @@ def test_brax_checkpoint_has_the_trained_policy(ppo_example):
         x = x / (1.0 + np.exp(-x))
     expected = x @ policy["params"]["Dense_0"]["kernel"] + policy["params"]["Dense_0"]["bias"]
     for path in (folder, checkpoint):
-        action, _ = load_policy(path)(observation, jax.random.key(0))
+        action, _ = load_brax_policy(path)(observation, jax.random.key(0))
         np.testing.assert_allclose(action, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
     with pytest.raises(UserError, match="no checkpoint of brax's PPO; give"):
-        load_policy(tmp_path)
+        load_brax_policy(tmp_path)
 
 
+@pytest.mark.slow
 def test_brax_sac_trains_and_evaluates(env):
     (make_policy, trained, _), history = train(
         brax_sac,
