@@ -435,6 +435,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     return PhysicsState(*(np.array(x) for x in zip(*after, strict=True))), contacts
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property) -> None:
     """Each engine runs freely. Contacts amplify differences, in a few worlds by a factor of a
