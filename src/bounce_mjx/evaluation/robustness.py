@@ -105,8 +105,11 @@ class RobustnessReport(pydantic.BaseModel):
     def worst_share(self, outcome: ConditionOutcome) -> float:
         """Lowest of a condition's results that are shares, from 0 to 1; the share of the episodes
         that last if none is known to be one."""
-        names = [name for name, measured in self.measured.items() if measured.endswith("%")]
-        shares = [outcome.values[name] for name in names if outcome.values[name] is not None]
+        shares = [
+            value
+            for name, value in outcome.values.items()
+            if value is not None and self.measured.get(name, "").endswith("%")
+        ]
         return min(shares, default=100.0 * outcome.lasted) / 100.0
 
 
