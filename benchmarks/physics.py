@@ -7,6 +7,7 @@ actions. The engines take turns. The fastest repeat counts, because other work o
 only slow a repeat down.
 """
 
+import itertools
 import os
 import sys
 import time
@@ -21,11 +22,12 @@ from mujoco import rollout
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
-from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.physics import Control, PhysicsParameters
+from bounce_mjx.tasks.registry import task_config
 
 EngineName = Literal["fused", "mjx", "c"]
 
@@ -37,6 +39,8 @@ class Command(StrictModel):
     """Numbers of environments."""
     engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
     """Engines; c is MuJoCo's C engine on all processor cores."""
+    tasks: tuple[str, ...] = ("bounce",)
+    """Tasks whose worlds are measured, in turns; juggle has two balls."""
     control_steps: Annotated[int, Field(ge=1)] = 50
     """Control steps in one measurement of the fused engine; the slower engines take only 2."""
     repeats: Annotated[int, Field(ge=1)] = 5
@@ -45,9 +49,11 @@ class Command(StrictModel):
     """Folder for physics.json and physics.md."""
 
 
-def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
+def jax_program(
+    task: str, engine: str, batch: int, control_steps: int
+) -> tuple[Callable[[], None], float]:
     """A compiled program of a JAX engine, and its compile time in seconds."""
-    env = BounceBall(EnvConfig(physics=engine))
+    env = Env(task_config(task)(physics=engine))
     batch_last = {"in_axes": -1, "out_axes": -1}
 
     def control_step(physics, key):
@@ -72,9 +78,9 @@ def jax_program(engine: str, batch: int, control_steps: int) -> tuple[Callable[[
     return lambda: jax.block_until_ready(program(physics, keys[0])), compile_seconds
 
 
-def c_program(batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
+def c_program(task: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
     """A function that runs the C engine on all cores, and its compile time, 0."""
-    env = BounceBall()
+    env = Env(task_config(task)())
     model, threads = env.mj_model, os.cpu_count() or 1
     rng = np.random.default_rng(0)
     state = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
@@ -96,10 +102,12 @@ def measure(command: Command) -> list[dict]:
     records = []
     for batch in command.batch_sizes:
         programs = {}
-        for engine in command.engines:
+        for task, engine in itertools.product(command.tasks, command.engines):
             steps = command.control_steps if engine == "fused" else min(2, command.control_steps)
-            make = c_program if engine == "c" else lambda b, s, e=engine: jax_program(e, b, s)
-            programs[engine] = (*make(batch, steps), steps)
+            names = (task,) if engine == "c" else (task, engine)
+            make = c_program if engine == "c" else jax_program
+            label = engine if len(command.tasks) == 1 else f"{engine}, {task}"
+            programs[label] = (*make(*names, batch, steps), steps)
         times = {engine: [] for engine in programs}
         for repeat in range(command.repeats + 1):
             for engine, (run, _, _) in programs.items():
@@ -108,7 +116,7 @@ def measure(command: Command) -> list[dict]:
                 if repeat:
                     times[engine].append(time.perf_counter() - started)
         for engine, (_, compile_seconds, steps) in programs.items():
-            physics_steps = batch * steps * EnvConfig().num_substeps
+            physics_steps = batch * steps * task_config(command.tasks[0])().num_substeps
             records.append(
                 {
                     "batch": batch,

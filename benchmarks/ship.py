@@ -20,10 +20,9 @@ from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.resources import POLICIES, PRETRAINED
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, runs_folder
 from bounce_mjx.runs.folders import (
-    PRETRAINED,
-    SHIPPED,
     best_checkpoint,
     find_checkpoint,
     save_config,
@@ -39,7 +38,7 @@ class ShipCommand(StrictModel):
 
     run: Annotated[Path, tyro.conf.Positional]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
-    name: Literal["pretrained", "robust"] = PRETRAINED
+    name: Literal[tuple(POLICIES)] = PRETRAINED
     """Name of the policy in the package."""
     out: Path | None = None
     """Folder to write, by default the policy's own; an existing one is replaced."""
@@ -55,7 +54,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Makes the policy that comes with the package from a run.",
         )
         set_up_jax()
-        out = command.out or Path(SHIPPED[command.name])
+        out = command.out or Path(POLICIES[command.name])
         ship(command.run, out, Console(), command.name)
 
 
@@ -90,9 +89,9 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
 
     made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
-    config = trained_with.model_copy(update={"log_dir": TrainConfig().log_dir})
+    config = trained_with.model_copy(update={"log_dir": runs_folder(trained_with.env.task)})
     results = {
-        "command": f"python train_jax.py --config {SHIPPED[name]}/{CONFIG_FILE}",
+        "command": f"python train_jax.py --config {POLICIES[name]}/{CONFIG_FILE}",
         "seed": config.seed,
         "device": "unknown" if made_by is None else made_by.device,
         "best_steps": checkpoint.steps,

@@ -41,36 +41,46 @@ class Camera:
 
 def simulate(
     policy, camera: Camera, seconds: float, target_height: float, recorder: Recorder | None = None
-) -> tuple[int, float]:
-    """Number of bounces, and time (s) until the ball is lost."""
+) -> list[tuple[int, float]]:
+    """Bounces and length (s) of each episode; after a loss of the ball, the arm starts again."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
     ball = data.joint("ball_link")
+    held = ball.qpos.copy()
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
         joint.qpos = angle
-    control_steps = round(policy.metadata.control_dt / model.opt.timestep)
-    bounces, falling = 0, False
     policy.reset()
-    for step in range(round(seconds / model.opt.timestep)):
-        camera.look(data.time, ball.qpos[:3])
-        if step % control_steps == 0:
-            measurements = {
-                "joint_angles": [joint.qpos[0] for joint in joints],
-                "joint_velocities": [joint.qvel[0] for joint in joints],
-                "target_height": target_height,
-                "time": data.time,
-                **camera.measure(data.time),
-            }
-            data.ctrl[:] = policy.servo_targets(policy.step(measurements))
-            if recorder is not None:
-                recorder.step(measurements, data.ctrl)
-        mujoco.mj_step(model, data)
-        bounces += falling and ball.qvel[2] > 0.0
-        falling = ball.qvel[2] < 0.0
-        if ball.qpos[2] < 0.05 or np.any(np.abs(ball.qpos[:2]) > 1.5):
-            break
-    return int(bounces), data.time
+    camera.look(data.time, ball.qpos[:3])
+    arm = policy.supervise(rate=1.0 / model.opt.timestep, box=((0.2, -0.5, -0.2), (1.0, 0.5, 0.6)))
+    episodes, begun, bounces, falling = [], 0.0, 0, False
+    while data.time < seconds - 1e-6:
+        measured = {
+            "joint_angles": [joint.qpos[0] for joint in joints],
+            "joint_velocities": [joint.qvel[0] for joint in joints],
+            "target_height": target_height,
+            "time": data.time,
+            **camera.measure(data.time),
+        }
+        commands = arm.commands(measured)
+        if recorder is not None:
+            recorder.step(measured, commands[-1])
+        if arm.state == "ready":
+            arm.start()
+            begun, bounces, falling = data.time, 0, False
+        elif arm.state == "stopped":
+            episodes.append((bounces, data.time - begun))
+            arm.restart()
+        for command in commands:
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data)
+            if arm.state != "running" and arm.state != "braking":
+                # Somebody holds the ball until the arm is ready.
+                ball.qpos[:], ball.qvel[:] = held, 0.0
+            bounces += falling and ball.qvel[2] > 0.0
+            falling = ball.qvel[2] < 0.0
+            camera.look(data.time, ball.qpos[:3])
+    return [*episodes, (int(bounces), data.time - begun)] if arm.state == "running" else episodes
 
 
 if __name__ == "__main__":
@@ -85,5 +95,6 @@ if __name__ == "__main__":
         if given.log:
             joints = robot.metadata.joint_names
             recorder = files.enter_context(Recorder(given.log, joints, {"target_height": "m"}))
-        count, survived = simulate(robot, Camera(), given.seconds, given.target_height, recorder)
-        print(f"{count} bounces in {survived:.1f} s of {given.seconds:g} s")
+        seconds, height = given.seconds, given.target_height
+        for count, lasted in simulate(robot, Camera(), seconds, height, recorder):
+            print(f"{count} bounces in {lasted:.1f} s of {seconds:g} s")

@@ -20,10 +20,11 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.gymnasium import batch, environments
-from bounce_mjx.adapters.gymnasium.registration import ENV_ID
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID, EPISODE_STEPS
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.tasks.registry import find_task, registered_tasks
 from bounce_mjx.viewers import offscreen
 
 NUM_ENVS = 3
@@ -121,6 +122,21 @@ def test_import_registers_whichever_comes_first():
         )
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
         assert done.stdout.split() == [ENV_ID, "False"], done.stderr
+
+
+def test_each_task_of_the_package_has_a_name() -> None:
+    own = {
+        name for name in registered_tasks() if find_task(name).__module__.startswith("bounce_mjx")
+    }
+    assert own == set(EPISODE_STEPS)
+    for name in own:
+        spec = gymnasium.spec(f"bounce_mjx/{name.title()}-v0")
+        assert spec.max_episode_steps == find_task(name).Config().episode_steps
+    env = gymnasium.make("bounce_mjx/Juggle-v0")
+    observation, _ = env.reset(seed=0, options={"target_height": 0.5})
+    layout = env.get_wrapper_attr("task").layout
+    assert layout["ball_position"].stop - layout["ball_position"].start == 6
+    assert observation[layout["target_height"]] == pytest.approx(0.5)
 
 
 def test_spaces_and_attributes_equal_the_specification(single, vectorised):

@@ -11,17 +11,21 @@ import pydantic
 import pytest
 from rich.console import Console
 
+from bounce_mjx import BounceBall, load_policy
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.resources import resource_path
+from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.resources import POLICIES, TASK_POLICIES, resource_path
 from bounce_mjx.runs import folders
-from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config, runs_folder
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128
@@ -49,6 +53,24 @@ def console() -> Console:
     return Console(width=200, no_color=True)
 
 
+RELEASES = sorted((Path(__file__).parent / "releases").iterdir())
+
+
+@pytest.mark.parametrize("release", RELEASES, ids=lambda path: path.name)
+def test_what_a_release_wrote_is_loaded(release: Path) -> None:
+    """The promise in CHANGELOG.md: a run's config, results and checkpoint, and an exported policy.
+    The last two give the same action."""
+    config, results = load_run_config(release), load_results(release)
+    assert results is not None and results.best.passed
+    env = BounceBall(config.env)
+    observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    expected = act(networks, read_policy(best_checkpoint(release), config), observation)
+    deployed = load_policy(release / "policy.onnx")
+    measured = {name: observation[env.layout[name]] for name in deployed.needs}
+    np.testing.assert_allclose(deployed.step(measured), expected, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
     assert shipped["passed"]
@@ -62,10 +84,40 @@ def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
 
 
 def test_it_is_small_and_holds_only_the_policy() -> None:
-    files = [path for path in FOLDER.rglob("*") if path.is_file() and "robust" not in path.parts]
+    others = set(POLICIES) - {"pretrained"}
+    files = [path for path in FOLDER.rglob("*") if path.is_file() and not others & set(path.parts)]
     assert sum(path.stat().st_size for path in files) < 1_000_000
     items = {path.name for path in pretrained_checkpoint().folder.iterdir() if path.is_dir()}
     assert items == {"policy"}
+
+
+@pytest.mark.parametrize("task", [task for task in TASK_POLICIES if task != "bounce"])
+def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console) -> None:
+    """It has met its results, is small, and is found by its task and by its name."""
+    folder = resource_path(POLICIES[task])
+    report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    assert report["passed"] and report["details"]["episodes"] == 1024
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 300_000
+    assert load_run_config(folder).task == task
+    monkeypatch.chdir(tmp_path)
+    for path in (None, Path(task)):
+        chosen = choose_checkpoint(path, runs_folder(find_task(task)), console)
+        assert chosen == best_checkpoint(folder)
+    assert (folder / f"{task}.onnx").read_bytes() == export_onnx(chosen)
+    policy = load_policy(task)
+    assert set(policy.metadata.commands) == set(find_task(task).Config().commands)
+
+
+@pytest.mark.slow
+def test_the_policy_keeps_two_balls_up() -> None:
+    checkpoint = pretrained_checkpoint("juggle")
+    config = load_run_config(checkpoint.run)
+    report = evaluate_policy(
+        read_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(64)
+    ).report
+    values = {result.name: result.value for result in report.results}
+    assert values["kept"] > 95.0 and min(values["turns"], values["apart"], values["height"]) > 98.0
 
 
 def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> None:
@@ -106,7 +158,7 @@ def test_the_policies_have_names(tmp_path: Path, monkeypatch, console) -> None:
     assert choose_checkpoint(Path("pretrained"), LOG_DIR, console) == pretrained_checkpoint()
     monkeypatch.setattr(folders, "resource_path", lambda name: tmp_path / "package" / name)
     with pytest.raises(
-        UserError, match="robust is not in this version .* give pretrained or a run"
+        UserError, match="robust is not in this version .* give pretrained, .* or a run"
     ):
         choose_checkpoint(Path("robust"), LOG_DIR, console)
     robust = tmp_path / "package" / "pretrained" / "robust"

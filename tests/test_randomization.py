@@ -313,7 +313,7 @@ def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float) -> None:
         world = {"action_latency": latency, "servo_lag": jnp.asarray(lag * dt / n)}
 
         def step(memory, target):
-            control, memory = delayed(world, memory, target[None], dt, n)
+            control, memory = delayed(world, memory, Control(target[None]), dt, n)
             return memory, servo_targets(control, n)[:, 0]
 
         memory = start_actuation(config, dt, jnp.asarray(asked[:1]))
@@ -329,7 +329,7 @@ def test_a_latency_is_rounded_to_a_physics_step() -> None:
     memory = start_actuation(config, 0.01, jnp.zeros(1))
     for latency, switch in ((0.0124, 2.0), (0.0126, 3.0), (0.0199, 10.0), (0.02, 0.0)):
         control, _ = delayed(
-            {"action_latency": jnp.asarray(latency)}, memory, jnp.ones(1), 0.01, 10
+            {"action_latency": jnp.asarray(latency)}, memory, Control(jnp.ones(1)), 0.01, 10
         )
         assert control.switch == switch
 

@@ -372,7 +372,7 @@ class _Thrown(rest_task.Rest):
 
     num_draws = 2
 
-    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         return jnp.stack([draws[0], 0.0 * draws[0], 1.0 + draws[1]]), jnp.array([1.0, 2.0, 3.0])
 
     def reset(self, start: task.Start) -> jax.Array:

@@ -80,10 +80,10 @@ def test_a_path_is_closed_and_its_markers_lie_on_it(path: int) -> None:
     ends = [np.asarray(paths.offset(start, SIZE, phase)) for phase in (0.0, 1.0)]
     np.testing.assert_allclose(*ends, atol=1e-6)
     now = {name: float(value) for name, value in start.items()}
-    disc, *dots = TRACK.markers(now)
+    disc, *dots = TRACK.markers(now, {})
     np.testing.assert_allclose(disc.position, (0.6, 0.1, 0.5))
     later = start | {"target_x": 0.7, "phase": jnp.float32(0.7)}
-    assert [m.name for m in TRACK.markers(later)] == [disc.name, *(dot.name for dot in dots)]
+    assert [m.name for m in TRACK.markers(later, {})] == [disc.name, *(dot.name for dot in dots)]
     middle = np.array([0.6, 0.1, 0.5]) - np.asarray(paths.offset(start, SIZE, start["phase"]))
     walked = [middle + np.asarray(paths.offset(start, SIZE, i / 24)) for i in range(24)]
     np.testing.assert_allclose([dot.position for dot in dots], walked, atol=1e-6)

@@ -280,7 +280,7 @@ def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
     ended = np.zeros((11, 1), bool)
     ended[list(over)] = True
     command, metrics = {"height": value}, {"count": value}
-    return EnvFrame(value * 0.01, wide, wide, wide, command, metrics, ended, ended)
+    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
 
 
 def test_resampling_interpolates_positions() -> None:
@@ -288,7 +288,7 @@ def test_resampling_interpolates_positions() -> None:
     assert len(frames.time) == 6
     times = np.arange(6) / 60
     np.testing.assert_allclose(frames.time[:, 0], times)
-    for positions in (frames.qpos, frames.ball, frames.paddle):
+    for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
     # Commands and metrics come from the last step.
     for values in (frames.command["height"], frames.metrics["count"]):
@@ -1032,7 +1032,7 @@ class Lean(Still):
         twice = 2.0 * step.command["lean_angle"]
         return super().step(state, step)._replace(metrics={"twice": twice})
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: dict, metrics: dict) -> tuple[task.Marker, ...]:
         place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
         wall = task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0))
         dots = (task.Marker(f"dot {i}", (0.1 * i, 0.0, 0.5), size, (0, 0, 1, 1)) for i in range(3))

@@ -20,7 +20,7 @@ from bounce_mjx.evaluation.config import (
 )
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.resources import resource_path
+from bounce_mjx.resources import POLICIES, resource_path
 
 
 class RobustnessCommand(PolicyCommand):
@@ -60,7 +60,7 @@ def main(args: Sequence[str]) -> None:
         )
         from bounce_mjx.runs.config import in_world
         from bounce_mjx.runs.files import to_json, writable, write_output
-        from bounce_mjx.runs.folders import SHIPPED, choose_checkpoint
+        from bounce_mjx.runs.folders import choose_checkpoint
         from bounce_mjx.runs.reading import read_policy
         from bounce_mjx.training.setup import set_up_jax
 
@@ -75,7 +75,7 @@ def main(args: Sequence[str]) -> None:
     conditions = load_suite(suite, config.env, world, assumed)
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
     policy = read_policy(checkpoint, config)
-    shipped = checkpoint.run in map(resource_path, SHIPPED.values())
+    shipped = checkpoint.run in map(resource_path, POLICIES.values())
     out = command.out or (Path("robustness") if shipped else checkpoint.run)
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):

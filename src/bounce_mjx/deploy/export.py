@@ -18,6 +18,7 @@ from bounce_mjx.deploy.metadata import (
     MEASURED,
     NEXT,
     UNITS,
+    CommandLimits,
     CommandRange,
     Hinge,
     Input,
@@ -45,6 +46,7 @@ _ACTION = (
     "where base is the joint angles of the same observation; with max_lead, it is the last servo "
     "target within max_lead of them"
 )
+_LIMITED = "; the command moves toward it within limits"
 
 
 def export_onnx(checkpoint: Checkpoint) -> bytes:
@@ -114,18 +116,13 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
 
     Raises:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is no hinge with a
-        servo, a command has the name of a measurement, or there are several balls.
+        servo, or a command has the name of a measurement.
     """
     env = config.env
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
             f"the command {min(taken)} has the name of a measurement; give it another name in "
             f"the task {env.task.__name__}"
-        )
-    if env.num_balls > 1:
-        raise UserError(
-            f"the policy sees {env.num_balls} balls, but a deployed policy measures one; export a "
-            "policy with num_balls 1"
         )
     m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
@@ -138,15 +135,17 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         format=FORMAT,
         steps=steps,
         joint_names=joint_names(m),
+        num_balls=env.num_balls,
         observation=_inputs(env),
         # Without a quantity that sees it, there is no filter.
         position=env.observation.position if filtered else "measured",
         velocity=velocity if filtered or velocity != "filter" else "measured",
         estimator=filter_constants(env, m) if filtered else None,
         control_dt=env.control_dt,
-        action=_ACTION,
+        action=_ACTION if env.robot.limits.velocity is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
+        limits=_limits(env),
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
@@ -169,11 +168,19 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     )
 
 
+def _limits(env: WorldConfig) -> CommandLimits | None:
+    """The limits of the commands, None without."""
+    limits = env.robot.limits
+    if limits.velocity is None:
+        return None
+    return CommandLimits(limits.velocity, limits.acceleration, limits.jerk)
+
+
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
     histories = env.observation.seen()
     return tuple(
         Input(_INPUT_NAMES.get(part.name, part.name), histories[part.name], part.size, part.unit)
-        for part in env.observation.parts(env.num_joints)
+        for part in env.observation.parts(env.num_joints, env.num_balls)
     )
 
 
@@ -241,11 +248,13 @@ def _control_step(
     task, own = env.task(env), env.observation.seen("task")
     if not own:
         return lambda given: {"action": network(given)}, _histories(env)
+    rows = (env.num_balls,) if env.num_balls > 1 else ()
     measured = {
-        name: _floats(env.num_joints if quantity.size is None else quantity.size)
+        name: _floats(*(rows if quantity.per_ball else ()), quantity.entries(env.num_joints, 1))
         for name, quantity in ObservationConfig.quantities().items()
     }
-    measured |= dict.fromkeys(env.commands, _floats(1)) | {"ball_picture": _floats(3)}
+    measured |= dict.fromkeys(env.commands, _floats(1))
+    measured["ball_picture"] = measured["ball_position"]
     leaves, tree = jax.tree.flatten_with_path(jax.eval_shape(task.first_quantities, measured)[0])
     memory = {
         f"memory/{jax.tree_util.keystr(path, simple=True, separator='/')}": leaf
@@ -253,7 +262,7 @@ def _control_step(
     }
 
     def control_step(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        values = {name: given[f"{MEASURED}{name}"] for name in measured}
+        values = {n: given[f"{MEASURED}{n}"].reshape(x.shape) for n, x in measured.items()}
         past = {name: given[name] for name in own}
         before = tree.unflatten([given[name] for name in memory])
         start, first = task.first_quantities(values)
@@ -268,5 +277,5 @@ def _control_step(
         action = {"action": network(given | seen)}
         return action | {f"{NEXT}{name}": value for name, value in kept.items()}
 
-    inputs = _histories(env) | {f"{MEASURED}{name}": shape for name, shape in measured.items()}
+    inputs = _histories(env) | {f"{MEASURED}{n}": _floats(x.size) for n, x in measured.items()}
     return control_step, inputs | memory | {IS_FIRST: jax.ShapeDtypeStruct((), bool)}

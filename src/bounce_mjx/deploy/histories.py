@@ -22,7 +22,7 @@ class Histories:
 
     Measurements are arrays by name, as many as the policy needs: `joint_angles` [J],
     `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `ball_age` [1], commands [1],
-    and so on; units m, rad and s.
+    and so on; of several balls one after another, [6] or [9]; units m, rad and s.
     """
 
     def __init__(self, metadata: Metadata, inputs: Iterable[Input], measured: Measurements):
@@ -33,8 +33,8 @@ class Histories:
         """
         self._metadata, self._chain = metadata, Chain(metadata)
         self._no_joints = np.zeros(len(metadata.joint_names))
-        self._ball = measured.get("ball_position", np.zeros(3))
-        self._ball_velocity = np.zeros(3)
+        self._ball_velocity = np.zeros(3 * metadata.num_balls)
+        self._ball = measured.get("ball_position", self._ball_velocity)
         # Without time stamps, each picture arrives after the latency that the filter expects.
         self._latency = (metadata.estimator and metadata.estimator.latency) or 0.0
         self._age = float(measured["ball_age"][0]) if "ball_age" in measured else self._latency

@@ -5,30 +5,27 @@ from pathlib import Path
 
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import resource_path
-
-NAMES = {"robust": "pretrained/robust", "pretrained": "pretrained"}
-"""Policies that come with the package, and their folders; each folder holds `<name>.onnx`."""
+from bounce_mjx.resources import POLICIES, resource_path
 
 
 def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
     Args:
-      policy: "robust" or "pretrained", the policies that come with the package; a `.onnx` file
-        from `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported
-        with JAX.
+      policy: the name of a policy that comes with the package, "pretrained", "robust" or that of a
+        task such as "juggle"; a `.onnx` file from `bounce-mjx export`; or a run's folder or a
+        checkpoint in it, which is first exported with JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
 
     Raises:
       UserError: there is no such policy, or the file is damaged.
     """
-    if isinstance(policy, str) and policy in NAMES:
-        path = resource_path(f"{NAMES[policy]}/{policy}.onnx")
+    if isinstance(policy, str) and policy in POLICIES:
+        path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
         if not path.is_file():
             raise UserError(
                 f"the policy {policy} is not in this version of the package; give one of "
-                f"{', '.join(n for n in NAMES if n != policy)}, a .onnx file or a run's folder"
+                f"{', '.join(n for n in POLICIES if n != policy)}, a .onnx file or a run's folder"
             )
         return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
     path = Path(policy)
@@ -38,8 +35,8 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
         return DeployedPolicy(path.read_bytes(), str(path))
     except OSError as error:
         raise UserError(
-            f"the policy {path} cannot be read ({error.strerror}); give {' or '.join(NAMES)}, a "
-            ".onnx file or a run's folder"
+            f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
+            "a .onnx file or a run's folder"
         ) from error
 
 

@@ -25,8 +25,20 @@ UNITS = {
 }
 """Measurements that every policy accepts, and their units. A task's commands are further ones."""
 
+PER_BALL = {
+    "ball_position": 3,
+    "ball_velocity": 3,
+    "ball_quaternion": 4,
+    "ball_angular_velocity": 3,
+}
+"""Measurements of each ball, and their numbers of entries for one."""
+
 Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
+Limit = Annotated[float, (1e-6, 1e9)]
+
+# Entries that older files lack: their targets jump, and they are of one ball.
+_LATER = {"limits": "null", "num_balls": "1"}
 
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
@@ -71,6 +83,17 @@ class CommandRange(NamedTuple):
     """Unit; empty for a pure number."""
 
 
+class CommandLimits(NamedTuple):
+    """The arm's limits of each joint's command."""
+
+    velocity: tuple[Limit, ...]
+    """rad/s."""
+    acceleration: tuple[Limit, ...]
+    """rad/s^2."""
+    jerk: tuple[Limit, ...] | None
+    """rad/s^3; None for no limit."""
+
+
 class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
@@ -79,6 +102,8 @@ class Metadata(NamedTuple):
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
+    num_balls: Annotated[int, (1, 3)]
+    """Number of balls, each of which is measured."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
     position: Literal["measured", "filter"]
@@ -96,6 +121,9 @@ class Metadata(NamedTuple):
     max_lead: Annotated[float, (0.0, 1e3)] | None
     """Largest distance from the measured angle to the last servo target, to which an action adds,
     rad; None if it adds to the measured angle."""
+    limits: CommandLimits | None
+    """Limits of the commands, which then move between two actions (`robot.setpoints`); None for a
+    servo target that jumps."""
     joint_ranges: tuple[tuple[float, float] | None, ...]
     """Range of each servo target, rad; None for a joint without one."""
     servo_stiffness: tuple[float, ...]
@@ -120,16 +148,20 @@ class Metadata(NamedTuple):
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
-    """Number of entries of each measurement, in the order of `UNITS`, and of each command."""
+    """Number of entries of each measurement, in the order of `UNITS`, and of each command; of
+    several balls, one after another."""
     joints = dict.fromkeys(("joint_angles", "joint_velocities"), len(metadata.joint_names))
-    vectors = dict.fromkeys(("ball_position", "ball_velocity", "ball_angular_velocity"), 3)
-    sizes = joints | vectors | {"ball_quaternion": 4}
+    balls = {name: size * metadata.num_balls for name, size in PER_BALL.items()}
+    sizes = joints | balls
     return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name."""
-    return {name: json.dumps(value, allow_nan=False) for name, value in _plain(metadata).items()}
+    """JSON texts of the metadata by field name; without the entries that older files lack, if they
+    are as in these, so that such a file is as new."""
+    plain = _plain(metadata)
+    texts = {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
+    return {name: text for name, text in texts.items() if _LATER.get(name) != text}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
@@ -141,7 +173,7 @@ def from_entries(entries: dict[str, str]) -> Metadata:
         command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
         entries = entries | {"commands": json.dumps({"target_height": command})}
     # The actions of older files add to the measured angle.
-    entries = {"max_lead": "null"} | entries
+    entries = {"max_lead": "null"} | _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
     # An entry of older versions.
     if json.loads(entries.get("memory_size", "0")):
@@ -177,6 +209,11 @@ def _check(metadata: Metadata) -> None:
     ):
         if len(getattr(metadata, name)) != count:
             raise ValueError(f"its {name} are not of {count} joints")
+    for name, values in (metadata.limits or CommandLimits((), (), None))._asdict().items():
+        if values and len(values) != count:
+            raise ValueError(f"its limits of the {name} are not of {count} joints")
+    if metadata.limits is not None and metadata.max_lead is None:
+        raise ValueError("its limits have no max_lead")
     if taken := metadata.commands.keys() & UNITS.keys():
         raise ValueError(f"its command {min(taken)} has the name of a measurement")
     if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):

@@ -92,7 +92,8 @@ class OnnxNetwork:
     def _check(self) -> None:
         """Raises ValueError if the inputs and the memory do not fit to the metadata."""
         metadata, remembered = self.metadata, self._remembered
-        sizes = measurement_sizes(metadata) | {"ball_picture": 3, "paddle_position": 3}
+        sizes = measurement_sizes(metadata) | {"paddle_position": 3}
+        sizes["ball_picture"] = sizes["ball_position"]
         sizes |= dict.fromkeys(("action", "past_actions"), len(metadata.joint_names))
         stated = {}
         for part in metadata.observation:

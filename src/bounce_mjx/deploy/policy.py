@@ -1,13 +1,15 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from bounce_mjx.deploy.histories import Histories, Measurements
-from bounce_mjx.deploy.metadata import UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.motion import Motion
 from bounce_mjx.deploy.network import OnnxNetwork
+from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
 _MAX_PAUSE = 1.0
@@ -39,6 +41,7 @@ class DeployedPolicy:
                 name: c.unit or "no unit" for name, c in self.metadata.commands.items()
             }
             """Measurements that a step accepts, and their units."""
+            self._motion = Motion(self.metadata)
             self._sizes = measurement_sizes(self.metadata)
             self.needs = self._needs()
             """Measurements required in every step."""
@@ -57,16 +60,19 @@ class DeployedPolicy:
             ) from error
         self.reset()
 
-    def reset(self) -> None:
-        """Forgets the past. The next step fills the whole history with its measurements."""
+    def reset(self, targets: np.ndarray | None = None) -> None:
+        """Forgets the past. The next step fills the whole history with its measurements.
+
+        Args:
+          targets: servo targets [J] (rad) at which the arm rests; by default, the joint angles of
+            the next step.
+        """
         self._histories: Histories | None = None
         self._network.reset()
         self._measured: Measurements = {}
         self._time: float | None = None
         self._action = np.zeros(len(self.metadata.joint_names))
-        # The last servo targets, and what an action adds to, if that is not the measured angles.
-        self._targets: np.ndarray | None = None
-        self._base: np.ndarray | None = None
+        self._motion.rest(targets)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -78,7 +84,8 @@ class DeployedPolicy:
             `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
             (rad/s; default 0); each command in `metadata.commands`; `time` of any clock (s). The
             measurements in `needs` are required. Without `time`, a step is one control step after
-            the last one.
+            the last one. Of several balls (`metadata.num_balls`), each quantity has one row per
+            ball [B, 3], or the rows one after another.
 
             With `time`, the elapsed time is rounded to control steps. A call less than half a
             control step after the last one, or before it, is a repetition: it changes nothing and
@@ -93,7 +100,7 @@ class DeployedPolicy:
             shape or is not finite; or the time is more than 1 s from the last. The policy's
             state does not change. Or the network gives no finite action; then call `reset`.
         """
-        measured = self._checked(measurements)
+        measured = self.checked(measurements)
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
         if steps == 0:
@@ -114,18 +121,17 @@ class DeployedPolicy:
             self._histories.add(measured, self._action)
         action = self._network.step(self._histories.values, self._histories.newest)
         self._measured, self._time, self._action = measured, time, action
-        if self.metadata.max_lead is not None and "joint_angles" in measured:
-            lead, angles = self.metadata.max_lead, measured["joint_angles"]
-            last = angles if self._targets is None else self._targets
-            self._base = np.clip(last, angles - lead, angles + lead)
-            self._targets = self._targets_of(action)
+        if "joint_angles" in measured:
+            self._motion.begin(measured["joint_angles"])
+            self._act(action)
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
         """Servo targets [J] (rad) for the last step's action [J]: the joint angles measured in that
         step plus the scaled action, clipped to the joint ranges. With `metadata.max_lead`, the
         action adds to the last targets, within that distance of the measured angles; another
-        action than the policy's then counts as sent.
+        action than the policy's then counts as sent. With `metadata.limits`, they are the last of
+        the `commands`.
 
         Raises:
           UserError: there was no step since the reset, or it had no measured joint angles; or the
@@ -136,20 +142,77 @@ class DeployedPolicy:
                 "the servo targets start from the measured joint angles, and there are none; call "
                 "step with joint_angles first"
             )
-        ranges = self.metadata.joint_ranges
-        action = _array("the action", action, (len(ranges),), "from -1 to 1", 1.0)
-        targets = self._targets_of(action)
-        if self.metadata.max_lead is not None:
-            self._targets = targets
-        return targets.copy()
+        count = len(self.metadata.joint_names)
+        action = _array("the action", action, (count,), "from -1 to 1", 1.0)
+        self._act(action)
+        return self.targets
 
-    def _targets_of(self, action: np.ndarray) -> np.ndarray:
-        """Servo targets [J] (rad) of an action [J] in the last step."""
-        ranges = self.metadata.joint_ranges
-        low = [-np.inf if limits is None else limits[0] for limits in ranges]
-        high = [np.inf if limits is None else limits[1] for limits in ranges]
-        base = self._measured["joint_angles"] if self._base is None else self._base
-        return np.clip(base + self.metadata.action_scale * action, low, high)
+    def commands(self, rate: float) -> np.ndarray:
+        """Commands [M, J] (rad) of the control step at a rate (Hz): the servo targets for the times
+        1 / rate, 2 / rate, ... until the next step. With `metadata.limits` they move within these
+        limits, else they are alike.
+
+        Raises:
+          UserError: there was no step since the reset; or the rate is not 1 to 10,000 commands in a
+            control step.
+        """
+        if self.targets is None:
+            raise UserError("there are no commands before the first step; call step first")
+        count = rate * self.metadata.control_dt
+        if not (0.999 < count < 10_000.5 and abs(count - round(count)) < 1e-3):
+            raise UserError(
+                f"the rate is {rate!r} Hz, but must be a multiple of "
+                f"{1.0 / self.metadata.control_dt:g} Hz, one command for each control step"
+            )
+        return self._motion.at(np.arange(1, round(count) + 1) / rate)
+
+    @property
+    def targets(self) -> np.ndarray | None:
+        """Servo targets [J] at the end of the control step, rad; None before the first step."""
+        if not self._motion.is_known:
+            return None
+        return self._motion.at(np.array([self.metadata.control_dt]))[0]
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the commands come to rest in this control step."""
+        return self._motion.is_known and self._motion.is_still
+
+    def hold(self, joint_angles: np.ndarray | None = None) -> None:
+        """A control step without the policy, in which the commands brake, within the limits, or
+        rest; `joint_angles` [J] (rad) are where the arm is, for the first step."""
+        self._begin(joint_angles)
+        self._motion.aim(self._motion.position)
+
+    def move(
+        self, target: np.ndarray, speed: float, joint_angles: np.ndarray | None = None
+    ) -> None:
+        """A control step without the policy, in which the commands move toward joint angles [J]
+        (rad) at a speed (rad/s); `joint_angles` as for `hold`."""
+        self._begin(joint_angles)
+        self._motion.aim(self._motion.toward(target, speed))
+
+    def supervise(self, rate: float, **settings: Any) -> Supervisor:
+        """A supervisor that gives the commands of this policy at the robot's rate (Hz).
+
+        Args:
+          settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
+            `max_picture_age`, s (0.1); `max_steps_late`, control steps between two steps (2);
+            `max_error`, distance of a joint from its command, rad (0.4); `home_speed`, rad/s (0.3).
+        """
+        return Supervisor(self, rate, **settings)
+
+    def _begin(self, joint_angles: np.ndarray | None) -> None:
+        if joint_angles is None and not self._motion.is_known:
+            raise UserError("there are no commands before the first step; give joint_angles")
+        self._motion.begin(joint_angles)
+
+    def _act(self, action: np.ndarray) -> None:
+        """Aims the commands of the control step where an action [J] wishes."""
+        base, lead = self._measured["joint_angles"], self.metadata.max_lead
+        if lead is not None:
+            base = np.clip(self._motion.position, base - lead, base + lead)
+        self._motion.aim(base + self.metadata.action_scale * action)
 
     @property
     def observation(self) -> np.ndarray:
@@ -172,25 +235,37 @@ class DeployedPolicy:
             users["joint_angles"] |= users["ball_position"]
         return tuple(name for name in users if users[name] & reads)
 
-    def _checked(self, measurements: Mapping[str, Any]) -> Measurements:
-        """Copies of the measurements as arrays, with defaults for optional ones."""
+    def checked(
+        self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
+    ) -> Measurements:
+        """Copies of the measurements as arrays, with defaults for optional ones.
+
+        Args:
+          needs: those that may not be missing; by default, `needs`.
+
+        Raises:
+          UserError: as `step`.
+        """
         for name in measurements:
             if name not in self.units:
                 raise UserError(
                     f"{name} is not a measurement; a step takes {', '.join(self.units)}"
                 )
-        missing = [name for name in self.needs if name not in measurements]
+        needs = self.needs if needs is None else needs
+        missing = [name for name in needs if name not in measurements]
         if missing:
             raise UserError(
-                f"the measurement {missing[0]} is missing; this policy needs "
-                f"{', '.join(self.needs)} in every step"
+                f"the measurement {missing[0]} is missing; this policy needs {', '.join(needs)} in "
+                "every step"
             )
-        checked = {"ball_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
-        checked["ball_angular_velocity"] = np.zeros(3)
+        count = self.metadata.num_balls
+        checked = {"ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], count)}
+        checked["ball_angular_velocity"] = np.zeros(3 * count)
         for name, value in measurements.items():
             limit = np.inf if name == "time" else _LARGEST
             label = f"the measurement {name}"
-            checked[name] = _array(label, value, (self._sizes[name],), self.units[name], limit)
+            size, rows = self._sizes[name], count if name in PER_BALL else 1
+            checked[name] = _array(label, value, (size,), self.units[name], limit, rows)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
@@ -208,13 +283,18 @@ class DeployedPolicy:
         return max(0, round(elapsed / self.metadata.control_dt))
 
 
-def _array(label: str, value: Any, shape: tuple[int, ...], unit: str, limit: float) -> np.ndarray:
-    """A user's numbers as an array; UserError for another shape or numbers beyond a limit."""
+def _array(
+    label: str, value: Any, shape: tuple[int], unit: str, limit: float, rows: int = 1
+) -> np.ndarray:
+    """A user's numbers, which may come in rows, as an array; UserError for another shape or numbers
+    beyond a limit."""
     count = "one number" if shape == (1,) else f"{shape[0]} numbers"
     try:
         array = np.array(value, float)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
+    if rows > 1 and array.shape == (rows, shape[0] // rows):
+        array = array.ravel()
     if array.shape != shape and not (shape == (1,) and array.shape == ()):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
     wrong = ~(np.isfinite(array) & (np.abs(array) <= limit + 1e-6))

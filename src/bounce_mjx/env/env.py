@@ -18,17 +18,20 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
+from bounce_mjx.physics.control import Moving
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
     BallAddresses,
     check_unedited,
+    command_limits,
     find_addresses,
     fingerprint,
     joint_names,
     load_model,
     resting_activations,
 )
+from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import actuation, noise, sensing
 from bounce_mjx.world.actuation import Actuation
@@ -83,6 +86,9 @@ class EnvState(NamedTuple):
     memory: Memory | None = None
     ctrl: jax.Array | None = None
     """Servo targets of the last step [nu], if an action adds to them."""
+    setpoint: Setpoint | None = None
+    """The commands of the joints at the end of the last step, each entry [n], if they move within
+    the arm's limits."""
 
 
 class Env:
@@ -118,6 +124,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._check_joints()
+        self._limits = command_limits(config.robot.limits, self.mj_model, self._addresses)
         self._randomize = randomize
         self.layout = self.config.layout
         self._fingerprint = fingerprint(self.mj_model)
@@ -223,15 +230,19 @@ class Env:
         count = size + len(commands) + self.task.num_draws
         draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
         own = 0.5 * (draws[size + len(commands) :] + 1.0)
-        physics = self._first_physics(draws[:size], world, self.task.throw(own))
         command = {
             name: low + (high - low) * 0.5 * (draws[size + i] + 1.0)
             for i, (name, (low, high)) in enumerate(ends.items())
         }
+        physics = self._first_physics(draws[:size], world, self.task.throw(own, command))
         no_action = jnp.zeros(self.action_size, draws.dtype)
         state = EnvState(physics, command, no_action, parameters=parameters, world=world)
         if self.config.action.base == "target":
             state = state._replace(ctrl=self.servo_targets(physics, no_action))
+        if self._limits is not None:
+            position = jnp.stack(self._joint_targets(physics, no_action))
+            still = jnp.zeros_like(position)
+            state = state._replace(setpoint=Setpoint(position, still, still))
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, own))
         command = self.task.next_command(task, command)
@@ -318,13 +329,12 @@ class Env:
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
-            targets = self.servo_targets(before.physics, action, last=before.ctrl)
-            return self._with_targets(state, targets), Control(targets)
+            return self._commanded(state, action, None)
         # The same noise as in the observation from which the policy chose the action.
         error = sensing.joint_angle_noise(world, memory.counter, self.action_size, action.dtype)
-        targets = self.servo_targets(before.physics, action, error, before.ctrl)
+        state, control = self._commanded(state, action, error)
         control, queue = actuation.delayed(
-            world, memory.actuation, targets, config.control_dt, config.num_substeps
+            world, memory.actuation, control, config.control_dt, config.num_substeps
         )
         memory = memory._replace(counter=noise.next_counter(memory.counter), actuation=queue)
         if "air_drag" in world:
@@ -342,14 +352,49 @@ class Env:
         command = before.command
         if "command_interval" in world:
             command, memory = self._next_command(world, command, memory)
-        before = before._replace(command=command, memory=memory)
-        return self._with_targets(state.replace(pipeline_state=before), targets), control
+        now = state.pipeline_state._replace(command=command, memory=memory)
+        return state.replace(pipeline_state=now), control
 
-    def _with_targets(self, state: State, targets: jax.Array) -> State:
-        """A state that keeps the servo targets [nu] if the next action adds to them."""
-        if self.config.action.base == "measured":
-            return state
-        return state.replace(pipeline_state=state.pipeline_state._replace(ctrl=targets))
+    def _commanded(
+        self, state: State, action: jax.Array, error: jax.Array | None
+    ) -> tuple[State, Control]:
+        """The control of a clipped action [n] that arrives at once, and the state that keeps what
+        the next action starts from. `error` is that of `servo_targets`."""
+        before = state.pipeline_state
+        if self._limits is None:
+            targets = self.servo_targets(before.physics, action, error, before.ctrl)
+            if self.config.action.base == "measured":
+                return state, Control(targets)
+            return state.replace(pipeline_state=before._replace(ctrl=targets)), Control(targets)
+        wished = self._joint_targets(before.physics, action, error, before.ctrl)
+        starts = [Setpoint(*(x[i] for x in before.setpoint)) for i in range(len(wished))]
+        dt, substep = self.config.control_dt, self.config.physics_dt
+        after = [
+            next_setpoint(limits, start, target, dt, jnp)
+            for limits, start, target in zip(self._limits, starts, wished, strict=True)
+        ]
+        moving = Moving(
+            velocity=self._ctrl([start.velocity * substep for start in starts]),
+            acceleration=self._ctrl([x.acceleration * substep**2 for x in after]),
+            before=self._ctrl([start.acceleration * substep**2 for start in starts]),
+            smoothing=self._smoothing(action.dtype),
+        )
+        control = Control(self._ctrl([start.position for start in starts]), moving)
+        setpoint = Setpoint(*map(jnp.stack, zip(*after, strict=True)))
+        kept = before._replace(setpoint=setpoint)
+        if self.config.action.base == "target":
+            kept = kept._replace(ctrl=self._ctrl([x.position for x in after]))
+        return state.replace(pipeline_state=kept), control
+
+    def _smoothing(self, dtype: jnp.dtype) -> jax.Array | None:
+        """Physics steps [nu] of the mean that limits the jerk of each servo target."""
+        if self._limits[0].smoothing is None:
+            return None
+        # An actuator of no joint has a target of zero, whatever the time.
+        times = np.ones(self.mj_model.nu)
+        for actuator, limits in zip(self._addresses.actuators, self._limits, strict=True):
+            times[actuator] = limits.smoothing / self.config.physics_dt
+        return jnp.asarray(times, dtype)
 
     def _next_command(
         self, world: World, command: dict[str, jax.Array], memory: Memory
@@ -382,25 +427,44 @@ class Env:
           last: servo targets of the last step [nu], to which the action adds instead, within
             `max_lead` of the measured angles.
         """
+        return self._ctrl(self._joint_targets(physics, action, error, last))
+
+    def _joint_targets(
+        self,
+        physics: PhysicsState,
+        action: jax.Array,
+        error: jax.Array | None = None,
+        last: jax.Array | None = None,
+    ) -> list[jax.Array]:
+        """`servo_targets` as the angle [] of each joint, rad: one scalar per joint, which XLA fuses
+        with the physics; it would not fuse an indexed update."""
         model, addresses = self.mj_model, self._addresses
-        targets = [jnp.zeros_like(action[0])] * model.nu
-        # One scalar per joint, which XLA fuses with the physics; it would not fuse an indexed
-        # update.
+        targets = []
         for i, actuator in enumerate(addresses.actuators):
             angle = physics.qpos[addresses.arm_qpos[i]]
             if error is not None:
                 angle = angle + error[i]
-            gear = float(model.actuator_gear[actuator, 0])
             if last is not None:
-                lead = self.config.action.max_lead
+                lead, gear = self.config.action.max_lead, self._gear(actuator)
                 sent = last[actuator] if gear == 1.0 else last[actuator] / gear
                 angle = jnp.clip(sent, angle - lead, angle + lead)
             target = angle + self.config.action_scale * action[i]
             low, high = (float(limit) for limit in model.jnt_range[addresses.arm_joints[i]])
             if low < high:
                 target = jnp.clip(target, low, high)
-            targets[actuator] = target if gear == 1.0 else gear * target
-        return jnp.stack(targets)
+            targets.append(target)
+        return targets
+
+    def _ctrl(self, values: Sequence[jax.Array]) -> jax.Array:
+        """Inputs of the actuators [nu] from a value [] of each joint's angle."""
+        ctrl = [jnp.zeros_like(values[0])] * self.mj_model.nu
+        for actuator, value in zip(self._addresses.actuators, values, strict=True):
+            gear = self._gear(actuator)
+            ctrl[actuator] = value if gear == 1.0 else gear * value
+        return jnp.stack(ctrl)
+
+    def _gear(self, actuator: int) -> float:
+        return float(self.mj_model.actuator_gear[actuator, 0])
 
     def finish_step(self, state: State, action: jax.Array, physics: PhysicsState) -> State:
         """The part of a step after the physics: the task's, and the observation.
@@ -504,6 +568,7 @@ class Env:
                 config.randomization,
                 config.control_dt,
                 self.servo_targets(state.physics, jnp.zeros(self.action_size, dtype)),
+                moving=self._limits is not None,
             ),
             sensing=None,
         )

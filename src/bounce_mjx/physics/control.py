@@ -5,7 +5,27 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.robot.setpoints import Setpoint, command
+
 Scalar = float | jax.Array
+
+
+class Moving(NamedTuple):
+    """Servo targets that move within an arm's limits (`robot.setpoints`); times are in physics
+    steps."""
+
+    velocity: Any
+    """Velocities [nu] at the start of the control step."""
+    acceleration: Any
+    """Accelerations [nu] in the control step."""
+    before: Any
+    """Accelerations [nu] in the one before."""
+    smoothing: Any = None
+    """Time [nu] of the mean that limits the jerk."""
+    earlier: Any = None
+    """Accelerations [nu] two control steps before, for targets that are late and smoothed."""
+    duration: Any = None
+    """Physics steps [] in a control step, with `earlier`."""
 
 
 class Control(NamedTuple):
@@ -17,11 +37,13 @@ class Control(NamedTuple):
     """
 
     ctrl: Any
-    """Servo targets [nu]."""
+    """Servo targets [nu]; those at the start of the control step if they are moving."""
+    moving: Moving | None = None
+    """How the targets move."""
     previous: Any = None
-    """Servo targets [nu] until the physics step `switch`."""
+    """Servo targets [nu] until the physics step `switch`, if they do not move."""
     switch: Any = None
-    """Number [] of physics steps with the targets `previous`, a whole number."""
+    """Number [] of physics steps with earlier targets, a whole number."""
     filtered: Any = None
     """Outputs [nu] of the servos' first-order lags before the first step."""
     lag: Any = None
@@ -41,6 +63,8 @@ def servo_target(control: Control, step: Scalar) -> Scalar:
       control: `ctrl`, `previous` and `filtered` of one servo or of several.
       step: index of the physics step, from 0.
     """
+    if control.moving is not None:
+        return _moving_target(control, control.moving, step)
     late = control.previous is not None
     before = control.switch if late else 0.0
     if control.lag is None:
@@ -54,6 +78,23 @@ def servo_target(control: Control, step: Scalar) -> Scalar:
     since = jnp.maximum(step + 1.0 - before, 0.0)
     settled = control.ctrl + (at_switch - control.ctrl) * jnp.exp(rate * since)
     return jnp.where(step < before, at_switch, settled) if late else settled
+
+
+def _moving_target(control: Control, moving: Moving, step: Scalar) -> Scalar:
+    """`servo_target` of a target that moves: its position at the end of the physics step."""
+    start = Setpoint(control.ctrl, moving.velocity, moving.before)
+    earlier = None if moving.earlier is None else (moving.duration, moving.earlier)
+    since = step + 1.0
+    time = since if control.switch is None else since - control.switch
+
+    def target(time: Scalar, lag: Scalar | None = None) -> Scalar:
+        return command(start, moving.acceleration, time, jnp, moving.smoothing, lag, earlier)
+
+    if control.lag is None:
+        return target(time)
+    lag = jnp.maximum(control.lag, 1e-3)
+    behind = control.filtered - target(time - since, lag)
+    return target(time, lag) + behind * jnp.exp(-since / lag)
 
 
 def servo_targets(control: Control, num_steps: int) -> jax.Array:

@@ -27,7 +27,7 @@ MIN_JOINTS = 3
 
 _PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
-_HIDDEN_GROUP = 3
+HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
 _RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
@@ -430,7 +430,7 @@ class _Builder:
             for geom, touches in zip(body.geoms, touching, strict=True):
                 # Where a link has both kinds of shapes, the others are its picture.
                 if touches and i > 0 and not all(touching):
-                    geom.group = _HIDDEN_GROUP
+                    geom.group = HIDDEN_GROUP
                 geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")

@@ -33,6 +33,31 @@ class BallConfig(StrictModel):
     """Mass, kg."""
 
 
+class LimitsConfig(StrictModel):
+    """The arm's own limits, one number for each acting joint. Between two actions the servo targets
+    then move within the first three (`robot.setpoints`); without them they jump."""
+
+    velocity: tuple[Positive, ...] | None = None
+    """Largest velocity of a joint's command, rad/s; null for no limits of the command."""
+    acceleration: tuple[Positive, ...] | None = None
+    """Largest acceleration of a joint's command, rad/s^2; needed with velocity."""
+    jerk: tuple[Positive, ...] | None = None
+    """Largest jerk of a joint's command, rad/s^3; null for none."""
+    torque: tuple[Positive, ...] | None = None
+    """Largest torque of each servo, N m; null for those of the servos."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_together(self):
+        if (self.velocity is None) != (self.acceleration is None):
+            raise ValueError("velocity or acceleration is missing; give both or neither")
+        if self.jerk is not None and self.acceleration is None:
+            raise ValueError("jerk is given without velocity and acceleration; give all three")
+        given = [x for x in (self.velocity, self.acceleration, self.jerk, self.torque) if x]
+        if len(set(map(len, given))) > 1:
+            raise ValueError("the lists differ in length; give one number for each acting joint")
+        return self
+
+
 class RobotConfig(StrictModel):
     """Adoption of an arm whose MJCF has no paddle and no ball."""
 
@@ -52,6 +77,9 @@ class RobotConfig(StrictModel):
     """Damping of each replaced servo, N m s/rad or N s/m."""
     servo_force_limit: tuple[Positive | None, ...] | None = None
     """Force limit of each replaced servo, N m or N; null for a servo without one."""
+
+    limits: LimitsConfig = LimitsConfig()
+    """The arm's own limits, as its maker states them."""
 
     @pydantic.model_validator(mode="after")
     def _check_servos(self):

@@ -21,8 +21,9 @@ from bounce_mjx.robot.arm import (
     read_spec,
 )
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
-from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
+from bounce_mjx.robot.setpoints import JointLimits
 
 
 class BallAddresses(NamedTuple):
@@ -129,6 +130,7 @@ def load_model(
         addresses = find_addresses(mj_model)
         _check_servos(mj_model, addresses)
         _check_balls(len(addresses.balls), num_balls)
+        _limit_torques(mj_model, addresses, robot or RobotConfig())
     except UserError as error:
         raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
@@ -152,6 +154,40 @@ def paddle_home(
     mujoco.mj_kinematics(mj_model, data)
     x, y, z = (round(float(c), 4) for c in data.geom_xpos[addresses.paddle_geom])
     return x, y, z
+
+
+def command_limits(
+    limits: LimitsConfig, mj_model: mujoco.MjModel, addresses: Addresses
+) -> list[JointLimits] | None:
+    """The limits of each acting joint's command; None if the commands have none."""
+    if limits.velocity is None:
+        return None
+    result = []
+    for i, joint in enumerate(addresses.arm_joints):
+        low, high = map(float, mj_model.jnt_range[joint])
+        acceleration = limits.acceleration[i]
+        smoothing = None if limits.jerk is None else 2.0 * acceleration / limits.jerk[i]
+        span = (low, high) if low < high else None
+        result.append(JointLimits(limits.velocity[i], acceleration, smoothing, span))
+    return result
+
+
+def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotConfig) -> None:
+    """Applies `robot.limits.torque` to the servos, where theirs are not lower."""
+    torques = robot.limits.torque
+    if torques is None:
+        return
+    if len(torques) != len(addresses.actuators):
+        raise UserError(
+            f"robot.limits.torque has {len(torques)} numbers, but {len(addresses.actuators)} "
+            "joints act; give one for each"
+        )
+    for servo, torque in zip(addresses.actuators, torques, strict=True):
+        force = torque / abs(mj_model.actuator_gear[servo, 0])
+        limits = mj_model.actuator_forcerange[servo]
+        limited = mj_model.actuator_forcelimited[servo]
+        limits[:] = np.clip(limits, -force, force) if limited else (-force, force)
+        mj_model.actuator_forcelimited[servo] = True
 
 
 def _check_balls(present: int, num_balls: int) -> None:

@@ -34,20 +34,17 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import resource_path
+from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.task import copy_task
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
+from bounce_mjx.tasks.registry import find_task, is_file
 
 CheckpointName = Literal["latest", "best"]
-PRETRAINED = "pretrained"
 LATEST = "latest"
 """Name of the newest run on the command line."""
-SHIPPED = {PRETRAINED: PRETRAINED, "robust": f"{PRETRAINED}/robust"}
-"""Policies that come with the package: their names, and the folders of their runs."""
 CHECKPOINTS = "checkpoints"
 REPLACED = ".discarded"
 # A terminal obeys these characters.
@@ -201,10 +198,10 @@ def best_checkpoint(run: Path) -> Checkpoint:
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
-    """Checkpoint of a policy in `SHIPPED`."""
-    folder = resource_path(SHIPPED[name])
+    """Checkpoint of a policy in `POLICIES`."""
+    folder = resource_path(POLICIES[name])
     if not folder.is_dir():
-        others = " or ".join(other for other in SHIPPED if other != name)
+        others = ", ".join(other for other in POLICIES if other != name)
         raise UserError(
             f"the policy {name} is not in this version of the package; give {others} or a run's "
             "folder"
@@ -216,19 +213,20 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     """Checkpoint to show or to evaluate; prints the choice if the user made none.
 
     Args:
-      path: see `find_checkpoint`; or `LATEST` or a name in `SHIPPED`, unless there is a folder with
-        that name. For None, the newest run in `log_dir`, or `PRETRAINED` if the default folder of
-        runs is empty.
+      path: see `find_checkpoint`; or `LATEST` or a name in `POLICIES`, unless there is a folder
+        with that name. For None, the newest run in `log_dir`, or the package's policy of a task
+        whose default folder of runs is empty.
     """
-    if str(path) in SHIPPED and not os.path.isdir(path):
+    if str(path) in POLICIES and not os.path.isdir(path):
         return pretrained_checkpoint(str(path))
     try:
         run = named_run(path, log_dir)
     except UserError:
-        if path is not None or log_dir != runs_folder(find_task(DEFAULT)):
+        folders = {runs_folder(find_task(task)): name for task, name in TASK_POLICIES.items()}
+        if path is not None or log_dir not in folders:
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
-        return pretrained_checkpoint()
+        return pretrained_checkpoint(folders[log_dir])
     if run != path:
         for line in _introduction(run, log_dir):
             console.out(line, highlight=False)

@@ -1,7 +1,7 @@
 """What a task is made of: `Task`, its settings, reward terms, results and pictures."""
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.task.flight import GRAVITY, Flight, flight
+from bounce_mjx.task.flight import GRAVITY, Flight, closest, flight
 from bounce_mjx.task.quantities import latest
 from bounce_mjx.task.results import (
     Episodes,
@@ -25,7 +25,7 @@ from bounce_mjx.task.rewards import (
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values
-from bounce_mjx.world.config import ActionConfig, Command, ResetConfig, WorldConfig
+from bounce_mjx.world.config import ActionConfig, Command, NumBalls, ResetConfig, WorldConfig
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -44,6 +44,7 @@ __all__ = [
     "Marker",
     "Moment",
     "Near",
+    "NumBalls",
     "ObservationConfig",
     "Quantity",
     "RandomizationConfig",
@@ -59,6 +60,7 @@ __all__ = [
     "TaskStep",
     "Values",
     "WorldConfig",
+    "closest",
     "flight",
     "gaussian",
     "horizontal_distance",

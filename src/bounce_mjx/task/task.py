@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
@@ -114,13 +114,14 @@ class Task:
     def __init__(self, config: WorldConfig):
         self.config = config
 
-    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+    def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
         terms of the randomisation, of each ball [B, 3] if there are several; None for balls at rest
         at `ball_init_pos` and above it.
 
         Args:
           draws: uniform random numbers between 0 and 1 [num_draws].
+          command: value [] of each command, as it is drawn.
         """
         return None
 
@@ -187,8 +188,14 @@ class Task:
         """What a report draws of the first episodes of an evaluation, as NumPy arrays."""
         return ()
 
-    def markers(self, command: dict[str, float]) -> tuple[Marker, ...]:
-        """Shapes in the scene, for these commands; the same names in the same order for all."""
+    def markers(
+        self, command: dict[str, float], metrics: Mapping[str, float]
+    ) -> tuple[Marker, ...]:
+        """Shapes in the scene; the same names in the same order for all.
+
+        Args:
+          metrics: of the last step; each is 0 before the first one.
+        """
         return ()
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:

@@ -122,7 +122,7 @@ class Balance(task.Task):
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
     num_draws = 4
 
-    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         x, y, z = self.config.ball_init_pos
         east, north = REACH * (draws[:2] - 0.5)
         return jnp.stack([x + east, y + north, jnp.full_like(x, z)]), jnp.zeros(3)
@@ -172,7 +172,7 @@ class Balance(task.Task):
             ),
         )
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A frame around the ball at the point."""
         x, y, z = self.focus()
         place = (x + command["point_x"], y + command["point_y"], z + 0.004)

@@ -426,7 +426,7 @@ class Bounce(Task):
             Hits("hits on the paddle, cm", bounces),
         )
 
-    def markers(self, command: dict[str, float]) -> tuple[Marker, ...]:
+    def markers(self, command: dict[str, float], metrics: Any) -> tuple[Marker, ...]:
         """A disc at the target height, and the outline of the paddle's home."""
         reward = self.config.reward
         x, y = reward.target_x, reward.target_y

@@ -129,7 +129,7 @@ class Catch(task.Task):
     curves = (task.Curve("episode/caught", "caught", "episodes", "share of caught balls"),)
     num_draws = 5
 
-    def throw(self, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
         home = jnp.array(self.config.ball_init_pos)
         offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
@@ -180,7 +180,7 @@ class Catch(task.Task):
         caught = (episodes.maxima["caught"] > 0.0) & (episodes.lasted > 0.0)
         return (task.share_of_episodes("caught", measured, caught, MIN_CAUGHT),)
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc around the points at which throws aim."""
         size, green = (AIM_RADIUS, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.4)
         return (task.Marker("aim", self.focus(), size, green, "cylinder"),)

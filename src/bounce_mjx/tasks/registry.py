@@ -35,6 +35,7 @@ _OWN = {
     "balance": "bounce_mjx.tasks.balance:Balance",
     "bounce": "bounce_mjx.tasks.bounce:Bounce",
     "catch": "bounce_mjx.tasks.catch:Catch",
+    "juggle": "bounce_mjx.tasks.juggle:Juggle",
     "track": "bounce_mjx.tasks.track:Track",
 }
 

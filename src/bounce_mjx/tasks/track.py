@@ -190,7 +190,7 @@ class Track(task.Task):
             task.share_of_episodes("stable", f"episodes that last {length}", episodes.lasted, 0.99),
         )
 
-    def markers(self, command: dict[str, float]) -> tuple[task.Marker, ...]:
+    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         return paths.markers(command, self.config.path_size)
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:

@@ -20,7 +20,13 @@ from bounce_mjx.viewers.options import PageStart
 from bounce_mjx.viewers.pace import in_real_time
 from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import EnvFrame, Simulation, of_environment, stacked
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    Simulation,
+    of_environment,
+    pose_of,
+    stacked,
+)
 from bounce_mjx.viewers.trail import TRAIL_RGB, TRAIL_SECONDS
 
 # Plots per second.
@@ -120,9 +126,11 @@ class LivePage:
             {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
             for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
         ]
+        count = frame.balls.shape[1]
+        balls = ["ball"] if count == 1 else [f"ball {i + 1}" for i in range(count)]
         lines = [
             {"label": "s"},
-            {"label": "ball", "stroke": "#e8590c", "width": 2},
+            *({"label": name, "stroke": "#e8590c", "width": 2} for name in balls),
             *levels,
             {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
         ]
@@ -147,7 +155,7 @@ class LivePage:
     def _update_plots(self) -> None:
         env = self._simulation.env
         frames = list(self._history)[-round(_PLOT_SECONDS / env.dt) :]
-        heights = [(f.ball[0, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
+        heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
         times = np.arange(1 - len(heights), 1) * env.dt
         self._heights.data = (times, *np.array(heights).T)
         recent = frames[-round(1.0 / _PLOT_RATE / env.dt) :]
@@ -166,7 +174,7 @@ def _reward_terms(frame: EnvFrame) -> dict[str, float]:
 
 def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
-    markers = env.task.markers(of_environment(frame.command, 0))
+    markers = env.task.markers(*pose_of(frame, 0)[1:])
     # Markers whose names differ by a number are parts of one.
     rows = {
         words(marker.name.rstrip("_ 0123456789")): 255.0 * np.array(marker.rgba[:3])

@@ -1,6 +1,7 @@
 """The displayed model: the task's markers, and each visible geom as a mesh."""
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -8,6 +9,7 @@ import trimesh
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.arm import compile_spec
+from bounce_mjx.robot.balls import add_balls
 from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.shown import Marker
 from bounce_mjx.world.config import WorldConfig
@@ -19,6 +21,9 @@ _SEGMENTS = 40
 _EDGE = 0.004
 _CREASE_ANGLE = np.radians(30.0)
 
+NO_METRICS: Mapping[str, float] = defaultdict(float)
+"""Metrics before the first step."""
+
 
 class Display:
     """A model for display, and the poses of its parts for given coordinates."""
@@ -26,13 +31,19 @@ class Display:
     def __init__(self, env: Env):
         self._task = env.task
         lowest = {name: command.low for name, command in env.config.commands.items()}
-        self.model = _with_markers(env.config, env.task.markers(lowest))
+        self.model = _with_markers(env.config, env.task.markers(lowest, NO_METRICS))
         self.data = mujoco.MjData(self.model)
 
-    def pose(self, qpos: np.ndarray, command: dict[str, float]) -> None:
-        """Moves `data` to generalised positions [nq], and the markers to those of the commands."""
+    def pose(
+        self,
+        qpos: np.ndarray,
+        command: dict[str, float],
+        metrics: Mapping[str, float] = NO_METRICS,
+    ) -> None:
+        """Moves `data` to generalised positions [nq], and the markers to those of the commands and
+        of the last step's metrics."""
         self.data.qpos[:] = qpos
-        for marker in self._task.markers(command):
+        for marker in self._task.markers(command, metrics):
             body = self.model.body(marker_body(marker.name))
             self.data.mocap_pos[body.mocapid] = marker.position
         mujoco.mj_kinematics(self.model, self.data)
@@ -49,6 +60,7 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
     """The config's model with a body for each marker, which has the size and the colour of the
     model's site of its name, if there is one."""
     spec, path = scene_spec(config.mjcf, config.robot)
+    add_balls(spec, config.num_balls)
     looks = {marker.name: (marker.size, marker.rgba) for marker in markers}
     for site in spec.sites:
         if site.name in looks:

@@ -16,7 +16,7 @@ from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.options import SPEED_RANGE
 from bounce_mjx.viewers.pace import in_real_time
-from bounce_mjx.viewers.simulation import Simulation, frame_readings, of_environment
+from bounce_mjx.viewers.simulation import Simulation, frame_readings, pose_of
 from bounce_mjx.viewers.trail import Trail
 
 _KEYS = "RTGMNIKJL"
@@ -68,7 +68,7 @@ class Window:
         simulation, display = self._simulation, self._display
         trail = Trail(simulation.env.dt)
         trail.add(simulation.frame)
-        display.pose(simulation.frame.qpos[0], of_environment(simulation.frame.command, 0))
+        display.pose(*pose_of(simulation.frame, 0))
         with mujoco.viewer.launch_passive(
             display.model,
             display.data,
@@ -91,7 +91,7 @@ class Window:
                 frame = simulation.frame
                 with viewer.lock():
                     viewer.opt.flags[_OPTION_FLAGS], viewer.user_scn.flags[_SCENE_FLAGS] = flags
-                    display.pose(frame.qpos[0], of_environment(frame.command, 0))
+                    display.pose(*pose_of(frame, 0))
                     viewer.user_scn.ngeom = 0
                     draw_trail(viewer.user_scn, trail.points[:, 0])
                 viewer.set_texts(self._texts())

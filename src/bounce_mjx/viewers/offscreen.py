@@ -5,6 +5,7 @@ import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from mujoco.rendering.classic import gl_context
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.display import NO_METRICS, Display
 from bounce_mjx.viewers.trail import TRAIL_RGB
 
 CAMERA = "overview"
@@ -118,16 +119,20 @@ class Renderer:
         self._renderer.close()
 
     def render(
-        self, qpos: np.ndarray, command: dict[str, float], trail: np.ndarray | None = None
+        self,
+        qpos: np.ndarray,
+        command: dict[str, float],
+        metrics: Mapping[str, float] = NO_METRICS,
+        trail: np.ndarray | None = None,
     ) -> np.ndarray:
         """A picture [height, width, 3] (uint8).
 
         Args:
           qpos: generalised positions [nq].
-          command: the commands, which place the markers.
-          trail: ball positions [P, 3] to connect by a line, oldest first, m.
+          command: the commands, which place the markers, as do the last step's metrics.
+          trail: positions of each ball [P, B, 3] to connect by a line, oldest first, m.
         """
-        self._display.pose(qpos, command)
+        self._display.pose(qpos, command, metrics)
         self._renderer.update_scene(self._display.data, self._camera)
         if trail is not None:
             draw_trail(self._renderer.scene, trail)
@@ -135,8 +140,9 @@ class Renderer:
 
 
 def draw_trail(scene: mujoco.MjvScene, trail: np.ndarray) -> None:
-    """Adds a line through positions [P, 3] to a scene; older segments are fainter."""
-    for i, (start, end) in enumerate(zip(trail[:-1], trail[1:], strict=True)):
+    """Adds lines through positions [P, B, 3] to a scene; older segments are fainter."""
+    for i, ball in np.ndindex(len(trail) - 1, trail.shape[1]):
+        start, end = trail[i : i + 2, ball]
         if scene.ngeom >= scene.maxgeom:
             return
         geom = scene.geoms[scene.ngeom]

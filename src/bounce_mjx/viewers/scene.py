@@ -10,7 +10,7 @@ import viser
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.viewers.display import Display, body_scenes
-from bounce_mjx.viewers.simulation import EnvFrame, frame_readings, of_environment
+from bounce_mjx.viewers.simulation import EnvFrame, frame_readings, pose_of
 from bounce_mjx.viewers.trail import TRAIL_RGB, Trail
 
 _SPACING = np.array([1.3, 0.9, 0.0])
@@ -87,14 +87,15 @@ class Scene:
             for body, shapes in body_scenes(model)
         }
         self._trail = Trail(self._env.dt)
+        num_lines = num_envs * self._env.config.num_balls
         segments = self._trail.length - 1
         age = np.linspace(1.0, 0.0, self._trail.length)[:, None, None]
         colors = age * _BACKGROUND + (1.0 - age) * TRAIL_RGB
         colors = np.stack([colors[:-1], colors[1:]], axis=2)
         self._line = scene.add_line_segments(
             "/trail",
-            np.zeros((segments * num_envs, 2, 3)),
-            np.repeat(colors, num_envs, axis=1).reshape(-1, 2, 3).astype(np.uint8),
+            np.zeros((segments * num_lines, 2, 3)),
+            np.repeat(colors, num_lines, axis=1).reshape(-1, 2, 3).astype(np.uint8),
             thickness=0.006,
         )
         self._focus = np.array(self._env.task.focus())
@@ -129,8 +130,8 @@ class Scene:
             self._lost = np.where(over, frame.lost[:number], self._lost)
         with self._server.atomic():
             for i, label in enumerate(self._labels):
-                command = of_environment(frame.command, i)
-                display.pose(frame.qpos[i], command)
+                qpos, command, metrics = pose_of(frame, i)
+                display.pose(qpos, command, metrics)
                 positions[i], rotations[i] = display.data.xpos, display.data.xquat
                 # An empty label would be a white stroke.
                 label.text = self._label(frame, i)
@@ -142,8 +143,8 @@ class Scene:
                 if model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
-            path = self._trail.points[:, :number] + self._offsets
-            self._line.points = np.stack([path[:-1], path[1:]], axis=2).reshape(-1, 2, 3)
+            path = self._trail.points[:, :number] + self._offsets[:, None]
+            self._line.points = np.stack([path[:-1], path[1:]], axis=3).reshape(-1, 2, 3)
 
     def follow(self, frame: EnvFrame) -> None:
         """Moves the camera of every page smoothly with the first ball."""

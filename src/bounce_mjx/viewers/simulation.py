@@ -23,8 +23,8 @@ class EnvFrame(NamedTuple):
     """Time since the episode's reset [N], s."""
     qpos: np.ndarray
     """Generalised positions [N, nq], in MuJoCo's order."""
-    ball: np.ndarray
-    """The ball's centre [N, 3], m."""
+    balls: np.ndarray
+    """Centre of each ball [N, B, 3], m."""
     paddle: np.ndarray
     """The paddle's centre [N, 3], m."""
     command: dict[str, np.ndarray]
@@ -37,6 +37,11 @@ class EnvFrame(NamedTuple):
     lost: np.ndarray
     """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
     fast."""
+
+    @property
+    def ball(self) -> np.ndarray:
+        """Centre of the first ball [N, 3], m."""
+        return self.balls[..., 0, :]
 
 
 class _Changes(NamedTuple):
@@ -53,6 +58,12 @@ class _Changes(NamedTuple):
 def of_environment(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
     """Commands or metrics [N] of one environment, each a number."""
     return {name: float(value[index]) for name, value in values.items()}
+
+
+def pose_of(frame: EnvFrame, index: int) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
+    """The positions [nq], the commands and the metrics of one environment of a frame."""
+    command, metrics = (of_environment(x, index) for x in (frame.command, frame.metrics))
+    return frame.qpos[index], command, metrics
 
 
 def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
@@ -244,12 +255,13 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     frames = jax.tree.map(lambda values: values[before], recording)
 
     def blend(values):
-        return values[before] + fraction[..., None] * (values[after] - values[before])
+        share = fraction.reshape(*fraction.shape, *(1,) * (values.ndim - 2))
+        return values[before] + share * (values[after] - values[before])
 
     return frames._replace(
         time=frames.time + fraction * dt,
         qpos=blend(recording.qpos),
-        ball=blend(recording.ball),
+        balls=blend(recording.balls),
         paddle=blend(recording.paddle),
     )
 
@@ -286,10 +298,11 @@ def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFram
     """The frame of states (batch last) `steps` control steps after their resets."""
     now = states.pipeline_state
     kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(now)
+    places = [ball.qpos[:3] for ball in find_addresses(env.mj_model).balls]
     return EnvFrame(
         time=steps * env.dt,
         qpos=now.physics.qpos.T,
-        ball=now.physics.qpos[jnp.array(find_addresses(env.mj_model).ball_qpos[:3])].T,
+        balls=jnp.moveaxis(now.physics.qpos[jnp.array(places)], -1, 0),
         paddle=kinematics.paddle_position.T,
         command=now.command,
         metrics=states.metrics,

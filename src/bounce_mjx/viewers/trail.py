@@ -17,14 +17,14 @@ class Trail:
         self.length = round(TRAIL_SECONDS / dt)
         """Number P of positions."""
         self.points: np.ndarray | None = None
-        """Positions [P, N, 3], the oldest first, m; where an episode is shorter, its first
+        """Positions [P, N, B, 3], the oldest first, m; where an episode is shorter, its first
         position comes several times. None before the first frame."""
 
     def add(self, frame: EnvFrame) -> None:
         """Adds a frame's positions."""
         if self.points is None:
-            self.points, self._time = np.tile(frame.ball, (self.length, 1, 1)), frame.time
-        self.points = np.concatenate([self.points[1:], frame.ball[None]])
+            self.points, self._time = np.tile(frame.balls, (self.length, 1, 1, 1)), frame.time
+        self.points = np.concatenate([self.points[1:], frame.balls[None]])
         restarted = frame.time < self._time
-        self.points[:, restarted] = frame.ball[restarted]
+        self.points[:, restarted] = frame.balls[restarted]
         self._time = frame.time

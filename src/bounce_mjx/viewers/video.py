@@ -19,7 +19,7 @@ from bounce_mjx.viewers.simulation import (
     Simulation,
     frame_at,
     frame_readings,
-    of_environment,
+    pose_of,
     resample,
 )
 from bounce_mjx.viewers.trail import Trail
@@ -132,8 +132,7 @@ class VideoWriter:
             for i in range(len(frames.time)):
                 frame = frame_at(frames, i)
                 trail.add(frame)
-                command = of_environment(frame.command, 0)
-                picture = renderer.render(frame.qpos[0], command, trail.points[:, 0])
+                picture = renderer.render(*pose_of(frame, 0), trail.points[:, 0])
                 yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 
@@ -146,13 +145,15 @@ def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.
     large, small = ImageFont.load_default(2 * unit), ImageFont.load_default(unit)
     (name, value), *others = [*readings.items(), ("ball", f"{height:.2f} m")]
     bottom = (3.9 + 1.15 * len(others)) * unit
-    draw.rounded_rectangle((unit, unit, 11 * unit, bottom), unit // 2, fill=(15, 20, 28, 170))
+    left = 2.1 * unit + draw.textlength(value, font=large)
+    right = max(10.4 * unit, left + draw.textlength(name, font=small))
+    box = (unit, unit, right + 0.6 * unit, bottom)
+    draw.rounded_rectangle(box, unit // 2, fill=(15, 20, 28, 170))
     draw.text((1.6 * unit, 1.2 * unit), value, font=large, fill="white")
-    left = 1.6 * unit + draw.textlength(value, font=large) + 0.5 * unit
     draw.text((left, 2.1 * unit), name, font=small, fill=(255, 255, 255, 220))
     for row, (name, value) in enumerate(others):
         color = (255, 190, 120, 255) if name == "ball" else (120, 235, 140, 255)
         top = 3.7 * unit + 1.15 * row * unit
         draw.text((1.6 * unit, top), name, font=small, fill=color)
-        draw.text((10.4 * unit, top), value, font=small, fill=color, anchor="ra")
+        draw.text((right, top), value, font=small, fill=color, anchor="ra")
     return np.asarray(image)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.physics import Control
-from bounce_mjx.physics.control import servo_target
+from bounce_mjx.physics.control import Moving, servo_target
+from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.randomization import RandomizationConfig, World
 
@@ -18,20 +19,29 @@ DEFAULT_PUSH_INTERVAL = 2.0
 class Actuation(NamedTuple):
     """Memory of the actuation; a field is None if no term needs it."""
 
-    targets: jax.Array | None
-    """Servo targets of the last control steps [K, nu], the newest first."""
+    targets: jax.Array | Setpoint | None
+    """Servo targets of the last control steps [K, nu], the newest first; of targets that move,
+    position and velocity at the start of each step and the acceleration in it."""
     filtered: jax.Array | None
     """Outputs of the servos' lags [nu]."""
 
 
 def start_actuation(
-    config: RandomizationConfig, control_dt: float, targets: jax.Array
+    config: RandomizationConfig, control_dt: float, targets: jax.Array, moving: bool = False
 ) -> Actuation | None:
-    """Memory at a reset, with the servos at rest at the targets [nu]."""
+    """Memory at a reset, with the servos at rest at the targets [nu].
+
+    Args:
+      moving: whether the targets move within an arm's limits.
+    """
     queue = filtered = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
         queue = jnp.broadcast_to(targets, (length, *targets.shape))
+        if moving:
+            # Smoothing needs the acceleration one step further back.
+            still = jnp.zeros((length + 1, *targets.shape), targets.dtype)
+            queue = Setpoint(queue, still[1:], still)
     if config.servo_lag is not None:
         filtered = targets
     return None if queue is None and filtered is None else Actuation(queue, filtered)
@@ -40,36 +50,53 @@ def start_actuation(
 def delayed(
     world: World,
     actuation: Actuation | None,
-    targets: jax.Array,
+    control: Control,
     control_dt: float,
     num_substeps: int,
 ) -> tuple[Control, Actuation | None]:
-    """Control of a control step from the targets [nu] of its action.
+    """Control of a control step from that of its action, which has targets alone.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
     them.
     """
-    control = Control(targets)
     if actuation is None:
         return control, None
-    queue = actuation.targets
+    queue, targets, moving = actuation.targets, control.ctrl, control.moving
     if queue is not None:
-        queue = jnp.concatenate([targets[None], queue[:-1]])
+        newest = targets
+        if moving is not None:
+            newest = Setpoint(targets, moving.velocity, moving.acceleration)
+        queue = jax.tree.map(lambda new, q: jnp.concatenate([new[None], q[:-1]]), newest, queue)
         latency = world["action_latency"] / control_dt
         # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
         # and a switch at the end of the step.
         whole = jnp.floor(latency + 1e-4)
-        control = Control(
-            ctrl=taken(queue, whole),
-            previous=taken(queue[1:], whole),
-            switch=jnp.round((latency - whole) * num_substeps),
-        )
+        if moving is None:
+            control = Control(taken(queue, whole), previous=taken(queue[1:], whole))
+        else:
+            control = _late(queue, whole, moving, num_substeps)
+        control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
     filtered = actuation.filtered
     if filtered is not None:
         steps = world["servo_lag"] / (control_dt / num_substeps)
         control = control._replace(filtered=filtered, lag=steps)
         filtered = servo_target(control, jnp.asarray(num_substeps - 1, targets.dtype))
     return control, Actuation(queue, filtered)
+
+
+def _late(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) -> Control:
+    """Control of moving targets that are late by a whole number of control steps []."""
+    accelerations = queue.acceleration
+    smoothed = moving.smoothing is not None
+    late = Moving(
+        velocity=taken(queue.velocity, whole),
+        acceleration=taken(accelerations[:-1], whole),
+        before=taken(accelerations[1:], whole),
+        smoothing=moving.smoothing,
+        earlier=taken(accelerations[2:], whole) if smoothed else None,
+        duration=jnp.asarray(num_substeps, accelerations.dtype) if smoothed else None,
+    )
+    return Control(taken(queue.position, whole), late)
 
 
 def taken(queue: jax.Array, index: jax.Array) -> jax.Array:

@@ -24,6 +24,10 @@ PADDLE_HOME = (0.58856, 0.0, 0.05)
 """Where the project's own arm holds the paddle at a reset, m."""
 
 
+NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)]
+"""Number of balls."""
+
+
 class Command(NamedTuple):
     """A number that is wished of the policy: drawn at a reset and after each interval
     (`randomization.command_interval`), or set by a user."""
@@ -126,7 +130,7 @@ class WorldConfig(StrictModel):
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
-    num_balls: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)] = 1
+    num_balls: NumBalls = 1
     """Number of balls; those that the MJCF lacks are copies of its first one."""
     ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
     """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
@@ -179,6 +183,32 @@ class WorldConfig(StrictModel):
                 f"episode_seconds {self.episode_seconds} is shorter than one control step of "
                 f"{self.control_dt} s; choose a longer episode"
             )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_limits(self):
+        limits = self.robot.limits
+        for name in type(limits).model_fields:
+            values = getattr(limits, name)
+            if values is not None and len(values) != self.num_joints:
+                raise ValueError(
+                    f"robot.limits.{name} has {len(values)} numbers, but default_joint_angles has "
+                    f"{self.num_joints}; give one for each acting joint"
+                )
+        if limits.velocity is not None and self.action.base == "measured":
+            # A command that follows the measured angle, which follows the command, oscillates.
+            raise ValueError(
+                "robot.limits are of commands that move, to which an action adds, but action.base "
+                "is measured; set action.base to target"
+            )
+        if limits.jerk is not None:
+            for acceleration, jerk in zip(limits.acceleration, limits.jerk, strict=True):
+                if 2.0 * acceleration / jerk > self.control_dt:
+                    raise ValueError(
+                        f"robot.limits.jerk {jerk:g} is too low: the acceleration cannot turn from "
+                        f"{acceleration:g} to the opposite within control_dt {self.control_dt:g}; "
+                        f"give at least {2.0 * acceleration / self.control_dt:g}"
+                    )
         return self
 
     @pydantic.field_validator("mjcf")

@@ -180,12 +180,16 @@ class Batch:
             metrics=dict(zip(sorted(self._episodes.env.metrics), metrics, strict=True)),
         )
 
-    def pose(self, index: int) -> tuple[np.ndarray, dict[str, float]]:
-        """The generalised positions [nq] and the commands of one environment."""
+    def pose(self, index: int) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
+        """The generalised positions [nq], the commands, and the last step's metrics of one
+        environment."""
         self._check_started()
-        state = self._episodes.env.pipeline_state
-        command = {name: float(value[index]) for name, value in state.command.items()}
-        return np.array(state.physics.qpos[:, index]), command
+        env, state = self._episodes.env, self._episodes.env.pipeline_state
+        command, metrics = (
+            {name: float(value[index]) for name, value in values.items()}
+            for values in (state.command, env.metrics)
+        )
+        return np.array(state.physics.qpos[:, index]), command, metrics
 
     @functools.cached_property
     def _programs(self) -> "_Programs":

@@ -1,4 +1,4 @@
-"""Registers the environment with Gymnasium, before or after Gymnasium is imported."""
+"""Registers the environments with Gymnasium, before or after Gymnasium is imported."""
 
 import sys
 
@@ -8,13 +8,17 @@ ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
 """Name of any other one, with the argument `task`."""
-MAX_EPISODE_STEPS = 2000
-"""The tasks' episode of 20 s. A constant, because reading a config would import JAX."""
+EPISODE_STEPS = {"balance": 2000, "bounce": 2000, "catch": 300, "juggle": 2000, "track": 2000}
+"""Steps of an episode of each of the package's tasks. Constants, because reading a config takes
+time at each import of Gymnasium."""
+MAX_EPISODE_STEPS = EPISODE_STEPS["bounce"]
+"""Steps of an episode of any other task."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
 def register_when_imported() -> None:
-    """Makes `gymnasium.make` and `gymnasium.make_vec` work for `ENV_ID` and `TASK_ID`.
+    """Makes `gymnasium.make` and `gymnasium.make_vec` work for `ENV_ID`, for `TASK_ID`, and for
+    each of the package's tasks, such as bounce_mjx/Juggle-v0.
 
     Gymnasium is optional and takes half a second to import, so it is not imported here. If it is
     not loaded yet, the registration follows its import.
@@ -26,13 +30,16 @@ def register_when_imported() -> None:
 
 
 def register() -> None:
-    """Adds the environment to Gymnasium's registry; its classes are imported on first use."""
+    """Adds the environments to Gymnasium's registry; their classes are imported on first use."""
     import gymnasium
 
-    for name in (ENV_ID, TASK_ID):
+    tasks = dict.fromkeys((ENV_ID, TASK_ID), "bounce")
+    tasks |= {f"bounce_mjx/{task.title()}-v0": task for task in EPISODE_STEPS}
+    for name, task in tasks.items():
         gymnasium.register(
             name,
             entry_point=f"{_MODULE}:TaskEnv",
             vector_entry_point=f"{_MODULE}:TaskVectorEnv",
-            max_episode_steps=MAX_EPISODE_STEPS,
+            max_episode_steps=EPISODE_STEPS[task],
+            kwargs={"task": task},
         )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
-from bounce_mjx.physics.control import Control, drag, servo_target
+from bounce_mjx.physics.control import Control, Moving, drag, servo_target
 from bounce_mjx.physics.fused import chain, friction, joint_friction
 from bounce_mjx.physics.fused.contact import (
     Contact,
@@ -158,7 +158,11 @@ def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     def chosen(ctrl: jax.Array | None) -> jax.Array | None:
         return None if ctrl is None else jnp.stack([ctrl[i] for i in actuators])
 
+    moving = control.moving
+    if moving is not None:
+        moving = Moving(*map(chosen, moving[:-1]), moving.duration)
     return control._replace(
+        moving=moving,
         ctrl=chosen(control.ctrl),
         previous=chosen(control.previous),
         filtered=chosen(control.filtered),
@@ -209,15 +213,18 @@ def _substeps(
 
 def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
     """Servo targets during one physics step."""
-    if control.previous is None and control.lag is None:
+    if control.previous is None and control.lag is None and control.moving is None:
         return control.ctrl
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
-    none = (None,) * len(control.ctrl)
-    servos = zip(control.ctrl, control.previous or none, control.filtered or none, strict=True)
-    return tuple(
-        servo_target(control._replace(ctrl=ctrl, previous=previous, filtered=filtered), step)
-        for ctrl, previous, filtered in servos
-    )
+
+    def of_servo(i: int) -> Control:
+        def own(entry: Any) -> Any:
+            return entry[i] if isinstance(entry, tuple) else entry
+
+        moving = control.moving and Moving(*map(own, control.moving))
+        return Control(*map(own, control._replace(moving=None)))._replace(moving=moving)
+
+    return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
 
 
 @functools.lru_cache

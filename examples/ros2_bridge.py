@@ -1,0 +1,64 @@
+"""A policy on the topics of ROS 2, with the controller forward_position_controller of ros2_control.
+
+`python examples/ros2_bridge.py POLICY` subscribes to /joint_states and /ball (PointStamped, in the
+frame of the base), and publishes /forward_position_controller/commands at 500 Hz. Publish a message
+on /start for each episode. Read "Safety steps" in docs/real-robot.md first.
+"""
+
+import sys
+
+import rclpy
+from geometry_msgs.msg import PointStamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Empty, Float64MultiArray
+
+from bounce_mjx import load_policy
+
+RATE = 500.0
+
+
+class Bridge(Node):
+    """Takes the newest messages once each control step, and publishes one command in each tick."""
+
+    def __init__(self, policy, target_height: float = 0.7):
+        super().__init__("bounce_mjx")
+        self.names, self.arm = policy.metadata.joint_names, policy.supervise(RATE)
+        self.measured, self.taken, self.queue = {"target_height": target_height}, None, []
+        self.create_subscription(JointState, "/joint_states", self.on_joints, 1)
+        self.create_subscription(PointStamped, "/ball", self.on_ball, 1)
+        self.create_subscription(Empty, "/start", self.on_start, 1)
+        topic = "/forward_position_controller/commands"
+        self.publisher = self.create_publisher(Float64MultiArray, topic, 1)
+        self.create_timer(1.0 / RATE, self.tick)
+
+    def on_joints(self, message: JointState) -> None:
+        order = [message.name.index(name) for name in self.names]
+        self.measured["joint_angles"] = [message.position[i] for i in order]
+        self.measured["joint_velocities"] = [message.velocity[i] for i in order]
+
+    def on_ball(self, message: PointStamped) -> None:
+        point, self.taken = message.point, message.header.stamp
+        self.measured["ball_position"] = [point.x, point.y, point.z]
+
+    def on_start(self, message: Empty) -> None:
+        if self.arm.state == "stopped":
+            self.get_logger().info(f"stopped as {self.arm.reason}; going home")
+            self.arm.restart()
+        elif self.arm.state == "ready":
+            self.arm.start()
+
+    def tick(self) -> None:
+        if "joint_angles" not in self.measured or self.taken is None:
+            return
+        if not self.queue:
+            now = self.get_clock().now()
+            age = (now - rclpy.time.Time.from_msg(self.taken)).nanoseconds * 1e-9
+            time = {"time": now.nanoseconds * 1e-9, "ball_age": max(age, 0.0)}
+            self.queue = list(self.arm.commands(self.measured | time))
+        self.publisher.publish(Float64MultiArray(data=self.queue.pop(0).tolist()))
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    rclpy.spin(Bridge(load_policy(sys.argv[1])))

@@ -1,0 +1,73 @@
+"""A policy on a Universal Robots arm, by ur_rtde (`pip install ur_rtde`), at 500 Hz.
+
+`python examples/ur_rtde_bridge.py ROBOT_IP POLICY` reads the ball from UDP datagrams "x y z age" (m
+in the frame of the base, s) on port 5005. Read "Safety steps" in docs/real-robot.md first.
+"""
+
+import argparse
+import socket
+
+import numpy as np
+
+from bounce_mjx import load_policy
+
+RATE, LOOKAHEAD, GAIN = 500.0, 0.03, 300
+
+
+class Camera:
+    """The newest datagram of the ball."""
+
+    def __init__(self, port: int = 5005):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("", port))
+        self.socket.setblocking(False)
+        self.newest: dict = {}
+
+    def measure(self, step: float) -> dict:
+        """Position and age of the ball; the age grows by a control step until the next datagram."""
+        age = self.newest.get("ball_age", np.inf) + step
+        self.newest = self.newest | {"ball_age": age}
+        while True:
+            try:
+                *ball, age = map(float, self.socket.recv(256).split())
+            except BlockingIOError:
+                return self.newest
+            self.newest = {"ball_position": ball, "ball_age": age}
+
+
+def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> list[str]:
+    """Bounces for a time, and starts again after each stop. Returns the reasons of the stops."""
+    arm, step, reasons = policy.supervise(RATE), policy.metadata.control_dt, []
+    for _ in range(round(seconds / step)):
+        joints = {"joint_angles": receive.getActualQ(), "joint_velocities": receive.getActualQd()}
+        time = {"time": receive.getTimestamp()}
+        ball = camera.measure(step)
+        for command in arm.commands(joints | ball | commands | time):
+            period = control.initPeriod()
+            control.servoJ(command.tolist(), 0.0, 0.0, 1.0 / RATE, LOOKAHEAD, GAIN)
+            control.waitPeriod(period)
+        if arm.state == "ready" and ball.get("ball_age", np.inf) < 0.05:
+            arm.start()
+        elif arm.state == "stopped":
+            reasons.append(arm.reason)
+            arm.restart()
+    control.servoStop()
+    return reasons
+
+
+if __name__ == "__main__":
+    import rtde_control
+    import rtde_receive
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("robot", help="address of the robot")
+    parser.add_argument("policy", help="name, file or run")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--target-height", type=float, default=0.7, help="m")
+    given = parser.parse_args()
+    rtde = rtde_control.RTDEControlInterface(given.robot, RATE)
+    state = rtde_receive.RTDEReceiveInterface(given.robot, RATE)
+    wished = {"target_height": given.target_height}
+    print(
+        *bounce(load_policy(given.policy), rtde, state, Camera(), wished, given.seconds), sep="\n"
+    )

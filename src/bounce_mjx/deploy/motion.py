@@ -1,0 +1,79 @@
+"""The commands that a robot gets between two actions."""
+
+import numpy as np
+
+from bounce_mjx.deploy.metadata import Metadata
+from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
+
+
+class Motion:
+    """Commands of the joints, one control step after the other: within the arm's limits if the
+    policy has them, else a target for the whole control step."""
+
+    def __init__(self, metadata: Metadata):
+        ranges, limits = metadata.joint_ranges, metadata.limits
+        self._duration = metadata.control_dt
+        self._low = np.array([-np.inf if x is None else x[0] for x in ranges])
+        self._high = np.array([np.inf if x is None else x[1] for x in ranges])
+        self._limits = None
+        if limits is not None:
+            velocity, acceleration = np.array(limits.velocity), np.array(limits.acceleration)
+            smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
+            span = (self._low, self._high)
+            self._limits = JointLimits(velocity, acceleration, smoothing, span)
+        self._start = self._end = None
+
+    def rest(self, angles: np.ndarray | None) -> None:
+        """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
+        still = np.zeros(len(self._low))
+        self._start = None
+        self._end = None if angles is None else Setpoint(self._clipped(angles), still, still)
+
+    def begin(self, angles: np.ndarray) -> None:
+        """Begins a control step with the measured angles [J], where the last one ended."""
+        if self._end is None:
+            self.rest(angles)
+        self._start = self._end
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a command."""
+        return self._end is not None
+
+    @property
+    def position(self) -> np.ndarray:
+        """Command [J] at the start of the control step, before the mean that limits the jerk."""
+        return self._start.position
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the command rests at the end of the control step."""
+        return not (np.any(self._end.velocity) or np.any(self._end.acceleration))
+
+    def aim(self, target: np.ndarray) -> None:
+        """Wishes the joints at a target [J] at the end of the control step."""
+        target = self._clipped(target)
+        if self._limits is None:
+            still = np.zeros(len(target))
+            self._end = Setpoint(target, still, still)
+        else:
+            self._end = next_setpoint(self._limits, self._start, target, self._duration, np)
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """Commands [M, J] at times [M] since the start of the control step, s."""
+        if self._limits is None or self._start is None:
+            return np.tile(self._end.position, (len(times), 1))
+        acceleration, smoothing = self._end.acceleration, self._limits.smoothing
+        return command(self._start, acceleration, np.asarray(times)[:, None], np, smoothing)
+
+    def toward(self, target: np.ndarray, speed: float) -> np.ndarray:
+        """An aim [J] on the way to a target [J], rad, at most at a speed (rad/s) from which half
+        of the acceleration stops at the target."""
+        left = target - self._start.position
+        if self._limits is not None:
+            speed = np.minimum(speed, np.sqrt(self._limits.acceleration * np.abs(left)))
+        step = speed * self._duration
+        return self._start.position + np.clip(left, -step, step)
+
+    def _clipped(self, angles: np.ndarray) -> np.ndarray:
+        return np.clip(angles, self._low, self._high)

@@ -1,0 +1,210 @@
+"""The bridges to robots, on stand-ins of their libraries in front of MuJoCo's C engine."""
+
+import runpy
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import load_policy
+from bounce_mjx.resources import resource_path
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+RATE, SECONDS = 500, 7.0
+
+
+class World:
+    """The simulated arm at 500 Hz, somebody who holds the ball until the arm is ready and puts it
+    back after a loss, and a camera of 100 Hz with 20 ms of delay."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+        self.data = mujoco.MjData(self.model)
+        self.names = [f"Joint{i}" for i in range(1, 7)]
+        self.data.qpos[:6] = np.radians([0, 40, 110, 0, -60, 0]) + 0.05
+        self.data.ctrl[:] = self.data.qpos[:6]
+        self.ball = self.data.joint("ball_link")
+        self.start, self.held = self.ball.qpos.copy(), True
+        self.pictures: list[tuple[float, np.ndarray]] = []
+        self.commands, self.ticks, self.bounces, self.before = [], 0, 0, 0
+
+    @property
+    def time(self) -> float:
+        return self.data.time
+
+    def picture(self) -> tuple[float, np.ndarray] | None:
+        """The newest picture that has arrived: its time and the ball's position."""
+        arrived = [p for p in self.pictures if p[0] <= self.time - 0.02 + 1e-9]
+        return arrived[-1] if arrived else None
+
+    def tick(self, command: Any) -> None:
+        """2 ms with a command."""
+        self.commands.append(np.array(command))
+        self.data.ctrl[:] = command
+        if self.ticks % 5 == 0:
+            self.pictures.append((self.time, self.ball.qpos[:3].copy()))
+        for _ in range(2):
+            falling = self.ball.qvel[2] < 0.0
+            mujoco.mj_step(self.model, self.data)
+            if self.held:
+                self.ball.qpos[:], self.ball.qvel[:] = self.start, 0.0
+            self.bounces += bool(falling and self.ball.qvel[2] > 0.0)
+        self.ticks += 1
+
+    def watch(self, arm: Any) -> None:
+        self.held = arm.state not in ("running", "braking")
+
+
+def check(world: World, reasons: list[str]) -> None:
+    """The ball bounces, is thrown away once, and bounces again."""
+    assert reasons == ["the ball is lost"]
+    assert world.before >= 3 and world.bounces - world.before >= 2
+    steps = np.abs(np.diff(world.commands, axis=0))
+    assert steps.max() < 0.05
+
+
+def knocked(world: World) -> None:
+    """Knocks the ball away in the third second."""
+    if world.ticks == 3 * RATE:
+        world.ball.qvel[:2], world.before = 3.0, world.bounces
+
+
+def test_ur_rtde_bridge() -> None:
+    world, supervised = World(), []
+    policy = load_policy("robust")
+    make = policy.supervise
+    policy.supervise = lambda rate: supervised.append(make(rate)) or supervised[0]
+    bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
+
+    class Control:
+        def initPeriod(self) -> int:
+            return world.ticks
+
+        def servoJ(self, q, speed, acceleration, dt, lookahead, gain) -> bool:
+            assert isinstance(q, list) and len(q) == 6 and dt == 1.0 / RATE
+            assert 0.03 <= lookahead <= 0.2 and 100 <= gain <= 2000
+            self.sent = q
+            return True
+
+        def waitPeriod(self, period: int) -> None:
+            assert period == world.ticks
+            knocked(world)
+            world.tick(self.sent)
+            world.watch(supervised[0])
+
+        def servoStop(self) -> None:
+            self.stopped = True
+
+    class Receive:
+        def getActualQ(self) -> list[float]:
+            return world.data.qpos[:6].tolist()
+
+        def getActualQd(self) -> list[float]:
+            return world.data.qvel[:6].tolist()
+
+        def getTimestamp(self) -> float:
+            return world.time
+
+    class Socket:
+        """Datagrams of the camera."""
+
+        sent = 0
+
+        def recv(self, size: int) -> bytes:
+            picture = world.picture()
+            if picture is None or picture[0] == self.sent:
+                raise BlockingIOError
+            self.sent = picture[0]
+            return " ".join(map(str, [*picture[1], world.time - picture[0]])).encode()
+
+    camera = bridge["Camera"].__new__(bridge["Camera"])
+    camera.socket, camera.newest = Socket(), {}
+    control = Control()
+    wished = {"target_height": 0.5}
+    reasons = bridge["bounce"](policy, control, Receive(), camera, wished, SECONDS)
+    assert control.stopped and world.ticks == SECONDS * RATE
+    check(world, reasons)
+
+
+def message(**fields: Any) -> types.SimpleNamespace:
+    return types.SimpleNamespace(**fields)
+
+
+def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, said = World(), []
+
+    class Time:
+        def __init__(self, nanoseconds: int):
+            self.nanoseconds = nanoseconds
+
+        def __sub__(self, other: "Time") -> "Time":
+            return Time(self.nanoseconds - other.nanoseconds)
+
+        @staticmethod
+        def from_msg(stamp: types.SimpleNamespace) -> "Time":
+            return Time(stamp.sec * 10**9 + stamp.nanosec)
+
+    class Node:
+        def __init__(self, name: str):
+            self.subscribed, self.timers = {}, []
+
+        def create_subscription(self, kind, topic, callback, depth) -> None:
+            self.subscribed[topic] = callback
+
+        def create_publisher(self, kind, topic, depth) -> types.SimpleNamespace:
+            assert topic == "/forward_position_controller/commands"
+            return message(publish=lambda sent: setattr(self, "sent", sent.data))
+
+        def create_timer(self, period: float, callback) -> None:
+            self.timers.append((period, callback))
+
+        def get_clock(self) -> types.SimpleNamespace:
+            return message(now=lambda: Time(round(world.time * 1e9)))
+
+        def get_logger(self) -> types.SimpleNamespace:
+            return message(info=said.append)
+
+    modules = {
+        "rclpy": {"time": message(Time=Time)},
+        "rclpy.node": {"Node": Node},
+        "geometry_msgs.msg": {"PointStamped": None},
+        "sensor_msgs.msg": {"JointState": None},
+        "std_msgs.msg": {"Empty": None, "Float64MultiArray": message},
+    }
+    for name, content in modules.items():
+        module = types.ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setitem(
+            sys.modules, name.split(".")[0], sys.modules.get(name.split(".")[0], module)
+        )
+    node = runpy.run_path(str(EXAMPLES / "ros2_bridge.py"))["Bridge"](load_policy("robust"), 0.5)
+    ((period, tick),) = node.timers
+    assert period == 1.0 / RATE
+    backwards = world.names[::-1]
+    shown = None
+    for _ in range(round(SECONDS * RATE)):
+        state = message(
+            name=backwards,
+            position=world.data.qpos[:6][::-1].tolist(),
+            velocity=world.data.qvel[:6][::-1].tolist(),
+        )
+        node.subscribed["/joint_states"](state)
+        picture = world.picture()
+        if picture is not None and picture[0] != shown:
+            shown = picture[0]
+            point = message(**dict(zip("xyz", picture[1], strict=True)))
+            stamp = message(sec=int(shown), nanosec=round(shown % 1 * 1e9))
+            node.subscribed["/ball"](message(point=point, header=message(stamp=stamp)))
+        if node.arm.state in ("ready", "stopped"):
+            node.subscribed["/start"](message())
+        tick()
+        knocked(world)
+        world.tick(getattr(node, "sent", world.data.ctrl))
+        world.watch(node.arm)
+    assert len(said) == 1
+    check(world, [said[0].removeprefix("stopped as ").removesuffix("; going home")])
