@@ -16,7 +16,9 @@ class Unknown(NamedTuple):
     deviation: float
     """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
     step: float
-    """Difference at which derivatives are taken."""
+    """Difference at which derivatives are taken: small for latency and lag, which differ only in
+    the second order, and large where a bounce's instant moves, which a simulation rounds to its
+    steps."""
     unit: str
     stage: str
     """First stage of the search that varies it: arm, flight or bounce."""
@@ -27,10 +29,10 @@ class Unknown(NamedTuple):
 
 _JOINTS = None
 ARM = {
-    "action_latency": Unknown(0.02, 0.02, 1.5e-3, "s", "arm", limits=(0.0, 0.2)),
-    "servo_lag": Unknown(0.015, 0.02, 1.5e-3, "s", "arm", limits=(0.0, 0.2)),
+    "action_latency": Unknown(0.02, 0.02, 2e-4, "s", "arm", limits=(0.0, 0.2)),
+    "servo_lag": Unknown(0.015, 0.02, 2e-4, "s", "arm", limits=(0.0, 0.2)),
     "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0)),
-    "servo_damping": Unknown(1.0, 0.3, 0.06, "", "arm", _JOINTS, (0.05, 20.0)),
+    "servo_damping": Unknown(1.0, 0.3, 0.01, "", "arm", _JOINTS, (0.05, 20.0)),
     "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf)),
     "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0)),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
