@@ -123,6 +123,7 @@ def test_one_step_of_several_balls_is_mujocos(num_balls, cone, friction, record_
     print(f"{num_balls} balls, {cone}, friction {friction}: {error:.1e} of the largest speed")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_given_parameters_act_on_all_balls(record_property):
     """All parameters at once, against C on `edited_model`; without and with both kinds of
@@ -213,6 +214,7 @@ def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction, reco
     assert meetings >= 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [None, 0.3], ids=["frictionless", "friction"])
 @pytest.mark.usefixtures("float64")
 def test_the_gradient_of_touching_balls_is_that_of_finite_differences(friction):
@@ -246,6 +248,7 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences(friction):
         assert np.mean(np.abs(found - expected) / scale < 1e-3) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_mjx_agrees_on_several_balls():

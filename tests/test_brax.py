@@ -237,6 +237,7 @@ def ppo_example(tmp_path_factory):
     return folder, history
 
 
+@pytest.mark.slow
 def test_brax_ppo_trains_and_evaluates(ppo_example):
     folder, history = ppo_example
     assert len(history) == 2
@@ -245,6 +246,7 @@ def test_brax_ppo_trains_and_evaluates(ppo_example):
     assert "viewer.js" in (folder / "rollout.html").read_text()
 
 
+@pytest.mark.slow
 def test_brax_checkpoint_has_the_trained_policy(ppo_example):
     """The action of the loaded policy equals that of a network written out in NumPy."""
     folder, _ = ppo_example
@@ -267,6 +269,7 @@ def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
         load_policy(tmp_path)
 
 
+@pytest.mark.slow
 def test_brax_sac_trains_and_evaluates(env):
     (make_policy, trained, _), history = train(
         brax_sac,
