@@ -138,24 +138,34 @@ def minimise(
     place, now = np.flatnonzero(free), np.inf
     of_state = np.arange(starts.shape[1]) if free_states is None else np.flatnonzero(free_states)
     num_free, num_states = len(place), len(of_state)
+    num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
+    # Unknowns for which the pictures need another difference, if any picture counts.
+    apart = layout.ball_step[place] != layout.step[place]
+    apart = np.flatnonzero(apart & np.any(weights[:, num_angles:] > 0.0))
     own, reach = differences[of_state], deviations[of_state]
     # The start of a window that does not count stays as it is.
     counts = np.any(weights > 0.0, axis=1)[:, None]
     for iteration in range(iterations):
-        vectors = np.repeat(vector[None], 1 + num_free + num_states, axis=0)
+        vectors = np.repeat(vector[None], 1 + num_free + num_states + len(apart), axis=0)
         states = np.repeat(starts[None], len(vectors), axis=0)
         steps = layout.step[place].copy()
         # Differences that stay within the limits.
         ahead = layout.clipped(vector + layout.step)[place] - vector[place]
         steps = np.where(np.abs(ahead) < 0.5 * steps, -steps, steps)
         vectors[1 + np.arange(num_free), place] += steps
+        wide = layout.ball_step[place[apart]]
+        vectors[1 + num_free + num_states + np.arange(len(apart)), place[apart]] += wide
         for i, d in enumerate(of_state):
             states[1 + num_free + i, :, d] += differences[d]
         predicted = problem.simulate(vectors, states)
         r = problem.whitened(problem.residuals(predicted), weights)
         now = float(np.sum(costs(r[:1], states[:1])) + of_prior(vector))
         by_unknown = np.moveaxis(r[1 : 1 + num_free] - r[0], 0, -1) / steps
-        by_state = np.moveaxis(r[1 + num_free :] - r[0], 0, -1) / own
+        by_state = np.moveaxis(r[1 + num_free : 1 + num_free + num_states] - r[0], 0, -1) / own
+        by_ball = np.moveaxis(
+            r[1 + num_free + num_states :, :, num_angles:] - r[0, :, num_angles:], 0, -1
+        )
+        by_unknown[:, num_angles:, apart] = by_ball / wide
         scale = prior[place]
         at_guess = (starts - guess)[:, of_state] / reach
         reduced = _eliminate(r[0], by_unknown * scale, by_state * reach, at_guess)

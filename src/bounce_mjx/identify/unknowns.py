@@ -16,23 +16,25 @@ class Unknown(NamedTuple):
     deviation: float
     """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
     step: float
-    """Difference at which derivatives are taken: small for latency and lag, which differ only in
-    the second order, and large where a bounce's instant moves, which a simulation rounds to its
-    steps."""
+    """Difference at which derivatives are taken."""
     unit: str
     stage: str
     """First stage of the search that varies it: arm, flight or bounce."""
     size: int | None = 0
     """Number of entries; 0 for a number, None for one of each joint."""
     limits: tuple[float, float] = (-np.inf, np.inf)
+    ball_step: float | None = None
+    """The difference for the pictures, if it is another one: it must move a bounce's instant by
+    more than the physics step to which a simulation rounds it. The arm's must be small, as latency
+    and lag differ only in the second order."""
 
 
 _JOINTS = None
 ARM = {
-    "action_latency": Unknown(0.02, 0.02, 2e-4, "s", "arm", limits=(0.0, 0.2)),
-    "servo_lag": Unknown(0.015, 0.02, 2e-4, "s", "arm", limits=(0.0, 0.2)),
+    "action_latency": Unknown(0.02, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
+    "servo_lag": Unknown(0.015, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
     "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0)),
-    "servo_damping": Unknown(1.0, 0.3, 0.01, "", "arm", _JOINTS, (0.05, 20.0)),
+    "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15),
     "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf)),
     "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0)),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
@@ -89,6 +91,12 @@ class Layout(NamedTuple):
     def step(self) -> np.ndarray:
         """Differences [P] for the derivatives."""
         return self._vector("step")
+
+    @property
+    def ball_step(self) -> np.ndarray:
+        """Differences [P] for the derivatives of the pictures."""
+        own = [u.step if u.ball_step is None else u.ball_step for u in self.unknowns.values()]
+        return np.repeat(own, [self._size(u) for u in self.unknowns.values()])
 
     def clipped(self, vector: np.ndarray) -> np.ndarray:
         """The vector [..., P] within the limits of each unknown."""
