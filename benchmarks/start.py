@@ -53,7 +53,6 @@ MODULES = (
     "bounce_mjx.training.ppo_trainer",
     "bounce_mjx.reports.page",
     "jax.experimental.pallas.mosaic_gpu",
-    "orbax.checkpoint",
     "tensorboardX",
 )
 

@@ -45,7 +45,7 @@ def main(folder: Path = Path("brax_ppo"), rollout_steps: int = 500, **settings: 
             save_checkpoint_path=folder.resolve(),
             **(adapter.ppo_settings() | settings),
         )
-    policy = jax.jit(adapter.load_policy(folder))
+    policy = jax.jit(adapter.load_brax_policy(folder))
     step, state, states = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0)), []
     for _ in range(rollout_steps):
         state = step(state, policy(state.obs, jax.random.key(0))[0])

@@ -23,7 +23,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.adapters.brax import (
     BraxBounceBall,
     device_put_replicated,
-    load_policy,
+    load_brax_policy,
     pmap_support,
 )
 from bounce_mjx.errors import UserError
@@ -260,13 +260,13 @@ def test_brax_checkpoint_has_the_trained_policy(ppo_example):
         x = x / (1.0 + np.exp(-x))
     expected = x @ policy["params"]["Dense_0"]["kernel"] + policy["params"]["Dense_0"]["bias"]
     for path in (folder, checkpoint):
-        action, _ = load_policy(path)(observation, jax.random.key(0))
+        action, _ = load_brax_policy(path)(observation, jax.random.key(0))
         np.testing.assert_allclose(action, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
     with pytest.raises(UserError, match="no checkpoint of brax's PPO; give"):
-        load_policy(tmp_path)
+        load_brax_policy(tmp_path)
 
 
 @pytest.mark.slow

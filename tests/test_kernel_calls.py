@@ -15,7 +15,6 @@ from jax.experimental.pallas import mosaic_gpu as plgpu
 from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, kernel_calls, rows
 from bounce_mjx.gpu.kernel_calls import call_kernel
-from bounce_mjx.gpu.scalars import as_scalars
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 
@@ -58,7 +57,6 @@ def lowered_kernels(monkeypatch) -> list:
         return kernels[-1]
 
     monkeypatch.setattr(kernel_calls, "_lower", lower)
-    monkeypatch.setattr(kernel_calls, "_kept", {})
     return kernels
 
 
@@ -99,14 +97,6 @@ def test_the_program_has_the_same_call_as_without(no_locations):
     assert ours == plain
 
 
-def test_a_kernel_is_lowered_again_unless_its_key_is_known(lowered_kernels):
-    for key, factor, count in ((None, 2.0, 1), (None, 2.0, 2), (("a",), 3.0, 3), (("a",), 3.0, 3)):
-        lowered_text(lambda x, f=factor, k=key: call_kernel(doubling(f), RESULTS, x, key=k))
-        assert len(lowered_kernels) == count
-    modules = [attributes["module"] for attributes in lowered_kernels]
-    assert modules[2] not in modules[:2]
-
-
 ON_DEVICES = """
 import jax, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -143,31 +133,3 @@ def test_a_training_on_a_gpu_lowers_each_kernel_once(lowered_kernels, monkeypatc
     assert not lowered_kernels
     text = training_text(trainer, state)
     assert len(lowered_kernels) == text.count("custom_call @mosaic_gpu") == 2
-
-
-def test_functions_with_other_numbers_are_other_kernels():
-    x = jax.ShapeDtypeStruct((2,), jnp.float32)
-
-    def digest(function) -> str:
-        return as_scalars(lambda x: [function(x)], [x]).digest
-
-    def loop(x: jax.Array, count: int, step: float) -> jax.Array:
-        return jax.lax.fori_loop(0, count, lambda _, x: x + step, x)
-
-    functions = [
-        lambda x: 2.0 * x,
-        lambda x: 3.0 * x,
-        lambda x: 2.0 + x,
-        lambda x: x * jnp.array([2.0, 3.0]),
-        lambda x: x * jnp.array([2.0, 4.0]),
-        lambda x: x - x[::-1],
-        lambda x: x[::-1] - x,
-        lambda x: loop(x, 3, 1.0),
-        lambda x: loop(x, 4, 1.0),
-        lambda x: loop(x, 3, 2.0),
-        lambda x: jnp.where(x > 0.0, x, 1.0),
-        lambda x: jnp.where(x > 0.0, x, 2.0),
-    ]
-    digests = [digest(function) for function in functions]
-    assert len(set(digests)) == len(functions)
-    assert digests == [digest(function) for function in functions]

@@ -357,7 +357,7 @@ def hook(event, args):
     if event == "os.putenv" and os.fsdecode(args[0]) not in known:
         print(args[0])
 sys.addaudithook(hook)
-for module in ("orbax.checkpoint", "tensorboardX", REPORT_MODULE):
+for module in ("tensorboardX", REPORT_MODULE):
     importlib.import_module(module)
 """
     environment = {k: v for k, v in os.environ.items() if k != "CRC32C_SW_MODE"}

@@ -509,28 +509,34 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
 # Starts
 
 
-# Each factor is read in a way in which a user's own code may read it: the reward's from a file, the
-# action's from the environment, and the loss's from the script itself.
+# Each factor is read in a way in which a user's own code may read it: those of a reward term and of
+# the networks from files, that of the environment's step from the environment, and that of the loss
+# from the script itself, which patches all four functions.
 CHANGED = """
 import os, sys
 from pathlib import Path
 import jax
 from bounce_mjx.commands.train import main
-from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning import networks, ppo
 from bounce_mjx.tasks.bounce_rewards import PaddleHomeReward
 from bounce_mjx.env.env import Env
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+def from_file(name):
+    return float(Path(__file__).with_name(f"{name}.factor").read_text())
 formula = PaddleHomeReward.value
-def from_file(*args):
-    return formula(*args) * float(Path(__file__).with_name("factor").read_text())
-PaddleHomeReward.value = from_file
+PaddleHomeReward.value = lambda *args: formula(*args) * from_file("term")
+silu = networks.nn.silu
+networks.nn.silu = lambda x: silu(x) * from_file("networks")
 step = Env.step
 def from_variable(self, state, action, *args):
     return step(self, state, action * float(os.environ["FACTOR"]), *args)
 Env.step = from_variable
-entropy = Gaussian.entropy
-Gaussian.entropy = lambda self: LOSS * entropy(self)
+loss = ppo.loss
+def from_script(*args):
+    total, metrics = loss(*args)
+    return total + (LOSS - 1.0) * metrics["loss/value"], metrics
+ppo.loss = from_script
 main(sys.argv[1:])
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
@@ -547,11 +553,12 @@ def test_only_an_equal_training_finds_its_programs(
     script = tmp_path / "changed.py"
 
     def start(name: str, **changed: str) -> tuple[int, int, bytes]:
-        factors = {"reward": "1.0", "action": "1.0", "loss": "1.0"} | changed
-        (tmp_path / "factor").write_text(factors["reward"])
-        monkeypatch.setenv("FACTOR", factors["action"])
+        factors = dict.fromkeys(("term", "networks", "step", "loss"), "1.0") | changed
+        for of_file in ("term", "networks"):
+            (tmp_path / f"{of_file}.factor").write_text(factors[of_file])
+        monkeypatch.setenv("FACTOR", factors["step"])
         script.write_text(CHANGED.replace("LOSS", factors["loss"]))
-        flags = [*TINY, "--entropy-cost", "0.01", "--total-steps", "64", "--no-report"]
+        flags = [*TINY, "--total-steps", "64", "--no-report"]
         flags += ["--log-dir", tmp_path / name]
         with job(tmp_path / f"{name}.log", *flags, script=script) as process:
             assert process.wait() == 0, process.said
@@ -563,7 +570,7 @@ def test_only_an_equal_training_finds_its_programs(
     _, _, trained = start("first")
     requests, hits, again = start("second")
     assert hits == requests > 0 and again == trained
-    for changed in ("reward", "action", "loss"):
+    for changed in ("term", "networks", "step", "loss"):
         assert start(changed, **{changed: "0.5"})[2] != trained
 
 

@@ -500,7 +500,7 @@ def test_a_crafted_report_is_refused(report: RobustnessReport, tmp_path: Path, c
     first = plain["outcomes"][0]
     plain["outcomes"] = [] if change is None else [first | change, first]
     (tmp_path / "robustness.json").write_text(json.dumps(plain))
-    with pytest.raises(UserError, match="robustness.json cannot be read"):
+    with pytest.raises(UserError, match="robustness.json is damaged"):
         load_robustness(tmp_path)
 
 
@@ -542,7 +542,7 @@ def test_report_page_shows_the_picture(
     page, _ = write_report(run, None)
     assert "Perturbed worlds" in page.read_text(encoding="utf-8")
     (run / "robustness.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(UserError, match="robustness.json cannot be read .*delete it"):
+    with pytest.raises(UserError, match="robustness.json is damaged .*delete it"):
         write_report(run, None)
 
 

@@ -498,7 +498,7 @@ def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) ->
     with pytest.raises(UserError) as error_info:
         load_results(tmp_path)
     sentence = str(error_info.value)
-    assert sentence.startswith(f"{path} is damaged (") and "delete it to go on" in sentence
+    assert sentence.startswith(f"{path} is damaged (") and "delete it to continue" in sentence
     assert "\n" not in sentence and len(sentence) < 500
 
 

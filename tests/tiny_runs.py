@@ -1,7 +1,6 @@
 """A run that is small enough for a test, and a process that trains one."""
 
 import contextlib
-import functools
 import os
 import subprocess
 import sys
@@ -9,9 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
-import orbax.checkpoint as ocp
+import tensorstore
 
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.folders import Checkpoint
@@ -30,11 +28,13 @@ TIMEOUT = 300.0
 def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """Every array of the training state in a checkpoint."""
     check_integrity(checkpoint.folder)
-    with ocp.StandardCheckpointer() as checkpointer:
-        tree = checkpointer.restore((checkpoint.folder / "training").absolute())
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    name = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
-    return {name(path): np.asarray(leaf) for path, leaf in leaves}
+    files = {"driver": "file", "path": f"{checkpoint.folder.absolute()}/training/"}
+    database = {"driver": "ocdbt", "base": files}
+    end = "/.zarray"
+    keys = map(bytes.decode, tensorstore.KvStore.open(database).result().list().result())
+    names = [key.removesuffix(end) for key in keys if key.endswith(end)]
+    specs = {n: {"driver": "zarr", "kvstore": database | {"path": f"{n}/"}} for n in names}
+    return {n: tensorstore.open(x).result().read().result() for n, x in specs.items()}
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

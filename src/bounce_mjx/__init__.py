@@ -1,5 +1,6 @@
 """A robot arm that learns to bounce a ball: an environment on JAX and MuJoCo, with PPO."""
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from bounce_mjx.adapters.gymnasium.registration import register_when_imported
@@ -13,25 +14,22 @@ __version__ = "0.1.0"
 
 __all__ = ["BounceBall", "EnvConfig", "__version__", "load_policy"]
 
+_PUBLIC = {
+    "BounceBall": ("bounce_mjx.tasks.bounce_ball", "BounceBall"),
+    "EnvConfig": ("bounce_mjx.tasks.bounce", "BounceConfig"),
+    "load_policy": ("bounce_mjx.deploy.loading", "load_policy"),
+}
+
 register_when_imported()
 
 
 def __getattr__(name: str) -> Any:
     """Imports the public names on first use (PEP 562): JAX takes two seconds to import, and a
     deployed policy does not need it."""
-    if name == "BounceBall":
-        from bounce_mjx.tasks.bounce_ball import BounceBall
-
-        return BounceBall
-    if name == "EnvConfig":
-        from bounce_mjx.tasks.bounce import BounceConfig
-
-        return BounceConfig
-    if name == "load_policy":
-        from bounce_mjx.deploy.loading import load_policy
-
-        return load_policy
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _PUBLIC[name]
+    return getattr(importlib.import_module(module), attribute)
 
 
 def __dir__() -> list[str]:

@@ -35,6 +35,7 @@ from bounce_mjx.physics.parameters import (
     PhysicsParameters,
     contact_pair,
     edited_fields,
+    entries,
     link_bodies,
     to_direct_solref,
 )
@@ -158,29 +159,24 @@ _CONTACT_FIELDS = {"geom_friction", "geom_solref", "pair_friction", "pair_solref
 def _sources(mj_model: mujoco.MjModel, pair: int | None) -> list[_Source]:
     """Every source of a parameter; `pair` is the contact pair, if a contact field varies."""
     m, addresses = mj_model, find_addresses(mj_model)
-    dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
-    paddle, geoms = addresses.paddle_geom, [addresses.ball_geom, addresses.paddle_geom]
+    geoms = [addresses.ball_geom, addresses.paddle_geom]
     links = link_bodies(m)
     ends = np.cumsum([len(bodies) for bodies in links])[:-1]
 
-    def alone(parameter: str) -> Callable[[Any, ModuleType], Fields]:
-        return lambda x, xp: {parameter: x}
+    def alone(parameter: str, sign: float = 1.0) -> Callable[[Any, ModuleType], Fields]:
+        return lambda x, xp: {parameter: sign * x}
 
     def contact(solref: Any, xp: ModuleType) -> Fields:
         direct = to_direct_solref(solref, m.opt.timestep, xp)
         return dict(zip(("contact_stiffness", "contact_damping"), direct, strict=True))
 
+    plain = {}
+    for name, field, index, sign in entries(addresses):
+        plain.setdefault(name, _Source(field, index, alone(name, sign)))
     return [
+        *plain.values(),
         _Source("body_mass", addresses.ball_body, alone("ball_mass")),
         _Source("geom_size", (addresses.ball_geom, 0), alone("ball_radius")),
-        _Source("actuator_gainprm", (servos, 0), alone("servo_gain")),
-        _Source("actuator_biasprm", (servos, 2), lambda x, xp: {"servo_damping": -x}),
-        _Source("actuator_forcerange", (servos, 1), alone("force_limit")),
-        _Source("dof_armature", dofs, alone("armature")),
-        _Source("dof_damping", dofs, alone("damping")),
-        _Source("dof_frictionloss", dofs, alone("frictionloss")),
-        _Source("geom_pos", paddle, alone("paddle_position")),
-        _Source("geom_quat", paddle, alone("paddle_rotation")),
         _Source("opt.gravity", slice(None), alone("gravity")),
         _Source(
             "body_mass",

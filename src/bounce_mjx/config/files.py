@@ -63,12 +63,15 @@ def dump_config(config: StrictModel) -> str:
 
 
 def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:
-    """Dotted names of the settings in which two configs of one type differ."""
-    keys = set()
-    for name in type(one).model_fields:
-        a, b = getattr(one, name), getattr(other, name)
-        if isinstance(a, StrictModel) and type(a) is type(b):
-            keys |= {f"{name}.{inner}" for inner in differing_keys(a, b)}
-        elif a != b:
-            keys.add(name)
-    return keys
+    """Dotted names of the settings in which two configs differ."""
+    a, b = flat(one.model_dump()), flat(other.model_dump())
+    return {key for key in a.keys() | b.keys() if a.get(key) != b.get(key)}
+
+
+def flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested mappings by their dotted names."""
+    values = {}
+    for key, value in plain.items():
+        name = prefix + key
+        values |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return values

@@ -46,7 +46,8 @@ def describe(
     if first["type"] == "value_error":
         reason = first["msg"].removeprefix("Value error, ")
         return ": ".join([*path[-1:], shorten(reason, 500)])
-    return f"{spell('.'.join(path))} is {_quote(first['input'])}, but must {_wanted(error)}"
+    given = shorten(_Repr().repr(first["input"]))
+    return f"{spell('.'.join(path))} is {given}, but must {_wanted(error)}"
 
 
 class _Repr(reprlib.Repr):
@@ -60,11 +61,6 @@ class _Repr(reprlib.Repr):
     def repr_int(self, x: int, level: int) -> str:
         # Python refuses to write an integer of many digits.
         return super().repr_int(x, level) if x.bit_length() < 1000 else "a very large number"
-
-
-def _quote(value: Any) -> str:
-    """A user's value, cut to fit into a sentence."""
-    return shorten(_Repr().repr(value))
 
 
 def _wanted(error: pydantic.ValidationError) -> str:

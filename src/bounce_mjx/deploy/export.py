@@ -27,12 +27,13 @@ from bounce_mjx.deploy.metadata import (
 )
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import Policy, act, make_networks
-from bounce_mjx.robot.model import find_addresses, joint_name, joint_names, load_model
+from bounce_mjx.robot.arm import joint_name
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.estimator import filter_constants, paddle_normal
+from bounce_mjx.world.estimator import filter_constants, upper_face
 from bounce_mjx.world.observation import ObservationConfig
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
@@ -219,7 +220,7 @@ def _hinges(
         )
         anchor = data.xanchor[joint]
     centre = data.geom_xpos[addresses.paddle_geom] - anchor
-    normal = data.xmat[body].reshape(3, 3) @ paddle_normal(m, default_joint_angles)
+    normal = data.xmat[body].reshape(3, 3) @ upper_face(m, default_joint_angles)[0]
     return tuple(links), tuple(centre.tolist()), tuple(normal.tolist())
 
 

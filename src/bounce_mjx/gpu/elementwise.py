@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
+from jax.experimental.custom_partitioning import custom_partitioning
 from jax.extend.core import Primitive
 from jax.interpreters import mlir
-from jax.sharding import PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec
 
 from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.batches import batch_by, partition_by
-from bounce_mjx.gpu.kernel_calls import Key, call_kernel
+from bounce_mjx.gpu.kernel_calls import call_kernel
 from bounce_mjx.gpu.scalars import UnsupportedOperation, as_scalars
 
 Arrays = tuple[jax.Array, ...]
@@ -117,10 +117,8 @@ def in_one_kernel(function: Callable[..., Tree], interpret: bool = False) -> Cal
             results=tuple(scalar_function.positions),
             dtypes=tuple(scalar_function.dtypes),
         )
-        key = "elementwise", scalar_function.digest
-        run = _in_kernel_for_batches(flat_function, on_floats, layout, interpret, key)
-        results = run(*leaves)
-        return result_tree[-1].unflatten(results)
+        run = _in_kernel_for_batches(flat_function, on_floats, layout, interpret)
+        return result_tree[-1].unflatten(run(*leaves))
 
     return wrapped
 
@@ -184,22 +182,28 @@ def _in_kernel_for_batches(
     on_rows: ElementwiseFunction,
     layout: RowLayout,
     interpret: bool,
-    key: Key | None = None,
 ) -> Callable[..., Arrays]:
     """`function` of small arrays, with a GPU kernel for its batches.
 
     Args:
       on_rows: computes it for rows: the used entries of the arguments -> the rows of the results.
-      key: see `call_kernel`.
     """
 
-    def on_batch(*args: jax.Array) -> Arrays:
+    @jax.custom_batching.custom_vmap
+    def call(*args: jax.Array) -> Arrays:
         if args[0].ndim == layout.used[0].ndim:
             return tuple(function(*args))
         rows = layout.pack(args)
-        return layout.unpack(in_kernel(on_rows, len(layout.dtypes), rows, interpret, key))
+        return layout.unpack(in_kernel(on_rows, len(layout.dtypes), rows, interpret))
 
-    call = batch_by(on_batch, lambda *args: call(*args))
+    @call.def_vmap
+    def batch(axis_size: int, in_batched: list[bool], *args: jax.Array):
+        args = [
+            x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            for x, is_batched in zip(args, in_batched, strict=True)
+        ]
+        results = call(*args)
+        return results, (True,) * len(results)
 
     @jax.custom_jvp
     def differentiable(*args: jax.Array) -> Arrays:
@@ -232,35 +236,30 @@ def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
 
 
 def in_kernel(
-    function: ElementwiseFunction,
-    num_results: int,
-    rows: jax.Array,
-    interpret: bool = False,
-    key: Key | None = None,
+    function: ElementwiseFunction, num_results: int, rows: jax.Array, interpret: bool = False
 ) -> jax.Array:
     """Runs `function` of rows [R, ...] in one kernel, and returns its results as rows; with several
-    devices, each computes its shard.
-
-    Args:
-      key: see `call_kernel`.
-    """
+    devices, each computes its shard."""
 
     def run(rows: jax.Array) -> jax.Array:
         if interpret:
-            return _run_in_kernel(rows, function, num_results, key, interpret)
+            return _run_in_kernel(rows, function, num_results, interpret)
         # `jax.jit`, because the primitive has no implementation outside compiled programs.
-        bind = functools.partial(
-            _elementwise.bind, function=function, num_results=num_results, key=key
-        )
+        bind = functools.partial(_elementwise.bind, function=function, num_results=num_results)
         return jax.jit(bind)(rows)
 
-    def specs(packed: PartitionSpec) -> tuple[tuple[PartitionSpec], PartitionSpec]:
-        kept = PartitionSpec(None, *packed[1:])
-        return (kept,), kept
+    def partition(mesh, arg_shapes, result_shape):
+        kept = NamedSharding(mesh, PartitionSpec(None, *arg_shapes[0].sharding.spec[1:]))
+        return mesh, run, kept, (kept,)
 
     axes = " ".join(f"b{i}" for i in range(rows.ndim - 1))
-    rule = f"rows {axes} -> results {axes}"
-    return partition_by(run, specs, rule, ("rows", "results"))(rows)
+    partitioned = custom_partitioning(run)
+    partitioned.def_partition(
+        partition=partition,
+        sharding_rule=f"rows {axes} -> results {axes}",
+        need_replication_factors=("rows", "results"),
+    )
+    return partitioned(rows)
 
 
 # `jax.lax.platform_dependent` would trace the kernel and the function at once, and again for each
@@ -279,11 +278,7 @@ def _run_by_xla(packed: jax.Array, function: ElementwiseFunction, **_: object) -
 
 
 def _run_in_kernel(
-    packed: jax.Array,
-    function: ElementwiseFunction,
-    num_results: int,
-    key: Key | None,
-    interpret: bool = False,
+    packed: jax.Array, function: ElementwiseFunction, num_results: int, interpret: bool = False
 ) -> jax.Array:
     """Arguments [rows, ...] -> results [num_results, ...]."""
     from jax.experimental import pallas as pl
@@ -325,7 +320,7 @@ def _run_in_kernel(
         )
     flat = packed.reshape(num_rows, size)
     padded = jnp.pad(flat, ((0, 0), (0, num_blocks * _BLOCK - size)))
-    results = run(padded) if interpret else call_kernel(run, out_type, padded, key=key)
+    results = run(padded) if interpret else call_kernel(run, out_type, padded)
     return results[:, :size].reshape(num_results, *batch)
 
 

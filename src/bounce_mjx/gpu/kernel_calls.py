@@ -8,7 +8,7 @@ as a program of its own; the program around it only names it.
 
 import contextlib
 import threading
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -17,29 +17,20 @@ from jax.extend.core import Primitive
 from jax.interpreters import mlir
 
 _TARGET = "mosaic_gpu_v2"
-# Kernels that are kept for a second call.
-_MOST_KEPT = 8
 
-Key = tuple[Hashable, ...]
 Shapes = tuple[jax.ShapeDtypeStruct, ...]
 Attributes = dict[str, bytes | bool]
 """A lowered kernel, as XLA takes it."""
 
-_kept: dict[Hashable, Attributes] = {}
 
-
-def call_kernel(
-    kernel: Callable[..., Any], results: Any, *args: jax.Array, key: Key | None = None
-) -> Any:
+def call_kernel(kernel: Callable[..., Any], results: Any, *args: jax.Array) -> Any:
     """Calls a kernel of `plgpu.kernel`; only in compiled programs.
 
     Args:
       results: shapes of its results, in the structure in which the kernel returns them.
-      key: stands for this kernel and no other; its kind comes first. A second call then need not
-        lower the kernel again.
     """
     leaves, structure = jax.tree.flatten(results)
-    called = _kernel_call.bind(*args, kernel=kernel, key=key, results=tuple(leaves))
+    called = _kernel_call.bind(*args, kernel=kernel, results=tuple(leaves))
     return structure.unflatten(called)
 
 
@@ -71,21 +62,10 @@ def _call_plain(*args: jax.Array, kernel: Callable[..., Any], **_: object) -> Se
 
 
 def _call_lowered(
-    *args: jax.Array, kernel: Callable[..., Any], key: Key | None, results: Shapes
+    *args: jax.Array, kernel: Callable[..., Any], results: Shapes
 ) -> Sequence[jax.Array]:
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args)
-    attributes = _kept_or_lowered(kernel, shapes, key)
-    return jax.ffi.ffi_call(_TARGET, results)(*args, **attributes)
-
-
-def _kept_or_lowered(kernel: Callable[..., Any], shapes: Shapes, key: Key | None) -> Attributes:
-    if key is None:
-        return _lower(kernel, shapes)
-    attributes = _kept.get((key, shapes)) or _lower(kernel, shapes)
-    _kept[key, shapes] = attributes
-    if len(_kept) > _MOST_KEPT:
-        del _kept[next(iter(_kept))]
-    return attributes
+    return jax.ffi.ffi_call(_TARGET, results)(*args, **_lower(kernel, shapes))
 
 
 def _lower(kernel: Callable[..., Any], shapes: Shapes) -> Attributes:

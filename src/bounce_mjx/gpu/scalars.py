@@ -8,10 +8,9 @@ scalars alone.
 """
 
 import functools
-import hashlib
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -69,8 +68,6 @@ class ScalarFunction(NamedTuple):
     """Type of each of those scalars."""
     used: list[bool]
     """For each scalar of the arguments, whether it influences a result."""
-    digest: str
-    """The same for functions of the same operations, also in another process."""
 
 
 def as_scalars(
@@ -104,40 +101,7 @@ def as_scalars(
         positions=positions,
         dtypes=[v.aval.dtype for v in trace.jaxpr.outvars],
         used=[v in needed for v in trace.jaxpr.invars],
-        digest=_digest(trace),
     )
-
-
-def _digest(trace: ClosedJaxpr) -> str:
-    """A hash of all operations of a trace, and of their operands."""
-    text = hashlib.sha256()
-
-    def add(jaxpr: Jaxpr, consts: Sequence[Any]) -> None:
-        numbers: dict[Any, int] = {}
-
-        def of(v: Any) -> tuple:
-            if isinstance(v, Literal):
-                return v.aval.dtype.name, np.asarray(v.val).tobytes()
-            return numbers.setdefault(v, len(numbers)), v.aval.dtype.name, v.aval.shape
-
-        given = [np.asarray(c) for c in consts]
-        parts = [[of(v) for v in jaxpr.invars + jaxpr.constvars], [x.tobytes() for x in given]]
-        for equation in jaxpr.eqns:
-            plain = {}
-            for name, value in sorted(equation.params.items()):
-                inner = value if isinstance(value, tuple) else (value,)
-                if any(isinstance(x, Jaxpr | ClosedJaxpr) for x in inner):
-                    for x in inner:
-                        closed = isinstance(x, ClosedJaxpr)
-                        add(x.jaxpr if closed else x, x.consts if closed else ())
-                else:
-                    plain[name] = value
-            operands = [of(v) for v in equation.invars], [of(v) for v in equation.outvars]
-            parts.append((equation.primitive.name, plain, operands))
-        text.update(repr((parts, [of(v) for v in jaxpr.outvars])).encode())
-
-    add(trace.jaxpr, trace.consts)
-    return text.hexdigest()
 
 
 def _needed(jaxpr: Jaxpr) -> set:
@@ -149,7 +113,8 @@ def _needed(jaxpr: Jaxpr) -> set:
     return needed
 
 
-def _filled(shape: tuple[int, ...], values) -> Scalars:
+def _filled(shape: tuple[int, ...], values: Iterator[Scalar]) -> Scalars:
+    """An array of the next values."""
     array = np.empty(shape, object)
     for index in np.ndindex(*shape):
         array[index] = next(values)
@@ -158,18 +123,18 @@ def _filled(shape: tuple[int, ...], values) -> Scalars:
 
 def _constant(value: Any) -> Scalars:
     value = np.asarray(value)
-    array = np.empty(value.shape, object)
-    for index in np.ndindex(*value.shape):
-        array[index] = value[index]
-    return array
+    return _filled(value.shape, iter(value.flat))
 
 
 def _each(operation: Callable[..., Scalar], *arrays: Scalars) -> Scalars:
     """Applies an operation of scalars to arrays of one shape."""
-    result = np.empty(arrays[0].shape, object)
-    for index in np.ndindex(*result.shape):
-        result[index] = operation(*(a[index] for a in arrays))
-    return result
+    return _filled(arrays[0].shape, map(operation, *(a.flat for a in arrays)))
+
+
+def _each_row(operation: Callable[[Scalars], Scalar], rows: Scalars) -> Scalars:
+    """Applies an operation to each row [n] of an array [..., n]."""
+    shape = rows.shape[:-1]
+    return _filled(shape, (operation(rows[index]) for index in np.ndindex(*shape)))
 
 
 def _evaluate(jaxpr: Jaxpr, consts: Sequence[Scalars], args: Sequence[Scalars]) -> list[Scalars]:
@@ -238,10 +203,7 @@ def _same_rank(args: list[Scalars]) -> list[Scalars]:
 def _reduce(operation: Callable[..., Scalar], array: Scalars, axes: Sequence[int]) -> Scalars:
     kept = [i for i in range(array.ndim) if i not in axes]
     rows = array.transpose(*kept, *axes).reshape([array.shape[i] for i in kept] + [-1])
-    result = np.empty(rows.shape[:-1], object)
-    for index in np.ndindex(*result.shape):
-        result[index] = functools.reduce(operation, rows[index])
-    return result
+    return _each_row(functools.partial(functools.reduce, operation), rows)
 
 
 def _dot(a: Scalars, b: Scalars, *, dimension_numbers, **_) -> Scalars:
@@ -283,11 +245,7 @@ def _arg_extreme(is_better: Callable[..., Scalar]) -> Callable[..., Scalars]:
                 index = jnp.where(wins, index_dtype.type(i), index)
             return index
 
-        rows = np.moveaxis(x, axis, -1)
-        result = np.empty(rows.shape[:-1], object)
-        for place in np.ndindex(*result.shape):
-            result[place] = first(rows[place])
-        return result
+        return _each_row(first, np.moveaxis(x, axis, -1))
 
     return index_of_extreme
 
@@ -380,10 +338,6 @@ def _scan(equation, args: list[Scalars]) -> list[Scalars]:
     return [_filled(a.shape, end) for a in carry]
 
 
-def _logistic(x: Scalar) -> Scalar:
-    return 1.0 / (1.0 + jnp.exp(-x))
-
-
 def _sqrt(x: Scalar) -> Scalar:
     regular = (x > 0.0) & (x < jnp.inf)
     root = x * lax.rsqrt(jnp.where(regular, x, 1.0))
@@ -457,18 +411,10 @@ def _atan2(y: Scalar, x: Scalar) -> Scalar:
     return jnp.where((x != x) | (y != y), jnp.nan, angle)
 
 
-def _asin(x: Scalar) -> Scalar:
-    return _atan2(x, _sqrt((1.0 - x) * (1.0 + x)))
-
-
-def _acos(x: Scalar) -> Scalar:
-    return _atan2(_sqrt((1.0 - x) * (1.0 + x)), x)
-
-
 # Operations that Mosaic GPU does not compile, expressed with operations that it does.
 _REWRITTEN: dict[str, Callable[..., Scalar]] = {
-    "acos": _acos,
-    "asin": _asin,
+    "acos": lambda x: _atan2(_sqrt((1.0 - x) * (1.0 + x)), x),
+    "asin": lambda x: _atan2(x, _sqrt((1.0 - x) * (1.0 + x))),
     "atan": _atan,
     "atan2": _atan2,
     "ceil": lambda x: -_floor(-x),
@@ -479,7 +425,7 @@ _REWRITTEN: dict[str, Callable[..., Scalar]] = {
     "floor": _floor,
     "is_finite": lambda x: jnp.abs(x) < jnp.inf,
     "log1p": _log1p,
-    "logistic": _logistic,
+    "logistic": lambda x: 1.0 / (1.0 + jnp.exp(-x)),
     "pow": _pow,
     "rem": _rem,
     "sinh": lambda x: 0.5 * (_expm1(x) - _expm1(-x)),

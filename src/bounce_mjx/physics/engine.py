@@ -48,15 +48,17 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     beyond_fused = fused.unsupported_feature(mj_model)
     if is_fused(mj_model, choice):
         if beyond_fused is not None:
-            raise UserError(_refusal(beyond_fused, _beyond_mjx(mj_model), "fused"))
+            beyond_mjx = _mjx_engine().unsupported_feature(mj_model)
+            raise UserError(_refusal(beyond_fused, beyond_mjx, "fused"))
         reason = "the model qualifies" if choice == "auto" else "chosen by --physics fused"
         warning = solver_warning(mj_model)
         return _engine("fused", reason, fused, mj_model, () if warning is None else (warning,))
-    beyond_mjx = _beyond_mjx(mj_model)
+    mjx = _mjx_engine()
+    beyond_mjx = mjx.unsupported_feature(mj_model)
     if beyond_mjx is not None:
         raise UserError(_refusal(beyond_fused, beyond_mjx, "mjx"))
     reason = "chosen by --physics mjx" if choice == "mjx" else _lacks("fused", beyond_fused)
-    return _engine("mjx", reason, _mjx_engine(), mj_model, ())
+    return _engine("mjx", reason, mjx, mj_model, ())
 
 
 def _engine(
@@ -110,10 +112,6 @@ def _check_supported_parameters(
                     f'noslip_iterations="{mj_model.opt.noslip_iterations}"; set it to 0 or leave '
                     "this friction out"
                 )
-
-
-def _beyond_mjx(mj_model: mujoco.MjModel) -> str | None:
-    return _mjx_engine().unsupported_feature(mj_model)
 
 
 def _mjx_engine() -> ModuleType:

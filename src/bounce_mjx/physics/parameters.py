@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import raise_solver_limits
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 Array = np.ndarray | jax.Array
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
@@ -67,24 +67,11 @@ MODEL_PARAMETERS = PhysicsParameters()
 
 def shapes(num_joints: int) -> PhysicsParameters:
     """Shape of each parameter for one environment."""
-    per_joint = (num_joints,)
-    return PhysicsParameters(
-        ball_mass=(),
-        ball_radius=(),
-        contact_stiffness=(),
-        contact_damping=(),
-        contact_friction=(),
-        servo_gain=per_joint,
-        servo_damping=per_joint,
-        force_limit=per_joint,
-        armature=per_joint,
-        damping=per_joint,
-        frictionloss=per_joint,
-        link_mass=per_joint,
-        paddle_position=(3,),
-        paddle_rotation=(4,),
-        gravity=(3,),
-    )
+    per_joint = "servo_gain servo_damping force_limit armature damping frictionloss link_mass"
+    sizes = dict.fromkeys(per_joint.split(), num_joints)
+    sizes |= {"paddle_position": 3, "paddle_rotation": 4, "gravity": 3}
+    names = PhysicsParameters._fields
+    return PhysicsParameters(*((sizes[name],) if name in sizes else () for name in names))
 
 
 def check_shapes(parameters: PhysicsParameters, num_joints: int) -> None:
@@ -115,18 +102,20 @@ def edited_fields(
     edited = _Fields(mj_model)
     _edit_balls(edited, parameters)
     _edit_contacts(edited, parameters)
-    _edit_arm(edited, parameters)
-    p, paddle = parameters, find_addresses(mj_model).paddle_geom
+    _edit_links(edited, parameters)
+    p, addresses = parameters, edited.addresses
+    for name, field, index, sign in entries(addresses):
+        if (value := getattr(p, name)) is not None:
+            edited.put(field, index, sign * value)
+    if p.force_limit is not None:
+        edited.put("actuator_forcelimited", np.array(addresses.actuators), True)
     if p.ball_mass is not None or p.link_mass is not None:
         mass = edited.current("body_mass")
         edited.fields["body_subtreemass"] = _subtree_masses(mj_model, mass)
-    if p.paddle_position is not None:
-        edited.put("geom_pos", paddle, p.paddle_position)
-    if p.paddle_rotation is not None:
-        edited.put("geom_quat", paddle, p.paddle_rotation)
     if p.paddle_position is not None or p.paddle_rotation is not None:
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
-        edited.put("geom_sameframe", paddle, int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE))
+        without = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        edited.put("geom_sameframe", addresses.paddle_geom, without)
     return edited.fields, {} if p.gravity is None else {"gravity": p.gravity}
 
 
@@ -134,7 +123,7 @@ class _Fields:
     """New arrays for some fields of a model."""
 
     def __init__(self, mj_model: mujoco.MjModel):
-        self.model = mj_model
+        self.model, self.addresses = mj_model, find_addresses(mj_model)
         self.fields: dict[str, Array] = {}
 
     def current(self, field: str) -> Array:
@@ -149,7 +138,7 @@ class _Fields:
 
 def _edit_balls(edited: _Fields, p: PhysicsParameters) -> None:
     m = edited.model
-    for ball in find_addresses(m).balls:
+    for ball in edited.addresses.balls:
         if p.ball_mass is not None:
             ratio = p.ball_mass / m.body_mass[ball.body]
             edited.put("body_mass", ball.body, p.ball_mass)
@@ -185,33 +174,35 @@ def _edit_contacts(edited: _Fields, p: PhysicsParameters) -> None:
             edited.put("pair_friction", (pair, slice(0, 2)), friction)
 
 
-def _edit_arm(edited: _Fields, p: PhysicsParameters) -> None:
-    m, addresses = edited.model, find_addresses(edited.model)
+def _edit_links(edited: _Fields, p: PhysicsParameters) -> None:
+    if p.link_mass is None:
+        return
+    m, links = edited.model, link_bodies(edited.model)
+    bodies = np.concatenate(links)
+    joints = np.repeat(np.arange(len(links)), [len(link) for link in links])
+    moved = m.body_mass[bodies] > 0.0
+    bodies, joints = bodies[moved], joints[moved]
+    mass, old_mass = p.link_mass[joints], link_masses(m)[joints]
+    edited.put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
+    edited.scale("body_inertia", bodies, (mass / old_mass)[:, None])
+
+
+def entries(addresses: Addresses) -> tuple[tuple[str, str, Any, float], ...]:
+    """The entries of a model that hold a parameter as it is, up to its sign: the parameter, the
+    model's field, the index in it and the sign. Where several hold one, the first is read."""
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
-    if p.servo_gain is not None:
-        edited.put("actuator_gainprm", (servos, 0), p.servo_gain)
-        edited.put("actuator_biasprm", (servos, 1), -p.servo_gain)
-    if p.servo_damping is not None:
-        edited.put("actuator_biasprm", (servos, 2), -p.servo_damping)
-    if p.force_limit is not None:
-        edited.put("actuator_forcelimited", servos, True)
-        edited.put("actuator_forcerange", (servos, 0), -p.force_limit)
-        edited.put("actuator_forcerange", (servos, 1), p.force_limit)
-    if p.armature is not None:
-        edited.put("dof_armature", dofs, p.armature)
-    if p.damping is not None:
-        edited.put("dof_damping", dofs, p.damping)
-    if p.frictionloss is not None:
-        edited.put("dof_frictionloss", dofs, p.frictionloss)
-    if p.link_mass is not None:
-        links = link_bodies(m)
-        bodies = np.concatenate(links)
-        joints = np.repeat(np.arange(len(links)), [len(link) for link in links])
-        moved = m.body_mass[bodies] > 0.0
-        bodies, joints = bodies[moved], joints[moved]
-        mass, old_mass = p.link_mass[joints], link_masses(m)[joints]
-        edited.put("body_mass", bodies, mass * (m.body_mass[bodies] / old_mass))
-        edited.scale("body_inertia", bodies, (mass / old_mass)[:, None])
+    return (
+        ("servo_gain", "actuator_gainprm", (servos, 0), 1.0),
+        ("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
+        ("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
+        ("force_limit", "actuator_forcerange", (servos, 1), 1.0),
+        ("force_limit", "actuator_forcerange", (servos, 0), -1.0),
+        ("armature", "dof_armature", dofs, 1.0),
+        ("damping", "dof_damping", dofs, 1.0),
+        ("frictionloss", "dof_frictionloss", dofs, 1.0),
+        ("paddle_position", "geom_pos", addresses.paddle_geom, 1.0),
+        ("paddle_rotation", "geom_quat", addresses.paddle_geom, 1.0),
+    )
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:

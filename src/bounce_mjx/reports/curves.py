@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
@@ -124,12 +125,12 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
 
 def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     """The settings that affect the training, by dotted name."""
-    flat = _flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
+    settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
     # The paths of the run's own copies would make every run a group of its own.
-    flat["task"] = identify_task(config.task)
+    settings["task"] = identify_task(config.task)
     if config.env.mjcf is not None:
-        flat["env.mjcf"] = identify_robot(config.env.mjcf, run)
-    return flat
+        settings["env.mjcf"] = identify_robot(config.env.mjcf, run)
+    return settings
 
 
 def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,15 +144,6 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
         steps = np.intersect1d(steps, curve.steps)
     values = np.stack([curve.values[np.isin(curve.steps, steps)] for curve in curves])
     return steps, values.mean(axis=0), values.std(axis=0)
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings in groups as settings by dotted name."""
-    flat = {}
-    for name, value in settings.items():
-        name = prefix + name
-        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return flat
 
 
 def _label(differences: dict[str, Any], seeds: Sequence[int]) -> str:

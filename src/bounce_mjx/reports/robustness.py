@@ -15,12 +15,11 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
 from bounce_mjx.reports.figures import literal, style
 from bounce_mjx.reports.tables import short_text
-from bounce_mjx.runs.files import read_json
+from bounce_mjx.runs.files import read_stored
 
 ROBUSTNESS_FILE = "robustness.json"
 
@@ -40,16 +39,8 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
     Raises:
       UserError: the file is damaged.
     """
-    path = folder / ROBUSTNESS_FILE
-    if not path.is_file():
-        return None
-    try:
-        return read_json(path, RobustnessReport)
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}); delete it, or write it again with bounce-mjx "
-            "robustness"
-        ) from error
+    remedy = "delete it, or write it again with bounce-mjx robustness"
+    return read_stored(folder / ROBUSTNESS_FILE, RobustnessReport, remedy)
 
 
 def summary(report: RobustnessReport) -> str:

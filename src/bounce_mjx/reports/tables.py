@@ -31,9 +31,9 @@ class _Detail(NamedTuple):
     is_mean: bool
 
 
-def figure_text(value: float | None, spec: str = ".2f", scale: float = 1.0) -> str:
-    """A measured figure times `scale`, as text; "-" if there was nothing to measure."""
-    return "-" if value is None else f"{scale * value:{spec}}"
+def figure_text(value: float | None, spec: str = ".2f") -> str:
+    """A measured figure as text; "-" if there was nothing to measure."""
+    return "-" if value is None else f"{value:{spec}}"
 
 
 def short_text(value: float | None) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError, install_command, reason_of, shorten
+from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.limits import check_files
@@ -97,13 +97,8 @@ def _in_package(name: str) -> Path:
 
 
 def _in_menagerie(name: str) -> Path:
-    try:
+    with needed("mujoco-menagerie", "bounce_mjx[robots]"):
         import mujoco_menagerie
-    except ImportError as error:
-        raise UserError(
-            f"the package mujoco-menagerie is missing, which menagerie:{shorten(name)} needs; "
-            f"install it with: {install_command('bounce_mjx[robots]')}"
-        ) from error
     robot, _, entry = name.partition("/")
     try:
         found = mujoco_menagerie.get(robot)
@@ -239,10 +234,12 @@ class _Builder:
         balls = [j for j in on_chain if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL]
         if balls:
             raise UserError(
-                f"the ball joint {_name(model, balls[0])} in the arm; give an arm of hinges and "
-                "slides"
+                f"the ball joint {joint_name(model, balls[0])} in the arm; give an arm of hinges "
+                "and slides"
             )
-        names = {_name(model, j): j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)}
+        names = {
+            joint_name(model, j): j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
+        }
         site = shorten(self._config.site)
         for name in given or ():
             if name not in names:
@@ -252,7 +249,7 @@ class _Builder:
                 )
         acting = [j for name, j in names.items() if given is None or name in given]
         if len(acting) < MIN_JOINTS:
-            have = _listed(_name(model, j) for j in acting) if acting else "none"
+            have = _listed(joint_name(model, j) for j in acting) if acting else "none"
             remedy = _other_sites(model) if given is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
@@ -270,7 +267,7 @@ class _Builder:
         for a in range(model.nactuator):
             if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
                 actuators.setdefault(int(model.actuator_trnid[a, 0]), []).append(a)
-        idle = [_name(model, joint) for joint in joints if joint not in actuators]
+        idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
                 f"no actuator on {_listed(idle)}; add one, or name the acting joints with --joints"
@@ -308,15 +305,15 @@ class _Builder:
         ]
         bodies = model.jnt_bodyid.tolist()
         beside = [
-            _name(model, j)
+            joint_name(model, j)
             for j in sorted(actuators)
             if bodies[j] not in chain and not _is_below(model, bodies[j], branches)
         ]
         if beside:
             raise UserError(
                 f"{len(beside)} driven joints ({_listed(beside)}) in addition to the arm "
-                f"{_listed(_name(model, j) for j in joints)}; give an MJCF with nothing but one "
-                "arm on a fixed base"
+                f"{_listed(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
+                "one arm on a fixed base"
             )
         return [b for b in branches if any(_is_below(model, body, [b]) for body in bodies)]
 
@@ -355,7 +352,7 @@ class _Builder:
             joint, dof = parts[i], model.jnt_dofadr[i]
             if np.any(joint.range) and not model.jnt_limited[i]:
                 self._changes.append(
-                    f"ignored the range of {_name(model, i)}, which is not limited"
+                    f"ignored the range of {joint_name(model, i)}, which is not limited"
                 )
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             joint.range = model.jnt_range[i] if model.jnt_limited[i] else np.zeros(2)
@@ -406,7 +403,7 @@ class _Builder:
             if j not in joints and not _is_below(model, int(body), gripper + objects)
         ]
         if fixed:
-            names = _listed(_name(model, j) for j in fixed)
+            names = _listed(joint_name(model, j) for j in fixed)
             self._changes.append(f"fixed the joints that do not act: {names}")
         for element in [parts[j] for j in fixed] + [bodies[b] for b in gripper + objects]:
             arm.delete(element)
@@ -605,7 +602,8 @@ def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> str:
     return ", ".join(different)
 
 
-def _name(model: mujoco.MjModel, joint: int) -> str:
+def joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Name of a joint; an unnamed joint has its index for a name."""
     return model.joint(joint).name or f"joint{joint}"
 
 

@@ -17,6 +17,7 @@ from bounce_mjx.robot.arm import (
     PADDLE_GEOM_NAME,
     build_arm,
     compile_spec,
+    joint_name,
     locate,
     read_spec,
 )
@@ -241,9 +242,12 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
+    body = mujoco.mjtObj.mjOBJ_BODY
     balls = [_find_ball(mj_model, BALL_BODY_NAME)]
-    while len(balls) < MAX_BALLS and _has_body(mj_model, ball_name(len(balls))):
-        balls.append(_find_ball(mj_model, ball_name(len(balls))))
+    for name in map(ball_name, range(1, MAX_BALLS)):
+        if mujoco.mj_name2id(mj_model, body, name) < 0:
+            break
+        balls.append(_find_ball(mj_model, name))
     paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
     servos = _servos(mj_model)
     joints = tuple(servos)
@@ -271,15 +275,6 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
         qpos=tuple(range(qpos, qpos + 7)),
         qvel=tuple(range(qvel, qvel + 6)),
     )
-
-
-def _has_body(mj_model: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
-
-
-def joint_name(mj_model: mujoco.MjModel, joint: int) -> str:
-    """Name of a joint; an unnamed joint has its index for a name."""
-    return mj_model.joint(joint).name or f"joint{joint}"
 
 
 def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.model import Addresses, find_addresses, joint_name
+from bounce_mjx.robot.arm import joint_name
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 # Length that makes rotations comparable with displacements: about a forearm, m/rad.
 _LENGTH = 0.25

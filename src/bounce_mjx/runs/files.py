@@ -49,6 +49,23 @@ def read_json(path: Path, model: type[ModelT]) -> ModelT:
         raise ValueError(f"{path.name} is nested too deeply") from error
 
 
+def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
+    """The content of a JSON file that a command wrote; None if there is none.
+
+    Args:
+      remedy: the end of the error.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return read_json(path, model)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({error}); {remedy}") from error
+
+
 def first_mistake(error: pydantic.ValidationError) -> str:
     """First validation error in stored data, on one line: its place and the expected type."""
     first = error.errors(include_url=False, include_input=False)[0]
@@ -66,10 +83,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 def write_output(path: Path, content: str | bytes) -> None:
     """Writes a file that the user named, like `write_atomically`; a device or a pipe, such as
     /dev/stdout, stays one."""
-    if path.exists() and not path.is_file():
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    else:
-        write_atomically(path, content)
+    content = content.encode() if isinstance(content, str) else content
+    is_special = path.exists() and not path.is_file()
+    (Path.write_bytes if is_special else write_atomically)(path, content)
 
 
 @contextlib.contextmanager
@@ -88,16 +104,27 @@ def writable(path: Path, advice: str) -> Iterator[None]:
         raise UserError(f"{path} cannot be written ({error.strerror}); {advice}") from error
 
 
-def check_output(path: Path | None, flag: str) -> None:
+def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -> None:
     """Fails before the work if a file that the user named with a flag could not be written.
 
+    Args:
+      suffixes: the ends of the name that it may have; by default, any.
+
     Raises:
-      UserError: it is a folder, or in one that does not exist.
+      UserError: it has another suffix, may not be written, is a folder, or is in one that does not
+        exist.
     """
-    if path is not None and not os.path.isdir(path.absolute().parent):
+    if path is None:
+        return
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
+    folder = path.absolute().parent
+    if not os.path.isdir(folder):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
-    if path is not None and os.path.isdir(path):
+    if os.path.isdir(path):
         raise UserError(f"{flag} {path} is a folder; give a file")
+    if not os.access(path if os.path.exists(path) else folder, os.W_OK):
+        raise UserError(f"{flag} {path} may not be written; give another file")
 
 
 def sync(path: Path) -> None:

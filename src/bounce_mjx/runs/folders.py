@@ -8,8 +8,8 @@
         results.json                    all evaluations, and the time of each activity
         checkpoints/latest/<steps>/     the newest state
         checkpoints/best/<steps>/       the state with the best evaluation
-            policy/                     the policy, written by orbax
-            training/                   the training state, written by orbax; optional
+            policy/                     the policy's arrays (zarr in OCDBT)
+            training/                   the training state's arrays; optional
             run.json                    the steps, the config, the evaluations so far
             manifest.json               size and SHA-256 of every other file
 

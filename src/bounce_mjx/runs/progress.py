@@ -8,7 +8,7 @@ from pydantic import Field
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Figure, Report
-from bounce_mjx.runs.files import first_mistake, read_json
+from bounce_mjx.runs.files import first_mistake, read_stored
 
 RESULTS_FILE = "results.json"
 
@@ -83,13 +83,7 @@ def load_results(run: Path) -> Results | None:
     Raises:
       UserError: the file is damaged.
     """
-    path = run / RESULTS_FILE
-    if not path.is_file():
-        return None
-    try:
-        return read_json(path, Results)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} is damaged ({error}); delete it to continue without it") from error
+    return read_stored(run / RESULTS_FILE, Results, "delete it to continue without it")
 
 
 class Progress(_Evaluations):

@@ -111,10 +111,9 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     # JAX's own error, not a damaged file's.
     jax.devices()
-    # Read with tensorstore, as the readers of orbax print tracebacks from their threads for damaged
-    # files.
     try:
-        opening = [_open_array(checkpoint.folder / item, path, leaf) for path, leaf in leaves]
+        folder = checkpoint.folder / item
+        opening = [open_array(folder, path, leaf, open=True, read=True) for path, leaf in leaves]
         reading = [array.result().read() for array in opening]
         arrays = [jax.numpy.asarray(array.result()) for array in reading]
     # Damaged files raise exceptions of many types.
@@ -123,12 +122,20 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     return jax.tree_util.tree_unflatten(tree, arrays)
 
 
-def _open_array(folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct) -> tensorstore.Future:
-    """Opens an array in orbax's format: one chunk, compressed with zstd.
+def open_array(
+    folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct, **options: Any
+) -> tensorstore.Future:
+    """Opens an array of a checkpoint: one chunk, compressed with zstd, as orbax wrote them too.
 
     A crafted file cannot take more memory than the array: the expected shape fixes the size of the
     chunk, and the zstd reader stops there. (The blosc reader allocates the size that the file
     states.)
+
+    Args:
+      folder: of all arrays of an item.
+      path: the array's path in its pytree.
+      leaf: its shape and type.
+      options: of `tensorstore.open`.
     """
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     files = {"driver": "file", "path": f"{os.path.abspath(folder)}/"}
@@ -140,7 +147,7 @@ def _open_array(folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct) -> tensor
     }
     database = {"driver": "ocdbt", "base": files, "path": f"{name}/"}
     spec = {"driver": "zarr", "kvstore": database, "metadata": metadata}
-    return tensorstore.open(spec, open=True, read=True)
+    return tensorstore.open(spec, **options)
 
 
 def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:

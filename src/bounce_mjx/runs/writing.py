@@ -3,20 +3,17 @@ before it replaces the older one, so a killed process always leaves one complete
 
 import concurrent.futures
 import contextlib
-import functools
-import logging
 import os
 import re
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
+import tensorstore
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
@@ -25,7 +22,7 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE
-from bounce_mjx.runs.reading import RECORD_FILE
+from bounce_mjx.runs.reading import RECORD_FILE, open_array
 
 
 class CheckpointWriter:
@@ -105,7 +102,7 @@ class CheckpointWriter:
             self._restore_folder()
             write()
             del self._pending[name]
-        # Also if it was moved meanwhile: orbax makes the folders that it writes to.
+        # Also if it was moved meanwhile: tensorstore makes the folders that it writes to.
         self._restore_folder()
 
     def _restore_folder(self) -> None:
@@ -133,7 +130,6 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
     _remove_leftovers(folder.parent)
     try:
         unfinished.mkdir(parents=True)
-        _check_room(unfinished, sum(leaf.nbytes for leaf in jax.tree.leaves(items)))
         for name, tree in items.items():
             _save_arrays(unfinished / name, tree)
         (unfinished / RECORD_FILE).write_text(record, encoding="utf-8")
@@ -156,33 +152,16 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
 
 
 def _save_arrays(folder: Path, tree: Any) -> None:
-    """Writes a pytree with orbax, on this host only."""
-    ocp = _silent_orbax()
-    host = jax.process_index()
-    only_here = ocp.options.MultiprocessingOptions(primary_host=host, active_processes={host})
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=only_here)
-    folder = Path(os.path.abspath(folder))
-    folder.mkdir()
-    handler.save(folder, args=ocp.args.PyTreeSave(tree))
-    handler.finalize(folder)
-
-
-@functools.cache
-def _silent_orbax() -> ModuleType:
-    """orbax, without the tracebacks that its threads print of an error that it raises as well."""
-    # The import takes a third of a second, and only writing needs it.
-    import orbax.checkpoint as ocp
-
-    logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
-    show = sys.unraisablehook
-
-    def show_others(unraisable: "sys.UnraisableHookArgs") -> None:
-        # After the error, the other writes end in the event loop that orbax has closed.
-        if str(unraisable.exc_value) != "Event loop is closed":
-            show(unraisable)
-
-    sys.unraisablehook = show_others
-    return ocp
+    """Writes a pytree of arrays as `reading.open_array` opens them, all in one go."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    with tensorstore.Transaction() as together:
+        # With a context of its own, each array would be written, and flushed, on its own.
+        shared = dict(context=tensorstore.Context(), transaction=together)
+        options = shared | dict(create=True, write=True)
+        opening = [open_array(folder, path, leaf, **options) for path, leaf in leaves]
+        writing = [x.result().write(leaf) for x, (_, leaf) in zip(opening, leaves, strict=True)]
+        for each in writing:
+            each.result()
 
 
 def _remove_leftovers(folder: Path) -> None:
@@ -191,13 +170,3 @@ def _remove_leftovers(folder: Path) -> None:
     for path in folder.glob("*"):
         if path.suffix in (PARTIAL, folders.REPLACED) and path not in counting:
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _check_room(folder: Path, size: int) -> None:
-    """Raises OSError if the disk is full, before the threads of orbax fail with tracebacks."""
-    room = folder / "room"
-    with room.open("wb") as file:
-        if hasattr(os, "posix_fallocate"):
-            # orbax writes the arrays twice, plus some small files.
-            os.posix_fallocate(file.fileno(), 0, 2 * size + 2**20)
-    room.unlink()

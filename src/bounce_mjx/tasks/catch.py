@@ -110,7 +110,7 @@ class Config(task.WorldConfig):
         return {"ball_init_pos": [x, y, round(z + REST_HEIGHT, 4)]}
 
 
-class State(NamedTuple):
+class CatchState(NamedTuple):
     """What the task keeps of an episode: the ball's vertical velocity [] (m/s) and its position
     from the paddle's centre [3] (m) after the last step, the time since the first contact and the
     time at rest [], both s, and whether the ball was at rest in time [], bool."""
@@ -141,12 +141,12 @@ class Catch(task.Task):
         rising = jnp.array([0.0, 0.0, 0.5 * GRAVITY]) * seconds
         return home + offset - seconds * velocity, velocity + rising
 
-    def reset(self, start: task.Start) -> State:
+    def reset(self, start: task.Start) -> CatchState:
         zero, truth = jnp.zeros(()), start.truth
         offset = truth.ball_position - truth.paddle_position
-        return State(truth.ball_velocity[2], offset, zero, zero, zero > 0.0)
+        return CatchState(truth.ball_velocity[2], offset, zero, zero, zero > 0.0)
 
-    def step(self, state: State, step: task.Step) -> task.TaskStep:
+    def step(self, state: CatchState, step: task.Step) -> task.TaskStep:
         truth, dt = step.truth, self.config.control_dt
         offset = truth.ball_position - truth.paddle_position
         # The mean of the step, in which the servos' speed rises and falls.
@@ -166,7 +166,7 @@ class Catch(task.Task):
             action_change=jnp.mean(jnp.square(step.action - step.last_action)),
         )
         return task.TaskStep(
-            state=State(truth.ball_velocity[2], offset, contact, rest, caught),
+            state=CatchState(truth.ball_velocity[2], offset, contact, rest, caught),
             reward=task.weighted_terms(self.config.reward, inputs),
             ended=(offset[2] < -LOST_DEPTH) | (truth.paddle_position[2] < FLOOR),
             metrics={"caught": caught},

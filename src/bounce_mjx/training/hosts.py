@@ -27,6 +27,7 @@ from jax._src import distributed
 from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
+from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.interrupt import in_daemon_thread
 from bounce_mjx.runs.config import TrainConfig
@@ -159,7 +160,7 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     # Only the leader uses the folder of the runs.
     plain = config.model_dump(mode="json", exclude={"log_dir"})
     plain["resume"] = resume and os.path.abspath(resume)
-    first, *others = map(_flat, _exchange(plain))
+    first, *others = map(flat, _exchange(plain))
     for i, other in enumerate(others, start=1):
         for key in sorted(first.keys() | other.keys()):
             ours, theirs = first.get(key), other.get(key)
@@ -169,15 +170,6 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
                     f"the processes of this training differ in {key}, which is {ours} in process 0 "
                     f"and {theirs} in process {i}; start all with the same flags"
                 )
-
-
-def _flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested mappings by their dotted names."""
-    flat = {}
-    for key, value in plain.items():
-        inner = isinstance(value, dict)
-        flat |= _flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
-    return flat
 
 
 def _exchange(value: Any) -> list[Any]:

@@ -50,7 +50,7 @@ Tree = TypeVar("Tree")
 # Time between two attempts to save to a full disk after the end of the training, s.
 RETRY_SECONDS = 2.0
 
-# Imported by name during the compilation, because this import takes half a second; so does orbax's.
+# Imported by name during the compilation, because this import takes half a second.
 REPORT_MODULE = "bounce_mjx.reports.page"
 
 
@@ -275,7 +275,6 @@ class _Job:
         compiling = self.trainer.compile(self.pool)
         self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
-        self.pool.submit(importlib.import_module, "orbax.checkpoint")
         if self.options.report:
             opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
         compiling.result()

@@ -131,21 +131,16 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
 
 def _primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
     """A sphere, capsule, ellipsoid, cylinder or box of MuJoCo's half-sizes [3], m."""
-    types = mujoco.mjtGeom
-    if kind == types.mjGEOM_SPHERE:
-        mesh = trimesh.creation.uv_sphere(size[0], count=[_SEGMENTS // 2, _SEGMENTS])
-    elif kind == types.mjGEOM_ELLIPSOID:
-        mesh = trimesh.creation.uv_sphere(1.0, count=[_SEGMENTS // 2, _SEGMENTS])
-        mesh.apply_scale(size)
-    elif kind == types.mjGEOM_CAPSULE:
-        mesh = trimesh.creation.capsule(2.0 * size[1], size[0], count=[_SEGMENTS // 2, _SEGMENTS])
-    elif kind == types.mjGEOM_CYLINDER:
-        mesh = trimesh.creation.cylinder(size[0], 2.0 * size[1], sections=_SEGMENTS)
-    elif kind == types.mjGEOM_BOX:
-        mesh = trimesh.creation.box(2.0 * size)
-    else:
-        return None
-    return trimesh.graph.smooth_shade(mesh, angle=_CREASE_ANGLE)
+    types, create, count = mujoco.mjtGeom, trimesh.creation, [_SEGMENTS // 2, _SEGMENTS]
+    makers = {
+        types.mjGEOM_SPHERE: lambda: create.uv_sphere(size[0], count=count),
+        types.mjGEOM_ELLIPSOID: lambda: create.uv_sphere(1.0, count=count).apply_scale(size),
+        types.mjGEOM_CAPSULE: lambda: create.capsule(2.0 * size[1], size[0], count=count),
+        types.mjGEOM_CYLINDER: lambda: create.cylinder(size[0], 2.0 * size[1], sections=_SEGMENTS),
+        types.mjGEOM_BOX: lambda: create.box(2.0 * size),
+    }
+    make = makers.get(types(int(kind)))
+    return make and trimesh.graph.smooth_shade(make(), angle=_CREASE_ANGLE)
 
 
 def _color(model: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.viewers.files import new_output
+from bounce_mjx.runs.files import writable, write_output
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at, resample
@@ -30,8 +30,8 @@ def write_page(
       UserError: the file cannot be written.
     """
     text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
-    with new_output(path, "--html") as new:
-        new.write_text(text, encoding="utf-8")
+    with writable(path, "give another file with --html"):
+        write_output(path, text)
 
 
 def replay(

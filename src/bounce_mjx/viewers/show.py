@@ -11,8 +11,8 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
+from bounce_mjx.runs.files import check_output
 from bounce_mjx.viewers.controllers import Controller
-from bounce_mjx.viewers.files import check_writable
 from bounce_mjx.viewers.native import Window, check_display, has_display
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
@@ -85,12 +85,12 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
 
-        check_writable(options.video, "--video", SUFFIXES)
+        check_output(options.video, "--video", SUFFIXES)
         film = VideoWriter(options.video, options.size, options.fps)
     if options.html is not None:
         from bounce_mjx.viewers.page import SUFFIXES, write_page
 
-        check_writable(options.html, "--html", SUFFIXES)
+        check_output(options.html, "--html", SUFFIXES)
 
     def present(simulation: Simulation, start: PageStart) -> None:
         with console.status("recording"):

@@ -11,8 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import MissingPackage, UserError, install_command
+from bounce_mjx.files import new_file
 from bounce_mjx.interrupt import StopRequest
-from bounce_mjx.viewers.files import new_output
+from bounce_mjx.runs.files import writable
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
@@ -96,7 +97,8 @@ class VideoWriter:
           Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, simulation.env.dt, self.fps)
-        with new_output(self._path, "--video") as new:
+        advice = "give another file with --video"
+        with writable(self._path, advice), new_file(self._path) as new:
             encoder = subprocess.Popen(
                 self._command(new), stdin=subprocess.PIPE, stderr=subprocess.PIPE
             )
@@ -109,10 +111,7 @@ class VideoWriter:
                 _, errors = encoder.communicate()
                 if encoder.returncode:
                     reason = " ".join(errors.decode(errors="replace").split())
-                    raise UserError(
-                        f"--video {self._path} cannot be written ({reason[-200:]}); "
-                        "give another file"
-                    )
+                    raise UserError(f"{self._path} cannot be written ({reason[-200:]}); {advice}")
             finally:
                 encoder.kill()
                 encoder.communicate()

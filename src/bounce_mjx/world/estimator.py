@@ -45,9 +45,8 @@ class Estimator:
         self._config, self._engine = config, engine
         constants = filter_constants(config, mj_model)
         self._filter = BallFilter(constants, config.control_dt, jnp, _repeat)
-        addresses = find_addresses(mj_model)
-        normal = paddle_normal(mj_model, config.default_joint_angles)
-        self._above_paddle = mj_model.geom_pos[addresses.paddle_geom] + normal
+        normal, _ = upper_face(mj_model, config.default_joint_angles)
+        self._above_paddle = mj_model.geom_pos[find_addresses(mj_model).paddle_geom] + normal
 
         terms = config.randomization
         interval = 1.0 / terms.camera_rate[0] if terms.camera_rate else 0.0
@@ -128,31 +127,26 @@ def _repeat(count: int, function: Callable[[Any], Any], start: Any) -> Any:
 
 def filter_constants(config: WorldConfig, mj_model: mujoco.MjModel) -> Constants:
     """Constants of the filter from the config and the nominal model."""
-    addresses = find_addresses(mj_model)
-    paddle, ball = addresses.paddle_geom, addresses.ball_geom
-    half_sizes = mj_model.geom_aabb[paddle, 3:]
-    thickness = half_sizes @ abs(_face(mj_model, config.default_joint_angles))
+    _, height = upper_face(mj_model, config.default_joint_angles)
+    radius = mj_model.geom_size[find_addresses(mj_model).ball_geom, 0]
     return Constants(
         **config.estimator.model_dump(),
         gravity=tuple(mj_model.opt.gravity.tolist()),
-        contact_distance=float(thickness + mj_model.geom_size[ball, 0]),
+        contact_distance=float(height + radius),
     )
 
 
-def paddle_normal(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> np.ndarray:
+def upper_face(
+    mj_model: mujoco.MjModel, joint_angles: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
     """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
-    the frame of the paddle's body."""
-    normal = np.zeros(3)
-    paddle = find_addresses(mj_model).paddle_geom
-    mujoco.mju_rotVecQuat(normal, _face(mj_model, joint_angles), mj_model.geom_quat[paddle])
-    return normal
-
-
-def _face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> np.ndarray:
-    """Normal [3] of the paddle's upper face in the frame of its geom: an axis with a sign."""
+    the frame of the paddle's body, and the face's distance [] from the paddle's centre, m."""
     data, addresses = mujoco.MjData(mj_model), find_addresses(mj_model)
     data.qpos[list(addresses.arm_qpos)] = joint_angles
     mujoco.mj_kinematics(mj_model, data)
-    upward = data.geom_xmat[addresses.paddle_geom].reshape(3, 3)[2]
-    steepest = int(np.argmax(abs(upward)))
-    return np.sign(upward[steepest]) * np.eye(3)[steepest]
+    paddle, normal = addresses.paddle_geom, np.zeros(3)
+    upward = data.geom_xmat[paddle].reshape(3, 3)[2]
+    axis = int(np.argmax(abs(upward)))
+    face = np.sign(upward[axis]) * np.eye(3)[axis]
+    mujoco.mju_rotVecQuat(normal, face, mj_model.geom_quat[paddle])
+    return normal, mj_model.geom_aabb[paddle, 3 + axis]

@@ -12,7 +12,7 @@ with needed("brax", "bounce_mjx[brax]"):
     silence_mjx()
     import brax.envs
 
-from bounce_mjx.adapters.brax.checkpoints import load_policy
+from bounce_mjx.adapters.brax.checkpoints import load_brax_policy
 from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
 from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
@@ -22,7 +22,7 @@ __all__ = [
     "ENV_NAME",
     "BraxBounceBall",
     "device_put_replicated",
-    "load_policy",
+    "load_brax_policy",
     "network_settings",
     "ppo_settings",
 ]

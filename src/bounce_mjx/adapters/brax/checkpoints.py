@@ -16,7 +16,7 @@ BraxPolicy = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, Any]]]
 """(observation [..., N], key) -> (action [..., A], extras)."""
 
 
-def load_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy:
+def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy:
     """The policy of a checkpoint that `ppo.train(save_checkpoint_path=...)` wrote.
 
     brax 0.14.2 has a function of this name, but it cannot read the checkpoints of networks without

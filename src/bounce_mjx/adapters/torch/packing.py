@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import torch
 
 
-class _Part(NamedTuple):
+class _Place(NamedTuple):
     """Position of one array in the block."""
 
     shape: tuple[int, ...]
@@ -33,12 +33,12 @@ class Layout:
     def __init__(self, shapes: Any):
         """Lays out a pytree of shapes and types, as `jax.eval_shape` gives it."""
         leaves, self._tree = jax.tree.flatten(shapes)
-        self._parts: list[_Part] = []
+        self._parts: list[_Place] = []
         stop = 0
         for leaf in leaves:
             dtype = jnp.dtype(leaf.dtype)
             start, stop = stop, stop + -(-math.prod(leaf.shape) * dtype.itemsize // 4)
-            self._parts.append(_Part(tuple(leaf.shape), dtype, start, stop))
+            self._parts.append(_Place(tuple(leaf.shape), dtype, start, stop))
         # Made in advance, because a step makes each view anew: PyTorch's type, shape, strides and
         # the first element, counted in elements of this type.
         self._views = [
@@ -78,7 +78,7 @@ def _to_words(x: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(flat, jnp.int32)
 
 
-def _from_words(words: jax.Array, part: _Part) -> jax.Array:
+def _from_words(words: jax.Array, part: _Place) -> jax.Array:
     if part.dtype == jnp.bool_:
         flat = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(-1)
         return flat[: math.prod(part.shape)].reshape(part.shape) != 0

@@ -87,7 +87,12 @@ def step(
         balls=tuple(_ball(at, state, frictional) for at in addresses.balls),
     )
     if control.ball_push is not None:
-        motion = motion._replace(balls=tuple(map(_pushed, motion.balls, _pushes(control, model))))
+        pushes = jnp.reshape(control.ball_push, (-1, 3))
+        pushed = [
+            ball._replace(velocity=vadd(ball.velocity, tuple(pushes[k, i] for i in range(3))))
+            for k, ball in enumerate(motion.balls)
+        ]
+        motion = motion._replace(balls=tuple(pushed))
     leaves, tree = jax.tree.flatten(motion)
     inputs = (_arm_control(control, addresses.actuators), parameters)
     numbers, given = jax.tree.flatten(scalars_of(inputs, state.qpos.dtype))
@@ -118,16 +123,6 @@ def _ball(at: BallAddresses, state: PhysicsState, frictional: bool) -> Ball:
         velocity=tuple(state.qvel[i] for i in at.qvel[:3]),
         turning=friction.turning_of(*_orientation_and_spin(at, state)) if frictional else None,
     )
-
-
-def _pushes(control: Control, model: FusedModel) -> list[jax.Array]:
-    """The push [3] of each ball."""
-    one = len(model.balls) == 1
-    return [control.ball_push if one else control.ball_push[i] for i in range(len(model.balls))]
-
-
-def _pushed(ball: Ball, push: jax.Array) -> Ball:
-    return ball._replace(velocity=vadd(ball.velocity, tuple(push[i] for i in range(3))))
 
 
 def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:

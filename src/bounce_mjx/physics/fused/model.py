@@ -24,7 +24,6 @@ from bounce_mjx.physics.fused.scalars import (
     scale,
     vadd,
 )
-from bounce_mjx.physics.fused.support import check_supported
 from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
@@ -111,15 +110,8 @@ class FusedModel:
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
-    """Constants of a compiled model.
-
-    Raises:
-      UnsupportedModelError: the fused engine does not support a feature of the model; the text
-        names it.
-    """
-    addresses = find_addresses(mj_model)
-    check_supported(mj_model, addresses)
-    m = mj_model
+    """Constants of a compiled model that has no `unsupported_feature`."""
+    m, addresses = mj_model, find_addresses(mj_model)
     links, frames = _read_links(m, addresses)
     compensated = _compensated_share(m, addresses)
     if compensated is not None:
@@ -354,31 +346,30 @@ def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Fra
 
 
 def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
-    """Inertial frame of a body in the body's frame. Where the two are almost the same, MuJoCo flags
-    the body and computes as if they were the same."""
-    same = mj_model.body_sameframe[body]
-    frame = Frame(floats(mj_model.body_ipos[body]), _rotation(mj_model.body_iquat[body]))
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
-        return Frame()
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
-        return Frame(frame.origin)
-    return frame
+    """Inertial frame of a body in the body's frame."""
+    m = mj_model
+    frame = Frame(floats(m.body_ipos[body]), _rotation(m.body_iquat[body]))
+    return _as_flagged(m.body_sameframe[body], frame, frame)
 
 
 def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
-    """Frame of a geom in its body's frame, with the same flags as for inertial frames."""
-    same = mj_model.geom_sameframe[geom]
-    origin, rotation = floats(mj_model.geom_pos[geom]), _rotation(mj_model.geom_quat[geom])
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
-        return Frame()
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
-        return Frame(origin)
-    inertial = _inertial_frame(mj_model, int(mj_model.geom_bodyid[geom]))
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA:
-        return inertial
-    if same == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT:
-        return Frame(origin, inertial.rotation)
-    return Frame(origin, rotation)
+    """Frame of a geom in its body's frame."""
+    m = mj_model
+    frame = Frame(floats(m.geom_pos[geom]), _rotation(m.geom_quat[geom]))
+    inertial = _inertial_frame(m, int(m.geom_bodyid[geom]))
+    return _as_flagged(m.geom_sameframe[geom], frame, inertial)
+
+
+def _as_flagged(same: int, frame: Frame, inertial: Frame) -> Frame:
+    """A frame in its body's frame. Where it is almost the same as that one, or as the body's
+    inertial one, MuJoCo has a flag and computes as if they were the same."""
+    flags = mujoco.mjtSameFrame
+    return {
+        flags.mjSAMEFRAME_BODY: Frame(),
+        flags.mjSAMEFRAME_BODYROT: Frame(frame.origin),
+        flags.mjSAMEFRAME_INERTIA: inertial,
+        flags.mjSAMEFRAME_INERTIAROT: Frame(frame.origin, inertial.rotation),
+    }.get(flags(int(same)), frame)
 
 
 def _gravity_compensation(mj_model: mujoco.MjModel) -> np.ndarray:

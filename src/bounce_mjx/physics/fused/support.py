@@ -1,4 +1,4 @@
-"""Check that the fused engine supports a model; a refusal names the unsupported feature."""
+"""What the fused engine does not support of a model; a refusal names the feature."""
 
 import itertools
 
@@ -6,37 +6,6 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
-
-
-class UnsupportedModelError(ValueError):
-    """The fused engine does not support a feature of the model; the text names it."""
-
-
-def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
-    """Name of a feature that the fused engine does not support; None if it supports the model."""
-    try:
-        check_supported(mj_model, find_addresses(mj_model))
-    except UnsupportedModelError as error:
-        return str(error)
-    return None
-
-
-def check_supported(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Checks that the fused engine supports every feature of a model.
-
-    Raises:
-      UnsupportedModelError: a feature is not supported; the text names it.
-    """
-    _check_options(mj_model)
-    _check_bodies(mj_model, addresses)
-    _check_constraints(mj_model, addresses)
-    _check_actuators(mj_model, addresses)
-
-
-def _require(condition: bool, feature: str) -> None:
-    if not condition:
-        raise UnsupportedModelError(feature)
-
 
 _INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER)
 # MJCF flags that `read_model` obeys, or without effect on the supported models.
@@ -49,22 +18,35 @@ _HARMLESS_ENABLED = frozenset(("energy", "fwdinv", "invdiscrete"))
 _MIN_WIDTH = 1e-15
 
 
-def _check_options(m: mujoco.MjModel) -> None:
+def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
+    """Name of a feature that the fused engine does not support; None if it supports the model."""
+    addresses = find_addresses(mj_model)
+    features = {
+        **_options(mj_model),
+        **_bodies(mj_model, addresses),
+        **_constraints(mj_model, addresses),
+        **_actuators(mj_model, addresses),
+    }
+    return next((feature for feature, present in features.items() if present), None)
+
+
+def _options(m: mujoco.MjModel) -> dict[str, bool]:
+    """Options that are not supported, and whether the model has each."""
     integrator = mujoco.mjtIntegrator(m.opt.integrator)
-    _require(
-        integrator in _INTEGRATORS,
-        f"the integrator {integrator.name.removeprefix('mjINT_').lower()} "
-        "(only implicitfast and Euler)",
-    )
     disabled = _flags(m.opt.disableflags, mujoco.mjtDisableBit) - _HARMLESS_DISABLED
-    _require(not disabled, f"disabled parts of the engine ({', '.join(sorted(disabled))})")
     enabled = _flags(m.opt.enableflags, mujoco.mjtEnableBit) - _HARMLESS_ENABLED
-    _require(not enabled, f"enabled options of the engine ({', '.join(sorted(enabled))})")
-    _require(m.opt.disableactuator == 0, "disabled actuators (actuatorgroupdisable)")
-    fluid = m.opt.density or m.opt.viscosity or np.any(m.opt.wind)
-    _require(not fluid, "a medium (density, viscosity or wind)")
-    _require(m.nplugin == 0, "plugins")
-    _require(m.nflex == 0, "flexes (flex, flexcomp)")
+    return {
+        f"the integrator {integrator.name.removeprefix('mjINT_').lower()} "
+        "(only implicitfast and Euler)": integrator not in _INTEGRATORS,
+        f"disabled parts of the engine ({', '.join(sorted(disabled))})": bool(disabled),
+        f"enabled options of the engine ({', '.join(sorted(enabled))})": bool(enabled),
+        "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
+        "a medium (density, viscosity or wind)": np.any(
+            [m.opt.density, m.opt.viscosity, *m.opt.wind]
+        ),
+        "plugins": m.nplugin > 0,
+        "flexes (flex, flexcomp)": m.nflex > 0,
+    }
 
 
 def _flags(bits: int, kind: type) -> set[str]:
@@ -76,42 +58,35 @@ def _flags(bits: int, kind: type) -> set[str]:
     }
 
 
-def _check_bodies(m: mujoco.MjModel, addresses: Addresses) -> None:
-    bodies = [int(m.jnt_bodyid[joint]) for joint in addresses.arm_joints]
-    _require(
-        m.njnt == len(addresses.arm_joints) + len(addresses.balls),
-        "joints other than the acting ones and the ball's",
-    )
+def _bodies(m: mujoco.MjModel, addresses: Addresses) -> dict[str, bool]:
+    """Features of bodies and joints, as `_options`."""
+    joints, paddle = list(addresses.arm_joints), addresses.paddle_geom
     hinge_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    _require(
-        all(int(m.jnt_type[j]) in hinge_or_slide for j in addresses.arm_joints),
-        "arm joints that are neither hinges nor slides",
-    )
-    parents = [m.body_weldid[m.body_parentid[body]] for body in bodies]
-    _require(
-        all(
-            body == before or parent == before
-            for before, body, parent in zip([0, *bodies[:-1]], bodies, parents, strict=True)
+    bodies = m.jnt_bodyid[joints]
+    before, parents = np.array([0, *bodies[:-1]]), m.body_weldid[m.body_parentid[bodies]]
+    return {
+        "joints other than the acting ones and the ball's": (
+            m.njnt != len(joints) + len(addresses.balls)
         ),
-        "an arm that is not one serial chain",
-    )
-    _require(not np.any(m.body_mocapid >= 0), "bodies moved from outside (mocap)")
-    _require(
-        all(np.sum(m.body_weldid == ball.body) == 1 for ball in addresses.balls),
-        "bodies that are attached to the ball",
-    )
-    _require(
-        m.body_weldid[m.geom_bodyid[addresses.paddle_geom]] == bodies[-1],
-        "a paddle that is not behind the last joint",
-    )
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    _require(m.geom_type[addresses.paddle_geom] == box, "a paddle that is not a box")
-    nonlinear = np.any(m.jnt_stiffnesspoly)
-    _require(not nonlinear, "nonlinear springs (stiffness with several numbers)")
-    _require(not np.any(m.dof_dampingpoly), "nonlinear damping (damping with several numbers)")
-    _require(not np.any(m.jnt_limited), 'joint limits as constraints (limited="true")')
-    plain = all(_is_plain(m, ball) for ball in addresses.balls)
-    _require(plain, "a ball that is not one free homogeneous sphere")
+        "arm joints that are neither hinges nor slides": not np.all(
+            np.isin(m.jnt_type[joints], hinge_or_slide)
+        ),
+        "an arm that is not one serial chain": np.any((bodies != before) & (parents != before)),
+        "bodies moved from outside (mocap)": np.any(m.body_mocapid >= 0),
+        "bodies that are attached to the ball": any(
+            np.sum(m.body_weldid == ball.body) != 1 for ball in addresses.balls
+        ),
+        "a paddle that is not behind the last joint": (
+            m.body_weldid[m.geom_bodyid[paddle]] != bodies[-1]
+        ),
+        "a paddle that is not a box": m.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX,
+        "nonlinear springs (stiffness with several numbers)": np.any(m.jnt_stiffnesspoly),
+        "nonlinear damping (damping with several numbers)": np.any(m.dof_dampingpoly),
+        'joint limits as constraints (limited="true")': np.any(m.jnt_limited),
+        "a ball that is not one free homogeneous sphere": not all(
+            _is_plain(m, ball) for ball in addresses.balls
+        ),
+    }
 
 
 def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
@@ -129,56 +104,56 @@ def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
     )
 
 
-def _check_constraints(m: mujoco.MjModel, addresses: Addresses) -> None:
-    _require(m.neq == 0, "equality constraints")
-    _require(m.ntendon == 0, "tendons")
-    colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
-    _require(not np.any(colliding), "contacts by contype and conaffinity (only by pairs)")
-    _check_pairs(m, addresses)
-    frictional = np.any(m.pair_dim > 1)
-    _require(
-        not frictional or np.all(m.pair_dim > 1), "sliding friction of some contact pairs only"
-    )
-    friction = frictional or np.any(m.dof_frictionloss)
-    _require(not (friction and m.opt.noslip_iterations), "the noslip solver (noslip_iterations)")
-
-
-def _check_pairs(m: mujoco.MjModel, addresses: Addresses) -> None:
-    balls = {ball.geom for ball in addresses.balls}
-    geoms = [frozenset(map(int, pair)) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)]
+def _constraints(m: mujoco.MjModel, addresses: Addresses) -> dict[str, bool]:
+    """Features of constraints and contacts, as `_options`."""
+    balls = [ball.geom for ball in addresses.balls]
+    pairs = [frozenset(map(int, pair)) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)]
     touching = {frozenset((addresses.paddle_geom, ball)) for ball in balls}
     possible = touching | {frozenset(pair) for pair in itertools.combinations(balls, 2)}
-    _require(
-        m.npair > 0 and len(set(geoms)) == m.npair and touching <= set(geoms),
-        "other than one contact pair of the paddle and each ball",
-    )
-    _require(set(geoms) <= possible, "a pair other than of a ball and the paddle or another ball")
-    for pair in range(m.npair):
-        _require(
-            m.pair_dim[pair] in (1, 3),
-            f"torsional or rolling friction (condim {m.pair_dim[pair]}; only condim 1 and 3)",
-        )
-        gap = m.pair_margin[pair] or m.pair_gap[pair]
-        _require(not gap, "a contact margin or gap")
-        _require(m.pair_adhesion[pair] == 0.0, "adhesion")
-        solref, width = m.pair_solref[pair], m.pair_solimp[pair, 2]
-        same_sign = (solref[0] > 0.0) == (solref[1] > 0.0)
-        _require(same_sign, "a solref with exactly one positive number")
-        _require(width > _MIN_WIDTH, "a solimp without a width")
+    frictional = bool(np.any(m.pair_dim > 1))
+    friction = frictional or np.any(m.dof_frictionloss)
+    others = m.pair_dim[~np.isin(m.pair_dim, (1, 3))]
+    return {
+        "equality constraints": m.neq > 0,
+        "tendons": m.ntendon > 0,
+        "contacts by contype and conaffinity (only by pairs)": np.any(
+            m.geom_contype | m.geom_conaffinity
+        ),
+        "other than one contact pair of the paddle and each ball": (
+            len(set(pairs)) != m.npair or not touching <= set(pairs)
+        ),
+        "a pair other than of a ball and the paddle or another ball": not set(pairs) <= possible,
+        f"torsional or rolling friction (condim {max(others, default=0)}; only condim 1 and 3)": (
+            len(others) > 0
+        ),
+        "a contact margin or gap": np.any(m.pair_margin) or np.any(m.pair_gap),
+        "adhesion": np.any(m.pair_adhesion),
+        "a solref with exactly one positive number": np.any(
+            np.sum(m.pair_solref > 0.0, axis=1) == 1
+        ),
+        "a solimp without a width": np.any(m.pair_solimp[:, 2] <= _MIN_WIDTH),
+        "sliding friction of some contact pairs only": frictional and np.any(m.pair_dim == 1),
+        "the noslip solver (noslip_iterations)": friction and m.opt.noslip_iterations > 0,
+    }
 
 
-def _check_actuators(m: mujoco.MjModel, addresses: Addresses) -> None:
-    _require(
-        m.nu == len(addresses.arm_joints), "actuators other than one position servo on each joint"
-    )
+def _actuators(m: mujoco.MjModel, addresses: Addresses) -> dict[str, bool]:
+    """Features of actuators, as `_options`."""
     affine_gain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
-    servos = (
-        np.all(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
-        and all(int(gain) in affine_gain for gain in m.actuator_gaintype)
-        and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
-    )
-    _require(bool(servos), "actuators that are not position servos")
-    _require(not np.any(m.actuator_delay), "delayed actuators (delay)")
-    rotor = (m.actuator_damping, m.actuator_dampingpoly, m.actuator_armature)
-    _require(not any(map(np.any, rotor)), "damping or armature given to an actuator")
+    return {
+        "actuators other than one position servo on each joint": (
+            m.nu != len(addresses.arm_joints)
+        ),
+        "actuators that are not position servos": (
+            np.any(m.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT)
+            or np.any(m.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE)
+            or not np.all(np.isin(m.actuator_gaintype, affine_gain))
+            or np.any(m.actuator_biastype != mujoco.mjtBias.mjBIAS_AFFINE)
+        ),
+        "delayed actuators (delay)": np.any(m.actuator_delay),
+        "damping or armature given to an actuator": (
+            np.any(m.actuator_damping)
+            or np.any(m.actuator_dampingpoly)
+            or np.any(m.actuator_armature)
+        ),
+    }
