@@ -59,7 +59,13 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     content["sources"] = {f"randomization.{name}": text for name, text in sources.items()}
     content["assumed"] = [f"randomization.{name}" for name in assumed]
     head = f"# Identified from {log.source}: bounce-mjx train --world FILE\n"
-    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
+    # Ranges on one line each, and sources below one another.
+    parts = [
+        yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
+        for key, value in content.items()
+        for style in [None if key == "env" else False]
+    ]
+    return head + "".join(parts)
 
 
 def compare(
