@@ -158,6 +158,7 @@ def drop(model: mujoco.MjModel, data: mujoco.MjData, ball: int, rng: np.random.G
     data.qvel[at.qvel,] = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0), *np.zeros(3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("num_balls", "friction"), [(2, None), (3, None), (2, 0.3)], ids=["two", "three", "friction"]
 )

@@ -167,6 +167,7 @@ def test_step_keeps_what_wrappers_added(env):
     assert after.metrics["reward/height"] > 0.0
 
 
+@pytest.mark.slow
 def test_torchrl_steps_the_environment(need):
     """Its wrapper turns the state into tensors and back."""
     torchrl, torch = need("torchrl.envs"), need("torch")

@@ -179,6 +179,7 @@ def test_one_step_with_a_given_friction_is_mujocos(mj_model, cone):
     assert np.max(np.abs(without.qvel - expected.qvel)) > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frictionloss", [0.0, 10.0], ids=["sliding", "sliding and dry"])
 @pytest.mark.parametrize("cone", CONES)
 @pytest.mark.usefixtures("float64")

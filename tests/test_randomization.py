@@ -123,14 +123,16 @@ def test_a_training_draws_from_the_grown_ranges() -> None:
 
 
 def test_a_share_of_the_terms_is_drawn() -> None:
-    """Each on its own; a term without a nominal value is always drawn."""
+    """Each on its own, some with a share of their own; a term without a nominal value is always
+    drawn."""
     config = RandomizationConfig(**RANGES)
     keys = jax.random.split(jax.random.PRNGKey(2), 2000)
+    own = {"action_latency": 0.8, "air_drag": 0.0}
     draw = functools.partial(
-        draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6, share=0.3
+        draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6, share=0.3, shares=own
     )
     worlds = jax.jit(jax.vmap(draw))(keys)
-    drawn = []
+    drawn, expected = [], []
     for name, values in worlds.items():
         (low, high), nominal = RANGES[name], TERMS[name].nominal
         entries = np.asarray(values, float).reshape(2000, -1)
@@ -141,9 +143,13 @@ def test_a_share_of_the_terms_is_drawn() -> None:
         is_nominal = np.abs(entries - nominal) < 1e-7
         assert np.all(is_nominal | inside)
         assert np.all(is_nominal.all(axis=1) == is_nominal.any(axis=1)), name
-        drawn.append(~is_nominal[:, 0])
+        if name in own:
+            assert abs(1.0 - is_nominal[:, 0].mean() - own[name]) <= 5 * np.sqrt(0.16 / 2000)
+        if own.get(name) != 0.0:
+            drawn.append(~is_nominal[:, 0])
+            expected.append(own.get(name, 0.3))
     shares = np.mean(drawn, axis=1)
-    assert np.abs(shares - 0.3).max() < 5 * np.sqrt(0.21 / 2000)
+    assert np.abs(shares - expected).max() < 5 * np.sqrt(0.21 / 2000)
     correlation = np.corrcoef(drawn) - np.eye(len(drawn))
     assert np.abs(correlation).max() < 6 / np.sqrt(2000)
 
@@ -155,7 +161,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
     seen = {part.name for part in config.layout.parts}
     measured = {"joint_angles", "joint_velocities", "ball_position", "ball_age", "target_height"}
     # Those of the task come from the measurements, too.
-    computed = {"paddle_position", "action", *config.observation.seen("task")}
+    computed = {"paddle_position", "action", "servo_lead", *config.observation.seen("task")}
     if config.observation.velocity != "measured":
         computed.add("ball_velocity")
     assert seen <= measured | computed
@@ -171,6 +177,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
         ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
         ({"drag": (0.0, 0.1)}, "unknown key drag; did you mean air_drag?"),
+        ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is no term"),
     ],
 )
 def test_bad_range(values: dict, words: str) -> None:
@@ -428,6 +435,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     return PhysicsState(*(np.array(x) for x in zip(*after, strict=True))), contacts
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, record_property) -> None:
     """Each engine runs freely. Contacts amplify differences, in a few worlds by a factor of a

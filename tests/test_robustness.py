@@ -23,12 +23,18 @@ from bounce_mjx.evaluation.robustness import (
     measure_conditions,
 )
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range
+from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range, read_suite
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.reports.figures import image
 from bounce_mjx.reports.page import write_report
-from bounce_mjx.reports.robustness import load_robustness, robustness_figure, robustness_table
+from bounce_mjx.reports.robustness import (
+    load_robustness,
+    misses,
+    robustness_figure,
+    robustness_table,
+    summary,
+)
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
@@ -70,6 +76,41 @@ def test_the_shipped_suite_has_every_term() -> None:
     assert values("gravity_tilt") >= {round(s * np.radians(3.0), 6) for s in (-1, 1)}
     assert values("ball_velocity_noise") >= {0.1}
     assert values("target_height") >= {0.3, 0.8}
+
+
+def test_version_1_stays_as_it_is() -> None:
+    """Its scores are compared with later ones."""
+    path = resource_path("configs/robustness.yaml")
+    assert read_suite(path).version == "v1"
+    trained = EnvConfig(randomization={"air_drag": (0.0, 0.1)})
+    plain = [(c.perturbation.name, c.strength) for c in load_suite(path, trained)]
+    assert len(plain) == 144
+
+
+def test_version_2_is_of_fixed_numbers() -> None:
+    """No condition depends on a policy's training; late actions and pictures to 100 and 60 ms."""
+    path = resource_path("configs/robustness_v2.yaml")
+    assert read_suite(path).version == "v2"
+    few, many = (
+        load_suite(path, EnvConfig(randomization=drawn))
+        for drawn in ({}, {"action_latency": (0.0, 0.2), "ball_mass": (0.5, 2.0)})
+    )
+    for one, other in zip(few, many, strict=True):
+        assert one.perturbation == other.perturbation and one.env == other.env
+        np.testing.assert_equal(one.ranges, other.ranges)
+    assert not any(condition.perturbation.trained_ranges for condition in few)
+    pairs = {
+        tuple(round(1e3 * float(c.ranges[term][0])) for term in ("action_latency", "ball_latency"))
+        for c in few
+        if {"action_latency", "ball_latency"} <= c.ranges.keys()
+    }
+    assert {(34, 10), (40, 20), (60, 30), (80, 40)} <= pairs
+    alone = {
+        float(c.ranges["action_latency"][0]) for c in few if c.ranges.keys() == {"action_latency"}
+    }
+    assert {0.01, 0.06, 0.1} <= alone
+    tilts = [abs(c.ranges["paddle_tilt"][1]).max() for c in few if "paddle_tilt" in c.ranges]
+    assert max(tilts) == pytest.approx(np.radians(4.0))
 
 
 def test_strengths_have_a_unit_and_values_a_shape(tmp_path: Path) -> None:
@@ -392,7 +433,10 @@ def report() -> RobustnessReport:
     failed = ["consecutive bounces", "height", "stable"]
     return RobustnessReport(
         checkpoint="c", steps=1, suite="s", episodes=4, seed=0,
-        measured={name: f"what {name} means, %" for name in RESULTS},
+        measured={
+            name: f"what {name} means, {'m/s' if name == 'upward speed' else '%'}"
+            for name in RESULTS
+        },
         outcomes=[
             outcome("nominal", group="nominal", trained=True),
             outcome("late", 0.0, trained=True),
@@ -415,7 +459,22 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     (header,) = [line.split() for line in lines if "strength" in line]
     assert header == ["condition", "strength", "C", "P", "H", "U", "S"]
     described = [line.strip() for line in lines]
-    assert "U  upward speed: what upward speed means, %" in described
+    assert "U  upward speed: what upward speed means, m/s" in described
+
+
+def test_the_score_names_its_misses_and_shows_survival_with_the_other_results(
+    report: RobustnessReport,
+) -> None:
+    assert misses(report) == "late 10 ms"
+    report.outcomes[2].failed.append("height")
+    assert misses(report) == "late 5, 10 ms" and report.met == 3
+    report.version = "v2"
+    assert summary(report).startswith("3 of 5 conditions of v2 meet all judged results")
+    survives = outcome("low", 1.0, values=report.outcomes[0].values | {"height": 40.0})
+    assert survives.lasted == 1.0 and report.worst_share(survives) == 0.4
+    assert report.worst_share(report.outcomes[3]) == 0.25
+    report.measured.clear()
+    assert report.worst_share(report.outcomes[3]) == report.outcomes[3].lasted
 
 
 def test_shipped_suite_fits_80_columns() -> None:

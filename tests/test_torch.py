@@ -323,6 +323,7 @@ def test_rsl_rl_scripts_find_what_they_touch(env):
     vec_env.close()
 
 
+@pytest.mark.slow
 def test_rsl_rl_exports_the_policy(learners, tmp_path):
     """TorchScript and ONNX give the actions of the trained network, beyond the normaliser's limit
     too, and with a quantity that never varied."""
@@ -349,6 +350,7 @@ def test_rsl_rl_exports_the_policy(learners, tmp_path):
         np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_example_trains_and_acts_with_its_export(tmp_path):
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "rsl_rl_ppo.py"))["main"]
     rewards = main(tmp_path, iterations=1, **PPO.model_dump(include=SMALL))

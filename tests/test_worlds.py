@@ -11,7 +11,9 @@ from bounce_mjx.commands.train import read_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.config import LimitsConfig
 from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
+from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
 
@@ -99,6 +101,21 @@ def test_a_policy_is_measured_in_the_world_alone() -> None:
     assert there.env.action_scale == trained.env.action_scale
     with pytest.raises(UserError, match="fast_servo"):
         in_world(trained, Path("ur5e_rtde"))
+
+
+def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
+    trained = read_preset(Path("cpu"), Path("ur5e"))
+    own = trained.env.robot.limits
+    free = {"robot": trained.env.robot.model_copy(update={"limits": LimitsConfig()})}
+    config = trained.model_copy(update={"env": trained.env.model_copy(update=free)})
+    there, _ = in_world(config, Path("ur5e_rtde"))
+    assert own.velocity is not None and there.env.robot.limits == own
+    assert there.env.action_scale == trained.env.action_scale
+    assert there.env.randomization.action_latency == (0.015, 0.045)
+    measured = free | {"action": ActionConfig(base="measured")}
+    config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
+    with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
+        in_world(config, Path("ur5e_rtde"))
 
 
 def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:

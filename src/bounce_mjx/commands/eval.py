@@ -37,6 +37,9 @@ class EvalCommand(WorldCommand, PolicyCommand):
     """Seed of the resets."""
     nominal: bool = False
     """Whether the worlds are the model's own; else each episode draws one, as in the training."""
+    contacts: bool = False
+    """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
+    episodes."""
     physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
@@ -49,7 +52,9 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
     with no_garbage_collection():
-        from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+        from bounce_mjx.evaluation.contacts import describe_contacts
+        from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_contacts
+        from bounce_mjx.evaluation.recording import RECORDED_EPISODES
         from bounce_mjx.reports.tables import details_line, results_table
         from bounce_mjx.runs.files import check_output, to_json, writable, write_output
         from bounce_mjx.runs.folders import choose_checkpoint
@@ -66,15 +71,16 @@ def main(args: Sequence[str]) -> None:
     set_up_jax(on_engine(config.env, command.physics))
     policy = read_policy(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
+    options = EvaluationOptions(
+        command.episodes, command.seed, command.physics, command.nominal, commands
+    )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     with _progress(console) as progress:
         report, engine, warnings = evaluate_policy(
             policy,
             config.env,
             config.ppo,
-            EvaluationOptions(
-                command.episodes, command.seed, command.physics, command.nominal, commands
-            ),
+            options,
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
             progress=progress,
         )
@@ -82,9 +88,16 @@ def main(args: Sequence[str]) -> None:
         console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)
+    contacts = None
+    if command.contacts:
+        contacts = recorded_contacts(policy, config.env, config.ppo, options)
+        described = describe_contacts(contacts, RECORDED_EPISODES)
+        console.print(described, markup=False, highlight=False, soft_wrap=True)
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
+        if contacts is not None:
+            plain["contacts"] = [contact._asdict() for contact in contacts]
         with writable(command.json_file, "give another file with --json"):
             write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)

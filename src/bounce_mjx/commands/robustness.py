@@ -31,7 +31,8 @@ class RobustnessCommand(PolicyCommand):
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
     numbers is a condition too."""
     suite: Path | None = None
-    """YAML file of the perturbations; the default is configs/robustness.yaml."""
+    """YAML file of the perturbations, or the name of one in configs/; the default is robustness,
+    which is version 1, and robustness_v2 is version 2."""
     episodes: Count = DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
     seed: NonNegativeInt = DEFAULT_SEED
@@ -51,14 +52,15 @@ def main(args: Sequence[str]) -> None:
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
     with no_garbage_collection():
         from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
-        from bounce_mjx.evaluation.suite import load_suite
+        from bounce_mjx.evaluation.suite import load_suite, read_suite
         from bounce_mjx.reports.figures import image
         from bounce_mjx.reports.robustness import (
             ROBUSTNESS_FILE,
+            misses,
             robustness_figure,
             robustness_table,
         )
-        from bounce_mjx.runs.config import in_world
+        from bounce_mjx.runs.config import in_world, named_file
         from bounce_mjx.runs.files import to_json, writable, write_output
         from bounce_mjx.runs.folders import choose_checkpoint
         from bounce_mjx.runs.reading import read_policy
@@ -67,7 +69,9 @@ def main(args: Sequence[str]) -> None:
     console = Console()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
     config = command.config(checkpoint.run)
-    suite = command.suite or resource_path("configs/robustness.yaml")
+    suite = resource_path("configs/robustness.yaml")
+    if command.suite is not None:
+        suite = named_file(command.suite, "configs")
     world, assumed = None, None
     if command.world is not None:
         there, named = in_world(config, command.world)
@@ -94,12 +98,14 @@ def main(args: Sequence[str]) -> None:
         checkpoint=str(checkpoint.folder),
         steps=checkpoint.steps,
         suite=str(suite),
+        version=read_suite(suite).version,
         episodes=command.episodes,
         seed=command.seed,
         measured=outcomes[0].measured,
         outcomes=outcomes,
     )
     console.print(robustness_table(report))
+    console.print(f"missed: {misses(report)}", markup=False, highlight=False)
     figure = robustness_figure(report)
     files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}

@@ -226,6 +226,10 @@ def _check(metadata: Metadata) -> None:
         raise ValueError(
             "its chain or its paddle_normal holds a direction of another length than 1"
         )
+    if metadata.max_lead is None and any(
+        part.name == "servo_lead" for part in metadata.observation
+    ):
+        raise ValueError("its policy sees servo_lead, but it has no max_lead")
     sources = {"ball_position": metadata.position, "ball_velocity": metadata.velocity}
     is_filtered = any(sources.get(part.name) == "filter" for part in metadata.observation)
     if is_filtered != (metadata.estimator is not None):

@@ -46,6 +46,11 @@ class Motion:
         return self._start.position
 
     @property
+    def end(self) -> np.ndarray:
+        """Command [J] at the end of the control step, before that mean."""
+        return self._end.position
+
+    @property
     def is_still(self) -> bool:
         """Whether the command rests at the end of the control step."""
         return not (np.any(self._end.velocity) or np.any(self._end.acceleration))

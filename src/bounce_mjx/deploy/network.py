@@ -94,7 +94,7 @@ class OnnxNetwork:
         metadata, remembered = self.metadata, self._remembered
         sizes = measurement_sizes(metadata) | {"paddle_position": 3}
         sizes["ball_picture"] = sizes["ball_position"]
-        sizes |= dict.fromkeys(("action", "past_actions"), len(metadata.joint_names))
+        sizes |= dict.fromkeys(("action", "past_actions", "servo_lead"), len(metadata.joint_names))
         stated = {}
         for part in metadata.observation:
             if part.name not in remembered and part.name not in sizes:

@@ -100,7 +100,7 @@ class DeployedPolicy:
             shape or is not finite; or the time is more than 1 s from the last. The policy's
             state does not change. Or the network gives no finite action; then call `reset`.
         """
-        measured = self.checked(measurements)
+        measured = self._with_lead(self.checked(measurements))
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
         if steps == 0:
@@ -227,13 +227,21 @@ class DeployedPolicy:
         reads = self._network.reads
         optional = ("ball_quaternion", "ball_angular_velocity")
         users = {name: {name} for name in self.units if name not in optional}
-        users["joint_angles"].add("paddle_position")
+        users["joint_angles"] |= {"paddle_position", "servo_lead"}
         users["ball_position"].add("ball_picture")
         if self.metadata.velocity != "measured":
             users["ball_position"] |= users.pop("ball_velocity")
         if self.metadata.estimator is not None:
             users["joint_angles"] |= users["ball_position"]
         return tuple(name for name in users if users[name] & reads)
+
+    def _with_lead(self, measured: Measurements) -> Measurements:
+        """The measurements, and how far the last servo targets lead the measured angles."""
+        if self.metadata.max_lead is None or "joint_angles" not in measured:
+            return measured
+        angles = measured["joint_angles"]
+        last = self._motion.end if self._motion.is_known else angles
+        return measured | {"servo_lead": last - angles}
 
     def checked(
         self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None

@@ -211,8 +211,10 @@ class Env:
         world, parameters, memory_rng = {}, PhysicsParameters(), None
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
-            share = self.config.randomization.share if share is None else share
-            world = draw_world(ranges, world_rng, jnp.result_type(float), self.action_size, share)
+            own_share, shares = self.config.randomization.share, self.config.randomization.shares
+            share, shares = (own_share, shares) if share is None else (share, {})
+            dtype = jnp.result_type(float)
+            world = draw_world(ranges, world_rng, dtype, self.action_size, share, shares)
             parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
@@ -654,9 +656,20 @@ class Env:
             "paddle_position": paddle,
             **_entries(state.command),
             "action": state.last_action,
+            **self._servo_lead(state, angles),
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
+
+    def _servo_lead(self, state: EnvState, angles: jax.Array) -> dict[str, jax.Array]:
+        """Distances of the last servo targets from the measured joint angles [n], rad; nothing if
+        an action does not add to them."""
+        if state.ctrl is None:
+            return {}
+        # The servo shares the offset of the encoder's zero.
+        angles = angles - state.world.get("encoder_bias", 0.0)
+        sent = [state.ctrl[i] / self._gear(i) for i in self._addresses.actuators]
+        return {"servo_lead": jnp.stack(sent) - angles}
 
     def _measured_qpos(self, physics: PhysicsState, joint_angles: jax.Array) -> jax.Array:
         """qpos [nq] with measured joint angles [n]."""

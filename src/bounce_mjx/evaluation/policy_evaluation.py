@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
-from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.contacts import ArmContact, arm_contacts
+from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
+from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.config import PPOConfig
@@ -65,6 +67,24 @@ def evaluate_policy(
         # physics.
         warnings=env.engine.warnings if on_c else (),
     )
+
+
+def recorded_contacts(
+    policy: Policy,
+    env_config: WorldConfig,
+    ppo_config: PPOConfig,
+    options: EvaluationOptions = DEFAULT_OPTIONS,
+) -> list[ArmContact]:
+    """Contacts of the arm with itself and the floor in `RECORDED_EPISODES` episodes; the arguments
+    are those of `evaluate_policy`. In place of MuJoCo's C engine, the config's simulates."""
+    env = Env(_with_options(env_config, options))
+    commands = _commands(env_config, options)
+    networks = make_networks(ppo_config, env.observation_size, env.action_size)
+    evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
+    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
+    key = jax.random.PRNGKey(options.seed)
+    _, recording = evaluate(policy, key, ranges if commands else None)
+    return arm_contacts(env.config, recording)
 
 
 def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:

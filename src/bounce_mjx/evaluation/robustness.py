@@ -68,6 +68,8 @@ class RobustnessReport(pydantic.BaseModel):
     steps: int
     """Number of environment steps in the policy's training."""
     suite: str
+    version: str = ""
+    """Version of the suite."""
     episodes: int
     """Number of episodes in each condition."""
     seed: int
@@ -97,8 +99,18 @@ class RobustnessReport(pydantic.BaseModel):
 
     @property
     def met(self) -> int:
-        """Number of conditions that meet all judged results."""
+        """Number of conditions that meet all judged results: the score."""
         return sum(outcome.passed for outcome in self.outcomes)
+
+    def worst_share(self, outcome: ConditionOutcome) -> float:
+        """Lowest of a condition's results that are shares, from 0 to 1; the share of the episodes
+        that last if none is known to be one."""
+        shares = [
+            value
+            for name, value in outcome.values.items()
+            if value is not None and self.measured.get(name, "").endswith("%")
+        ]
+        return min(shares, default=100.0 * outcome.lasted) / 100.0
 
 
 def measure_conditions(

@@ -64,6 +64,8 @@ class Perturbation(StrictModel):
 class Suite(StrictModel):
     """Content of a suite file."""
 
+    version: str = ""
+    """Name of a suite that stays as it is, with which its scores are given."""
     perturbations: Annotated[tuple[Perturbation, ...], Field(min_length=1)] = ()
 
 
@@ -94,6 +96,15 @@ class Condition(NamedTuple):
         }
 
 
+def read_suite(path: Path) -> Suite:
+    """Reads a suite file.
+
+    Raises:
+      UserError: the file is missing or invalid.
+    """
+    return validate(Suite, read_mapping(path, "suite", "configs/robustness.yaml"), str(path))
+
+
 def load_suite(
     path: Path,
     trained: WorldConfig,
@@ -112,8 +123,7 @@ def load_suite(
     Raises:
       UserError: the file is missing or invalid.
     """
-    values = read_mapping(path, "suite", "configs/robustness.yaml")
-    suite = validate(Suite, values, str(path))
+    suite = read_suite(path)
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
     world = world or trained.model_copy(update={"randomization": RandomizationConfig()})
     names, conditions = {NOMINAL}, [_condition(nominal, None, trained, world, NOMINAL)]

@@ -44,11 +44,23 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
 
 
 def summary(report: RobustnessReport) -> str:
-    """Summary of a report in one sentence."""
+    """The score of a report in one sentence."""
+    version = f" of {report.version}" if report.version else ""
     return (
-        f"{report.met} of {len(report.outcomes)} conditions meet all judged results, with "
+        f"{report.met} of {len(report.outcomes)} conditions{version} meet all judged results, with "
         f"{report.episodes} episodes each"
     )
+
+
+def misses(report: RobustnessReport) -> str:
+    """The conditions that miss a result, by name."""
+    names = []
+    for rows in _perturbations(report.outcomes):
+        missed = [outcome for outcome in rows if not outcome.passed]
+        strengths = ", ".join(f"{o.strength:g}" for o in missed if o.strength is not None)
+        if missed:
+            names.append(" ".join(filter(None, (missed[0].perturbation, strengths, rows[0].unit))))
+    return "; ".join(names) or "none"
 
 
 def robustness_table(report: RobustnessReport) -> Table:
@@ -98,9 +110,9 @@ def result_letters(report: RobustnessReport) -> dict[str, str]:
 
 @style()
 def robustness_figure(report: RobustnessReport) -> Figure:
-    """Chart of perturbations by strength. The colour of a cell shows the share of the episodes
-    that last until their time limit. A cell has a tick or the letters of the missed results; a
-    frame marks conditions within the training ranges."""
+    """Chart of perturbations by strength. The colour of a cell shows the lowest of the results that
+    are shares. A cell has a tick or the letters of the missed results; a frame marks conditions
+    within the training ranges."""
     letters = result_letters(report)
     halves = _halves(report.outcomes)
     lines = max(map(len, halves))
@@ -117,12 +129,12 @@ def robustness_figure(report: RobustnessReport) -> Figure:
         for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), half, strict=True)):
             label.set_fontweight("normal" if outcomes else "bold")
             for x, outcome in enumerate(outcomes):
-                _draw_cell(axes, x, y, outcome, letters)
+                _draw_cell(axes, x, y, outcome, letters, report.worst_share(outcome))
     scale = ScalarMappable(_SCALE, _COLOURS)
     bar = figure.colorbar(
         scale, ax=columns, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
     )
-    bar.set_label("episodes until the time limit, %", fontsize=8)
+    bar.set_label("lowest result of those in %", fontsize=8)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
     figure.supxlabel(literal(below), fontsize=8, wrap=True)
@@ -166,9 +178,14 @@ def _halves(outcomes: Sequence[ConditionOutcome]) -> tuple[list[_Row], list[_Row
 
 
 def _draw_cell(
-    axes: Axes, x: float, y: float, outcome: ConditionOutcome, letters: dict[str, str]
+    axes: Axes,
+    x: float,
+    y: float,
+    outcome: ConditionOutcome,
+    letters: dict[str, str],
+    share: float,
 ) -> None:
-    shade = float(_SCALE(100.0 * outcome.lasted))
+    shade = float(_SCALE(100.0 * share))
     ink = _INK if 0.2 < shade < 0.8 else _PAPER
     edge = _INK if outcome.trained else "none"
     axes.add_patch(

@@ -292,7 +292,7 @@ def _named(path: Path, folder: str, kind: str) -> Path:
     found = named_file(path, folder)
     if found == path and str(path) == path.stem and not os.path.exists(path):
         names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
-        names = [name for name in names if name != "robustness"]
+        names = [name for name in names if not name.startswith("robustness")]
         raise UserError(
             f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or the path "
             "of a YAML file"

@@ -211,6 +211,15 @@ class WorldConfig(StrictModel):
                     )
         return self
 
+    @pydantic.model_validator(mode="after")
+    def _check_servo_lead(self):
+        if self.observation.servo_lead and self.action.base != "target":
+            raise ValueError(
+                f"observation.servo_lead is {self.observation.servo_lead}, but actions add to the "
+                "measured angles; set action.base to target, or servo_lead to 0"
+            )
+        return self
+
     @pydantic.field_validator("mjcf")
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:

@@ -66,6 +66,9 @@ class ObservationConfig(StrictModel):
     """Centre of the paddle by the forward kinematics of the measured joint angles."""
     action: Annotated[History, Quantity(None, "", "past")] = 0
     """Actions of the last control steps."""
+    servo_lead: Annotated[History, Quantity(None, "rad", "past")] = 0
+    """Distances of the last servo targets from the measured joint angles, for the action's base
+    target."""
     ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
     """Time since the picture of the ball was taken."""
     position: Literal["measured", "filter"] = "measured"

@@ -7,12 +7,15 @@ term uniformly. A term that is null is inactive and costs nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
+from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import jax, jnp, mujoco, np
 
 if TYPE_CHECKING:
@@ -162,11 +165,17 @@ class RandomizationConfig(StrictModel):
     """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
     value. A small share allows wide ranges of single terms, even if no policy can handle all their
     extremes together."""
+    shares: dict[str, UnitInterval] = {}
+    """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps of the training over which the ranges grow from the nominal values."""
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
+        for name in self.shares.keys() - TERMS.keys():
+            raise ValueError(
+                f"shares has a probability for {shorten(name)}, which is no term; remove it"
+            )
         for name in self.terms:
             (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
             if not low <= high:
@@ -203,12 +212,14 @@ def draw_world(
     dtype: jnp.dtype,
     num_joints: int,
     share: float | jax.Array = 1.0,
+    shares: Mapping[str, float] = MappingProxyType({}),
 ) -> World:
     """Draws the world of one episode; consumes the key.
 
     Args:
       num_joints: number of acting joints.
       share: probability [] that each term with a nominal value is drawn.
+      shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
     shapes = {name: TERMS[name].shape(num_joints) for name in TERMS if name in ranges}
@@ -218,10 +229,11 @@ def draw_world(
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
         term, (low, high) = TERMS[name], ranges[name]
-        shares = uniform[start : start + size].reshape(shapes[name])
-        drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * shares
+        places = uniform[start : start + size].reshape(shapes[name])
+        drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
         if term.nominal is not None:
-            drawn = jnp.where(uniform[i] < share, drawn, jnp.asarray(term.nominal, dtype))
+            is_drawn = uniform[i] < shares.get(name, share)
+            drawn = jnp.where(is_drawn, drawn, jnp.asarray(term.nominal, dtype))
         world[name] = drawn
         start += size
     return world
