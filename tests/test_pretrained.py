@@ -91,7 +91,7 @@ def test_it_is_small_and_holds_only_the_policy() -> None:
     assert items == {"policy"}
 
 
-@pytest.mark.parametrize("task", [task for task in TASK_POLICIES if task != "bounce"])
+@pytest.mark.parametrize("task", TASK_POLICIES)
 def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console) -> None:
     """It has met its results, is small, and is found by its task and by its name."""
     folder = resource_path(POLICIES[task])

@@ -4,12 +4,12 @@ import os
 from pathlib import Path
 
 PRETRAINED = "pretrained"
-TASK_POLICIES = {"bounce": PRETRAINED} | {t: t for t in ("balance", "catch", "juggle", "track")}
-"""The policy of each task that comes with the package, by the names of the tasks."""
+TASK_POLICIES = ("balance", "catch", "juggle", "track")
+"""Tasks with a policy of their name, beside that of the default task, `PRETRAINED`."""
 POLICIES = {PRETRAINED: PRETRAINED} | {
-    name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES) if name != "bounce"
+    name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES)
 }
-"""All policies that come with the package, and their folders."""
+"""The policies that come with the package, and their folders."""
 
 _PACKAGE = Path(__file__).resolve().parent
 

@@ -1,6 +1,6 @@
 """The console script.
 
-`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|excite|doctor|train-torch`
+`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|excite|identify|doctor|...`
 """
 
 import difflib
@@ -24,6 +24,7 @@ COMMANDS = {
     "report": "write the report of a run, report.html",
     "export": "write a trained policy as an ONNX file",
     "excite": "plan a motion from which an arm can be identified",
+    "identify": "estimate the world of a robot from its logs",
     "doctor": "print versions, devices and what is missing",
     "train-torch": "train with a PyTorch library",
 }

@@ -99,7 +99,7 @@ def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width">
 <title>bounce_mjx: {html.escape(run.name)}</title>
-<style>{_STYLE}</style>
+<style>{STYLE}</style>
 </head>
 <body>
 <h1>{report.summary}</h1>
@@ -107,12 +107,12 @@ def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 {html.escape(results.device)}. The best of {len(evaluations)} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
-{_table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
+{table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 {pictures}
 <h2>Where the time went</h2>
-{_table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
+{table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
 <h2>All evaluations</h2>
-{_table(["environment steps", *names, "all met"], evaluations)}
+{table(["environment steps", *names, "all met"], evaluations)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>
 </body>
 </html>
@@ -125,7 +125,7 @@ def _standing(evaluation: Evaluation) -> str:
     return "screening" if evaluation.screening else "-"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in HTML, with coloured verdicts."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
@@ -140,7 +140,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table>\n{row('th', header)}{body}</table>"
 
 
-_STYLE = """
+STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; background: #fff; }
 h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }

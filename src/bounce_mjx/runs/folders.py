@@ -40,7 +40,7 @@ from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.task import copy_task
-from bounce_mjx.tasks.registry import find_task, is_file
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 CheckpointName = Literal["latest", "best"]
 LATEST = "latest"
@@ -222,7 +222,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     try:
         run = named_run(path, log_dir)
     except UserError:
-        folders = {runs_folder(find_task(task)): name for task, name in TASK_POLICIES.items()}
+        policies = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
+        folders = {runs_folder(find_task(task)): policy for task, policy in policies.items()}
         if path is not None or log_dir not in folders:
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")

@@ -45,7 +45,8 @@ def closest(balls: jax.Array, velocities: jax.Array, seconds: float) -> jax.Arra
     other move straight on; they can pass within a control step.
 
     Args:
-      balls, velocities: present positions [B, 3] (m) and velocities [B, 3] (m/s).
+      balls: present positions [B, 3], m.
+      velocities: present velocities [B, 3], m/s.
     """
     distances = []
     for i, j in itertools.combinations(range(len(balls)), 2):

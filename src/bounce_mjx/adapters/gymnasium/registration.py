@@ -8,11 +8,12 @@ ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
 """Name of any other one, with the argument `task`."""
-EPISODE_STEPS = {"balance": 2000, "bounce": 2000, "catch": 300, "juggle": 2000, "track": 2000}
-"""Steps of an episode of each of the package's tasks. Constants, because reading a config takes
-time at each import of Gymnasium."""
-MAX_EPISODE_STEPS = EPISODE_STEPS["bounce"]
-"""Steps of an episode of any other task."""
+MAX_EPISODE_STEPS = 2000
+"""Steps of their episodes. Constants, because reading a config takes time at each import of
+Gymnasium."""
+EPISODE_STEPS = {"balance": 2000, "catch": 300, "juggle": 2000, "track": 2000}
+"""Steps of an episode of the package's other tasks, which have names such as
+bounce_mjx/Juggle-v0."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
@@ -33,13 +34,14 @@ def register() -> None:
     """Adds the environments to Gymnasium's registry; their classes are imported on first use."""
     import gymnasium
 
-    tasks = dict.fromkeys((ENV_ID, TASK_ID), "bounce")
-    tasks |= {f"bounce_mjx/{task.title()}-v0": task for task in EPISODE_STEPS}
-    for name, task in tasks.items():
+    environments = dict.fromkeys((ENV_ID, TASK_ID), (MAX_EPISODE_STEPS, {}))
+    for task, steps in EPISODE_STEPS.items():
+        environments[f"bounce_mjx/{task.title()}-v0"] = steps, {"task": task}
+    for name, (steps, arguments) in environments.items():
         gymnasium.register(
             name,
             entry_point=f"{_MODULE}:TaskEnv",
             vector_entry_point=f"{_MODULE}:TaskVectorEnv",
-            max_episode_steps=EPISODE_STEPS[task],
-            kwargs={"task": task},
+            max_episode_steps=steps,
+            kwargs=arguments,
         )

@@ -1,0 +1,119 @@
+"""Estimates a robot's world from its logs: `bounce-mjx identify LOG... --out world.yaml`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import NonNegative, StrictModel
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.garbage import no_garbage_collection
+from bounce_mjx.interrupt import interruptible
+from bounce_mjx.runs.config import read_preset
+
+
+class TopicsConfig(StrictModel):
+    """Topics of a ROS bag."""
+
+    joints: str = "/joint_states"
+    """JointState with the measured joint angles."""
+    targets: str = "/servo_targets"
+    """JointState or Float64MultiArray with the servo targets."""
+    ball: str = "/ball"
+    """PointStamped or PoseStamped with the ball's position."""
+
+
+class IdentifyCommand(StrictModel):
+    """Estimates the world of a robot from logs of its runs, and writes it for --world."""
+
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """CSV files of Recorder, or ROS bags (folders, .mcap or .db3 files)."""
+    robot: Path | None = None
+    """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
+    configs/robots/ (ur5e, panda or iiwa); the project's own arm by default."""
+    out: Path = Path("world.yaml")
+    """YAML file for the world; the page about it has the same name with .html."""
+    check: Path | None = None
+    """World that was identified earlier; compare the logs with it, and write nothing."""
+    camera_rotation: NonNegative = 0.0
+    """Standard deviation of the camera's rotation to the base, rad; 0 for a calibrated one."""
+    topics: TopicsConfig = TopicsConfig()
+    """Topics of a bag."""
+
+
+@interruptible
+@exit_on_user_error()
+def main(args: Sequence[str]) -> None:
+    """Runs the command line; exits with 1 if --check finds another robot, 2 on a mistake."""
+    command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
+    if not command.logs:
+        raise UserError("no log is given; name the CSV files or bags to identify from")
+    with no_garbage_collection():
+        from bounce_mjx.identify.bags import Topics, is_bag, read_bag
+        from bounce_mjx.identify.log import check, read_csv
+        from bounce_mjx.identify.stages import identify, joined
+        from bounce_mjx.identify.words import estimates, sentences
+        from bounce_mjx.identify.world import compare, world_of
+        from bounce_mjx.reports.identification import identification_page
+        from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+        from bounce_mjx.runs.files import check_output, writable, write_output
+        from bounce_mjx.training.setup import set_up_jax
+        from bounce_mjx.world.named import read_world
+
+    known = None if command.check is None else read_world(command.check)
+    page = command.out.with_suffix(".html")
+    if known is None:
+        for path in (command.out, page):
+            check_output(path, "--out")
+    config = read_preset(Path("default"), command.robot).env
+    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    names = joint_names(model)
+    ranges = model.jnt_range[list(find_addresses(model).arm_joints)]
+    topics = Topics(**command.topics.model_dump())
+    console = Console(soft_wrap=True, highlight=False)
+    logs = []
+    for path in command.logs:
+        log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
+        for warning in check(log, names, ranges):
+            console.print(f"warning: {warning}", markup=False)
+        logs.append(log)
+    set_up_jax(config)
+    log = joined(logs)
+    found = identify(
+        config,
+        log,
+        command.camera_rotation,
+        progress=lambda line: console.print(f"  {line}", markup=False),
+    )
+    for entry in estimates(found, names):
+        seen = "" if entry.seen else "  (not shown by the log)"
+        interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
+        console.print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}", markup=False)
+    for sensor, error in found.after.items():
+        held = found.held_out.get(sensor)
+        rest = "" if held is None else f", {held:.2f} in windows held out"
+        before = found.before.get(sensor, float("nan"))
+        console.print(
+            f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}",
+            markup=False,
+        )
+    for sentence in sentences(found, names):
+        console.print(sentence, markup=False)
+    if known is not None:
+        changed = compare(known, found, log, names)
+        for line in changed or [f"the robot is still that of {command.check}"]:
+            console.print(line, markup=False)
+        sys.exit(1 if changed else 0)
+    robot = None if command.robot is None else str(command.robot)
+    files = {
+        command.out: world_of(found, log, names, robot),
+        page: identification_page(found, log.source, names),
+    }
+    for path, content in files.items():
+        with writable(path, "choose another --out"):
+            write_output(path, content)
+        console.print(str(path), markup=False)

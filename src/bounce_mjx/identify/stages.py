@@ -1,0 +1,273 @@
+"""The search for a robot's world: the arm alone, the ball's flights, its bounces, all together."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.identify.fit import Fit, Noise, Problem, minimise, picture_weights
+from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
+from bounce_mjx.identify.unknowns import Layout, make_layout
+from bounce_mjx.identify.windows import GRAVITY, Windows, cut
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import TERMS
+
+# Every fifth window is held out of the search until its last stage.
+_HELD_OUT = 5
+# Latencies and lags of the first candidates, s.
+_LATENCIES = (0.002, 0.01, 0.02, 0.03, 0.04, 0.055)
+_BALL_LATENCIES = np.arange(-0.01, 0.06, 0.005)
+_LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
+# Time before a bounce at which a flight counts as over, s: the camera's jitter and half a contact.
+_BEFORE_BOUNCE = 0.012
+# A ball this high above a model's origin touches nothing, m.
+_NO_BALL = np.array([0.0, 0.0, 50.0])
+_FEWEST_BOUNCES = 3
+
+
+class Identified(NamedTuple):
+    """What a log says about a robot's world."""
+
+    layout: Layout
+    windows: Windows
+    noise: Noise
+    fit: Fit
+    covariance: np.ndarray
+    """Of the unknowns [P, P], with the prior."""
+    before: dict[str, float]
+    """Root of the mean squared residual of each sensor, in units of its noise: in the model's own
+    world."""
+    after: dict[str, float]
+    """In the identified world."""
+    held_out: dict[str, float]
+    """On the windows that the search had not seen."""
+    dropped: int
+    """Windows whose ball was not in free flight."""
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviations [P] of the unknowns."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def joined(logs: Sequence[Log]) -> Log:
+    """Several logs one after the other; no window spans two of them."""
+    parts, start = [], 0.0
+    for log in logs:
+        shift = start - min(log.times[0], log.target_times[0])
+        parts.append(
+            log._replace(
+                times=log.times + shift,
+                target_times=log.target_times + shift,
+                picture_times=log.picture_times + shift,
+                arrivals=log.arrivals + shift,
+            )
+        )
+        start = float(max(parts[-1].times[-1], parts[-1].target_times[-1])) + 1.0
+    source = ", ".join(log.source for log in logs)
+    return Log(
+        source, *(np.concatenate(arrays) for arrays in zip(*(p[1:] for p in parts), strict=True))
+    )
+
+
+def sensor_noise(log: Log) -> Noise:
+    """The sensors' noise, from differences that no motion explains: of third order, in the quietest
+    quarter of the log."""
+    weights = np.array([1.0, -3.0, 3.0, -1.0]) / np.sqrt(20.0)
+    third = np.stack([np.convolve(a, weights, "valid") for a in log.joint_angles.T], axis=1)
+    angles = _quiet(third)
+    balls = np.full(3, 0.002)
+    if len(log.ball_positions) > 200:
+        # Unequal intervals, as pictures are lost: a parabola through five neighbours.
+        t, rests = log.picture_times, []
+        for i in range(2, len(t) - 2, 2):
+            near = slice(i - 2, i + 3)
+            if t[i + 2] - t[i - 2] < 0.08:
+                since = t[near] - t[i]
+                basis = np.stack([np.ones(5), since, since**2], axis=1)
+                q, _ = np.linalg.qr(basis)
+                ball = log.ball_positions[near]
+                rests.append(np.sqrt(np.sum((ball - q @ (q.T @ ball)) ** 2, axis=0) / 2.0))
+        if len(rests) > 50:
+            # Of a sum of two squared normal numbers, the median is 1.386 times the variance.
+            balls = np.sqrt(np.median(np.square(rests), axis=0) * 2.0 / 1.386)
+    return Noise(np.maximum(angles, 1e-5), np.maximum(balls, 1e-4))
+
+
+def _regular(log: Log) -> Log:
+    """The log with each stretch of control steps at regular times: a line through its stamps."""
+    return log._replace(times=_on_a_line(log.times), target_times=_on_a_line(log.target_times))
+
+
+def _on_a_line(times: np.ndarray) -> np.ndarray:
+    steps = np.diff(times)
+    typical, lines = float(np.median(steps)), []
+    for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
+        index = np.arange(len(part)) - 0.5 * (len(part) - 1)
+        slope = typical if len(part) < 50 else float(index @ part / (index @ index))
+        lines.append(np.mean(part) + slope * index)
+    return np.concatenate(lines)
+
+
+def _quiet(values: np.ndarray) -> np.ndarray:
+    """Root mean square [k] in the quietest quarter of stretches of 200 rows."""
+    count = max(len(values) // 200, 1)
+    parts = np.array_split(values**2, count)
+    means = np.sort([np.mean(part, axis=0) for part in parts], axis=0)
+    return np.sqrt(means[count // 4])
+
+
+def identify(
+    config: WorldConfig,
+    log: Log,
+    camera_rotation: float = 0.0,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Identified:
+    """Estimates the world of a robot from its log.
+
+    Args:
+      config: settings of the robot's environment.
+      camera_rotation: prior standard deviation of the camera's rotation, rad; 0 for a camera that
+        is calibrated.
+      progress: called with a line about each step.
+
+    Raises:
+      UserError: the log has no window.
+    """
+    windows = cut(log, config.physics_dt, _NO_BALL)
+    if len(windows.first) < 5:
+        raise UserError(
+            f"{log.source} has {len(windows.first)} stretches of unbroken joint angles and servo "
+            "targets; record at least 5 s"
+        )
+    bounces = int(np.sum(windows.has_ball))
+    with_ball = bounces >= _FEWEST_BOUNCES
+    progress(f"{len(windows.first)} windows, {bounces} with a bounce")
+    layout = make_layout(config.num_joints, with_ball, camera_rotation)
+    run, noise = make_run(config, config.num_joints), sensor_noise(log)
+
+    def problem_of(log: Log) -> Problem:
+        windows = cut(log, config.physics_dt, _NO_BALL)
+        simulate = make_simulator(run, layout, log, windows, config.physics_dt)
+        return Problem(simulate, windows, layout, noise)
+
+    problem = problem_of(log)
+    n, held = config.num_joints, np.arange(len(windows.first)) % _HELD_OUT == _HELD_OUT - 1
+    arm_state = np.arange(windows.starts.shape[1]) < 2 * n
+    training = np.where(held, 0.0, 1.0)[:, None]
+
+    def search(stages, fit, pictures, iterations, states=None, mask=training, free=None):
+        """A search with the problem at hand."""
+        free = layout.free(stages) if free is None else free
+        weights = problem.weights(pictures=pictures) * mask
+        return minimise(
+            problem, fit.vector, fit.starts, free, weights, iterations, states, progress
+        )
+
+    progress("arm")
+    fit = _first(problem, training)
+    fit = search(["arm"], fit, 0.0, 10, arm_state)
+    regular = problem_of(_regular(log))
+    if len(regular.windows.first) == len(windows.first):
+        irregular, problem = problem, regular
+        other = fit._replace(starts=regular.windows.starts)
+        other = search(["arm"], other, 0.0, 5, arm_state)
+        if other.cost < fit.cost:
+            progress("the time stamps jitter about regular steps, which explain the log better")
+            fit, windows = other, regular.windows
+        else:
+            problem = irregular
+    pictures, stages = np.ones_like(windows.picture_weights), ["arm"]
+    if with_ball:
+        progress("flight")
+        flying = windows.picture_times < windows.bounces[:, None] - _BEFORE_BOUNCE
+        fit = search(["flight"], fit, flying * 1.0, 4, ~arm_state)
+        progress("bounce")
+        fit = _first_latency(problem, fit, training)
+        fit = search(["flight", "bounce"], fit, 1.0, 5, ~arm_state)
+        nothing = np.zeros(len(fit.vector), bool)
+        tested = search([], fit, 1.0, 3, ~arm_state, 1.0 - training, nothing)
+        pictures = picture_weights(problem, tested.predicted)
+        fit = search(["flight", "bounce"], tested, pictures, 6, ~arm_state)
+        stages = ["arm", "flight", "bounce"]
+    progress("all")
+    states = None if with_ball else arm_state
+    fit = search(stages, fit, pictures, 6, states)
+    nothing = np.zeros(len(fit.vector), bool)
+    tested = search([], fit, pictures, 3, states, 1.0 - training, nothing)
+    held_out = _errors(problem, tested)
+    fit = search(stages, tested, pictures, 3, states, np.ones_like(training))
+    nominal = {name: TERMS[name].nominal for name in layout.unknowns if name in TERMS}
+    own = layout.vector({name: value for name, value in nominal.items() if value is not None})
+    shown = problem.simulate(own[None], fit.starts[None])
+    before = fit._replace(predicted=Predicted(shown.angles[0], shown.balls[0]))
+    of_balls = fit.weights[:, -3 * windows.balls.shape[1] :]
+    dropped = windows.has_ball & np.all(of_balls == 0.0, axis=1)
+    return Identified(
+        layout,
+        windows,
+        problem.noise,
+        fit,
+        np.linalg.inv(fit.information + np.diag(layout.deviation**-2.0)),
+        _errors(problem, before),
+        _errors(problem, fit),
+        held_out,
+        int(np.sum(dropped)),
+    )
+
+
+def _first(problem: Problem, mask: np.ndarray) -> Fit:
+    """The best of candidates that differ in latency and lag, which the search could confuse."""
+    layout, places = problem.layout, problem.layout.slices()
+    pairs = [(latency, lag) for latency in _LATENCIES for lag in _LAGS]
+    vectors = np.repeat(layout.mean[None], len(pairs), axis=0)
+    vectors[:, places["action_latency"].start] = [pair[0] for pair in pairs]
+    vectors[:, places["servo_lag"].start] = [pair[1] for pair in pairs]
+    starts = np.repeat(problem.windows.starts[None], len(pairs), axis=0)
+    weights = problem.weights(pictures=0.0) * mask
+    predicted = problem.simulate(vectors, starts)
+    costs = 0.5 * np.sum(problem.residuals(predicted) ** 2 * weights, axis=(1, 2))
+    best = int(np.nanargmin(costs))
+    none = np.zeros((len(layout.mean), len(layout.mean)))
+    shown = Predicted(predicted.angles[best], predicted.balls[best])
+    return Fit(vectors[best], starts[best], none, shown, weights, float(costs[best]))
+
+
+def _first_latency(problem: Problem, fit: Fit, mask: np.ndarray) -> Fit:
+    """The best of candidates that differ in the ball's latency, each with the flights that explain
+    the pictures before the bounces equally well."""
+    place, n = problem.layout.slices()["ball_latency"].start, problem.layout.num_joints
+    vectors = np.repeat(fit.vector[None], len(_BALL_LATENCIES), axis=0)
+    vectors[:, place] = _BALL_LATENCIES
+    later = (vectors[:, place] - fit.vector[place])[:, None, None]
+    starts = np.repeat(fit.starts[None], len(vectors), axis=0)
+    position, velocity = slice(2 * n, 2 * n + 3), slice(2 * n + 3, 2 * n + 6)
+    starts[:, :, position] += later * starts[:, :, velocity] + 0.5 * later**2 * GRAVITY
+    starts[:, :, velocity] += later * GRAVITY
+    weights = problem.weights(with_angles=False) * mask
+    predicted = problem.simulate(vectors, starts)
+    # The middle of the windows, as some are of a ball in a hand.
+    costs = np.sum(problem.whitened(problem.residuals(predicted), weights) ** 2, axis=2)
+    used = np.any(weights > 0.0, axis=1)
+    best = int(np.argmin(np.median(costs[:, used], axis=1)))
+    return fit._replace(vector=vectors[best], starts=starts[best])
+
+
+def _errors(problem: Problem, fit: Fit) -> dict[str, float]:
+    """Root mean square of each sensor's residuals in units of its noise; the estimated starts count
+    as degrees of freedom."""
+    one = Predicted(fit.predicted.angles[None], fit.predicted.balls[None])
+    white = problem.whitened(problem.residuals(one), fit.weights)[0]
+    split = fit.weights.shape[1] - 3 * problem.windows.balls.shape[1]
+    n, errors = problem.layout.num_joints, {}
+    for name, part, states in (
+        ("joint_angles", slice(0, split), 2 * n),
+        ("ball_position", slice(split, None), 6),
+    ):
+        used = np.sum(fit.weights[:, part] > 0.0, axis=1)
+        free = float(np.sum(np.maximum(used - states, 0)))
+        if free > 0.0:
+            errors[name] = float(np.sqrt(np.sum(white[:, part] ** 2) / free))
+    return errors

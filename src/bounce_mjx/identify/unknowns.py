@@ -1,0 +1,156 @@
+"""The unknown quantities of a robot's world, their prior, and their place in one vector."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.world.randomization import TERMS
+
+
+class Unknown(NamedTuple):
+    """A term of the world that a log can show; `randomization` documents its meaning."""
+
+    mean: float
+    """Its value before the log is seen, at which the search starts."""
+    deviation: float
+    """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
+    step: float
+    """Difference at which derivatives are taken."""
+    unit: str
+    stage: str
+    """First stage of the search that varies it: arm, flight or bounce."""
+    size: int | None = 0
+    """Number of entries; 0 for a number, None for one of each joint."""
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    ball_step: float | None = None
+    """The difference for the pictures, if it is another one: it must move a bounce's instant by
+    more than the physics step to which a simulation rounds it. The arm's must be small, as latency
+    and lag differ only in the second order."""
+
+
+_JOINTS = None
+ARM = {
+    "action_latency": Unknown(0.02, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
+    "servo_lag": Unknown(0.015, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
+    "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0)),
+    "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15),
+    "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf)),
+    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0)),
+    "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
+    "gravity_tilt": Unknown(0.0, 0.03, 8e-3, "rad", "flight", 2),
+}
+BALL = {
+    "air_drag": Unknown(0.1, 0.1, 0.02, "1/m", "flight", limits=(0.0, np.inf)),
+    "ball_latency": Unknown(0.01, 0.02, 1e-3, "s", "bounce", limits=(-0.03, 0.07)),
+    "restitution": Unknown(0.85, 0.08, 0.02, "", "bounce", limits=(0.6, 0.98)),
+    "paddle_tilt": Unknown(0.0, 0.02, 8e-3, "rad", "bounce", 2),
+    "paddle_offset": Unknown(0.0, 0.006, 8e-3, "m", "bounce", 3),
+    "ball_position_bias": Unknown(0.0, 0.012, 2e-3, "m", "bounce", 3),
+    "contact_friction": Unknown(0.3, 0.3, 0.05, "", "bounce", limits=(0.0, np.inf)),
+}
+CAMERA_ROTATION = "camera_rotation"
+"""Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
+unless its prior deviation is given."""
+
+
+class Layout(NamedTuple):
+    """The unknowns in one vector."""
+
+    unknowns: Mapping[str, Unknown]
+    num_joints: int
+
+    def slices(self) -> dict[str, slice]:
+        """Place of each unknown."""
+        places, start = {}, 0
+        for name, unknown in self.unknowns.items():
+            size = self._size(unknown)
+            places[name] = slice(start, start + size)
+            start += size
+        return places
+
+    def _size(self, unknown: Unknown) -> int:
+        return self.num_joints if unknown.size is None else max(unknown.size, 1)
+
+    def _vector(self, field: str) -> np.ndarray:
+        return np.concatenate(
+            [np.full(self._size(u), getattr(u, field), float) for u in self.unknowns.values()]
+        )
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Prior mean [P]."""
+        return self._vector("mean")
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Prior standard deviation [P]."""
+        return self._vector("deviation")
+
+    @property
+    def step(self) -> np.ndarray:
+        """Differences [P] for the derivatives."""
+        return self._vector("step")
+
+    @property
+    def ball_step(self) -> np.ndarray:
+        """Differences [P] for the derivatives of the pictures."""
+        own = [u.step if u.ball_step is None else u.ball_step for u in self.unknowns.values()]
+        return np.repeat(own, [self._size(u) for u in self.unknowns.values()])
+
+    def clipped(self, vector: np.ndarray) -> np.ndarray:
+        """The vector [..., P] within the limits of each unknown."""
+        low, high = (
+            np.concatenate([np.full(self._size(u), u.limits[end]) for u in self.unknowns.values()])
+            for end in (0, 1)
+        )
+        return np.clip(vector, low, high)
+
+    def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        """Each unknown's value [..., size], or [...] of a number."""
+        return {
+            name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
+            for name, place in self.slices().items()
+        }
+
+    def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The vector [P] of values by name; a missing one has its prior mean."""
+        vector = self.mean
+        for name, place in self.slices().items():
+            if name in world:
+                vector[place] = world[name]
+        return vector
+
+    def free(self, stages: Sequence[str]) -> np.ndarray:
+        """Which entries [P] the stages vary."""
+        return np.concatenate(
+            [np.full(self._size(u), u.stage in stages) for u in self.unknowns.values()]
+        )
+
+    def labels(self, joint_names: Sequence[str]) -> list[str]:
+        """Name of each entry, for a reader."""
+        labels = []
+        for name, unknown in self.unknowns.items():
+            if unknown.size == 0:
+                labels.append(name)
+            elif unknown.size is None:
+                labels += [f"{name} of {joint}" for joint in joint_names]
+            else:
+                labels += [f"{name} {axis}" for axis in "xyz"[: unknown.size]]
+        return labels
+
+
+def make_layout(num_joints: int, with_ball: bool, camera_rotation: float = 0.0) -> Layout:
+    """Layout of the unknowns that a log can show.
+
+    Args:
+      with_ball: whether it shows bounces.
+      camera_rotation: prior standard deviation of the camera's rotation, rad.
+    """
+    unknowns = dict(ARM) | (BALL if with_ball else {})
+    if not with_ball:
+        unknowns.pop("encoder_bias")
+    if with_ball and camera_rotation > 0.0:
+        unknowns[CAMERA_ROTATION] = Unknown(0.0, camera_rotation, 3e-3, "rad", "bounce", 3)
+    assert set(unknowns) <= {*TERMS, CAMERA_ROTATION}
+    return Layout(unknowns, num_joints)

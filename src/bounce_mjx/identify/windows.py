@@ -1,0 +1,207 @@
+"""Windows of a log: pieces of a few tenths of a second, each with one bounce or the arm alone.
+
+A window is simulated from its own start, whose state is estimated too. Errors of the model
+therefore do not build up, and a log may have gaps.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.identify.log import Log
+
+MAX_DELAY = 0.08
+"""Time before the first picture of a window at which its simulation starts, s; a picture may be
+later than what it shows by as much."""
+_REACH = 0.3
+_SECONDS = MAX_DELAY + 2.0 * _REACH + 0.03
+_SHORTEST = 0.16
+_PADDING = 8
+_PICTURE_GAP = 0.06
+_JOINT_GAP = 0.1
+# Speed that the ball must have before and after a bounce, m/s.
+_BOUNCING = 0.5
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+class Windows(NamedTuple):
+    """S windows, padded to the same length; a padded measurement has the weight 0."""
+
+    first: np.ndarray
+    """Index [S] of the first physics step of each, from `origin`."""
+    steps: int
+    """Physics steps of each."""
+    origin: float
+    """Time of the physics step 0, s."""
+    angle_times: np.ndarray
+    """Times [S, A] of the measured joint angles since the window's start, s."""
+    angles: np.ndarray
+    """Measured joint angles [S, A, n], rad."""
+    angle_weights: np.ndarray
+    """1 for a measurement, 0 for padding [S, A]."""
+    picture_times: np.ndarray
+    """Time stamps [S, B] of the pictures since the window's start, s."""
+    balls: np.ndarray
+    """The ball in each picture [S, B, 3], m."""
+    picture_weights: np.ndarray
+    """1 for a picture, 0 for padding [S, B]."""
+    bounces: np.ndarray
+    """Time [S] of the bounce since the window's start, s; NaN for the arm alone."""
+    starts: np.ndarray
+    """First guess of the state at the start [S, 2 n + 9]: angles, velocities; the ball's position,
+    velocity and spin."""
+
+    @property
+    def has_ball(self) -> np.ndarray:
+        """Which windows [S] show the ball."""
+        return np.isfinite(self.bounces)
+
+
+def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240) -> Windows:
+    """Cuts a log into windows.
+
+    Args:
+      no_ball: position [3] of the ball in windows without one, away from the paddle.
+      max_windows: the largest number; of more, every k-th is kept.
+    """
+    spans = [(b - before, b + after, b) for b, before, after in _bounces(log)]
+    spans += [(start, end, np.nan) for start, end in _rest(log, spans)]
+    spans.sort()
+    if len(spans) > max_windows:
+        keep = np.linspace(0, len(spans) - 1, max_windows).round().astype(int)
+        spans = [spans[i] for i in keep]
+    origin = float(min(log.times[0], log.target_times[0]))
+    begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
+    first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
+    zero = origin + first * physics_dt
+    of_angles, used = [], -np.inf
+    for (_, end, _), begin in zip(spans, zero, strict=True):
+        inside = np.flatnonzero((log.times >= max(begin, used)) & (log.times < end))
+        of_angles.append(inside)
+        used = end
+    of_pictures = [
+        np.flatnonzero((log.picture_times >= start) & (log.picture_times <= end))
+        if np.isfinite(bounce)
+        else np.zeros(0, int)
+        for start, end, bounce in spans
+    ]
+    angle_times, angle_weights, angles = _padded(of_angles, log.times, zero, log.joint_angles)
+    picture_times, picture_weights, balls = _padded(
+        of_pictures, log.picture_times, zero, log.ball_positions
+    )
+    bounces = np.array([bounce for _, _, bounce in spans]) - zero
+    starts = np.stack(
+        [
+            np.concatenate(
+                [_joint_start(log, begin), _ball_start(log, pictures, b, begin, no_ball)]
+            )
+            for begin, pictures, b in zip(zero, of_pictures, bounces, strict=True)
+        ]
+    )
+    return Windows(
+        first=first,
+        steps=round(_SECONDS / physics_dt),
+        origin=origin,
+        angle_times=angle_times,
+        angles=angles,
+        angle_weights=angle_weights,
+        picture_times=picture_times,
+        balls=balls,
+        picture_weights=picture_weights,
+        bounces=bounces,
+        starts=starts,
+    )
+
+
+def _bounces(log: Log) -> list[tuple[float, float, float]]:
+    """Time of each bounce in the pictures, and the time before and after it in free flight, s."""
+    found = []
+    times, balls = log.picture_times, log.ball_positions
+    for run in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > _PICTURE_GAP) + 1):
+        if len(run) < 12:
+            continue
+        t, z = times[run], balls[run, 2]
+        speed = _slopes(t, z, 3)
+        lowest = [
+            i
+            for i in range(4, len(run) - 4)
+            if z[i] == np.min(z[i - 3 : i + 4])
+            and speed[i - 4] < -_BOUNCING < _BOUNCING < speed[i + 4]
+        ]
+        lowest = [i for j, i in enumerate(lowest) if j == 0 or i - lowest[j - 1] > 3]
+        ends = [t[0], *t[lowest], t[-1]]
+        for j, i in enumerate(lowest):
+            # The first and the last flight of a run belong to one window each, others to two.
+            before = (t[i] - ends[j]) * (1.0 if j == 0 else 0.5)
+            after = (ends[j + 2] - t[i]) * (1.0 if j == len(lowest) - 1 else 0.5)
+            before, after = min(before, _REACH), min(after, _REACH)
+            if min(before, after) > 0.5 * _SHORTEST:
+                found.append((float(t[i]), float(before), float(after)))
+    return found
+
+
+def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
+    """Slope [P] of a line through each point and its neighbours."""
+    slopes = np.zeros(len(times))
+    for i in range(len(times)):
+        part = slice(max(i - reach, 0), i + reach + 1)
+        t = times[part] - np.mean(times[part])
+        slopes[i] = t @ values[part] / max(t @ t, 1e-12)
+    return slopes
+
+
+def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
+    """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
+    taken = sorted((start, end) for start, end, _ in spans)
+    gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
+    taken += [(log.times[i], log.times[i + 1]) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + MAX_DELAY
+    pieces, begin = [], first
+    for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
+        length = start - begin
+        if length > _SHORTEST:
+            count = int(np.ceil(length / (2.0 * _REACH)))
+            edges = np.linspace(begin, start, count + 1)
+            pieces += list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+        begin = max(begin, end)
+    return pieces
+
+
+def _padded(
+    indices: list[np.ndarray], times: np.ndarray, zero: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times since each window's start [S, M], weights [S, M] and values [S, M, k]."""
+    # In steps, so that a simulation that was compiled for one log serves others.
+    most = -(-max([len(index) for index in indices] + [1]) // _PADDING) * _PADDING
+    padded = np.zeros((len(indices), most))
+    weights, kept = np.zeros_like(padded), np.zeros((*padded.shape, values.shape[1]))
+    for s, index in enumerate(indices):
+        padded[s, : len(index)] = times[index] - zero[s]
+        weights[s, : len(index)] = 1.0
+        kept[s, : len(index)] = values[index]
+    return padded, weights, kept
+
+
+def _joint_start(log: Log, time: float) -> np.ndarray:
+    """Angles and velocities [2 n] at a time, by a parabola through the measurements near it."""
+    near = np.argsort(np.abs(log.times - time))[:9]
+    t = log.times[near] - time
+    basis = np.stack([np.ones_like(t), t, t * t], axis=1)
+    solution = np.linalg.lstsq(basis, log.joint_angles[near], rcond=None)[0]
+    return np.concatenate([solution[0], solution[1]])
+
+
+def _ball_start(
+    log: Log, pictures: np.ndarray, bounce: float, zero: float, no_ball: np.ndarray
+) -> np.ndarray:
+    """Position, velocity and spin [9] of the ball at a time, by a free fall through the pictures
+    before the bounce."""
+    if not len(pictures):
+        return np.concatenate([no_ball, np.zeros(6)])
+    t = log.picture_times[pictures] - zero
+    before = t < bounce - 0.012
+    t, balls = t[before], log.ball_positions[pictures][before]
+    basis = np.stack([np.ones_like(t), t], axis=1)
+    fall = 0.5 * t[:, None] ** 2 * GRAVITY
+    solution = np.linalg.lstsq(basis, balls - fall, rcond=None)[0]
+    return np.concatenate([solution[0], solution[1], np.zeros(3)])

@@ -1,0 +1,118 @@
+"""What a log shows of a robot's world, and what it does not, in numbers and words."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.identify.stages import Identified
+from bounce_mjx.identify.unknowns import CAMERA_ROTATION
+
+# Half the width of a 95% interval in standard deviations.
+_WIDTH = 1.96
+# An unknown whose deviation fell by less than this factor is not shown by the log.
+_UNSEEN = 0.7
+# Information in units of the prior's below which a combination of unknowns is not shown.
+_WEAK = 1.5
+_SHARE = 0.35
+_GOOD_FIT = 1.2
+
+_MOTIONS = {
+    "encoder_bias": "bounces in other postures of the arm separate them",
+    "paddle_tilt": "bounces in other postures of the arm separate them",
+    "paddle_offset": "bounces in other postures of the arm, and near the paddle's edges, show it",
+    "ball_position_bias": "bounces at places far apart show it",
+    CAMERA_ROTATION: "bounces at places far apart, and a level under the base, show it",
+    "gravity_tilt": "long flights, and a level under the base, show it",
+    "link_mass": "a known weight on the paddle, or slow motions in other postures, show it",
+    "servo_gain": "a known weight on the paddle, or slow motions in other postures, show it",
+    "servo_damping": "faster motions show it (bounce-mjx excite --max-velocity)",
+    "servo_lag": "faster motions show it (bounce-mjx excite --max-velocity)",
+    "action_latency": "faster motions show it (bounce-mjx excite --max-velocity)",
+    "joint_frictionloss": "slow motions there and back show it (bounce-mjx excite)",
+    "contact_friction": "a ball that slips shows it: one with spin, or thrown from the side",
+    "air_drag": "higher flights show it",
+    "ball_latency": "bounces under a fast paddle show it",
+    "restitution": "more bounces show it",
+}
+
+
+class Estimate(NamedTuple):
+    """One unknown."""
+
+    label: str
+    unit: str
+    value: float
+    low: float
+    """Lower end of the 95% interval."""
+    high: float
+    seen: bool
+    """Whether the log shows it; otherwise the interval is the prior's."""
+
+
+def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
+    """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them."""
+    layout, width = found.layout, _WIDTH * found.deviation * misfit(found)
+    seen = found.deviation < _UNSEEN * layout.deviation
+    units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
+    return [
+        Estimate(label, unit, float(x), float(x - w), float(x + w), bool(s))
+        for label, unit, x, w, s in zip(
+            layout.labels(joint_names), units, found.fit.vector, width, seen, strict=True
+        )
+    ]
+
+
+def misfit(found: Identified) -> float:
+    """Factor by which the residuals exceed the sensors' noise, at least 1."""
+    return max(1.0, *found.after.values())
+
+
+def _size(found: Identified, name: str) -> int:
+    place = found.layout.slices()[name]
+    return place.stop - place.start
+
+
+def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
+    """Sentences about the fit and about what the log cannot show."""
+    said = []
+    for sensor, error in found.held_out.items():
+        if error > _GOOD_FIT:
+            said.append(
+                f"The model does not explain {sensor}: its error in windows that the search had "
+                f"not seen is {error:.2f} times the sensor's noise. The robot does something that "
+                "the model lacks, or it is another robot, and the intervals are too narrow."
+            )
+    if found.dropped:
+        said.append(
+            f"In {found.dropped} of {int(np.sum(found.windows.has_ball))} windows, the ball was "
+            "not in free flight; their pictures do not count."
+        )
+    if not np.any(found.windows.has_ball):
+        said.append("The log shows no bounce, so that only the arm was identified.")
+    return said + _unseen(found, joint_names)
+
+
+def _unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
+    """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
+    units of the prior, with small eigenvalues."""
+    layout, labels = found.layout, found.layout.labels(joint_names)
+    owners = [name for name in layout.unknowns for _ in range(_size(found, name))]
+    scaled = found.fit.information * np.outer(layout.deviation, layout.deviation)
+    values, vectors = np.linalg.eigh(scaled)
+    said: dict[frozenset[str], str] = {}
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > _WEAK:
+            break
+        main = np.flatnonzero(np.abs(vector) > _SHARE)
+        names = frozenset(owners[i] for i in main)
+        if not names or names in said:
+            continue
+        motion = next(_MOTIONS[name] for name in _MOTIONS if name in names)
+        if len(main) == 1:
+            text = f"The log does not show {labels[main[0]]}: its interval is the prior's"
+        else:
+            listed = ", ".join(labels[i] for i in main)
+            text = f"The log does not separate {listed}: their intervals are mostly the prior's"
+        said[names] = f"{text}; {motion}."
+    return list(said.values())

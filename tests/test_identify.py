@@ -1,0 +1,227 @@
+"""Identification: its parts against independent computations, and a hidden robot on MuJoCo's C
+engine."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from bounce_mjx.commands.main import main
+from bounce_mjx.identify.fit import Noise, Problem, _eliminate
+from bounce_mjx.identify.log import Log, read_csv
+from bounce_mjx.identify.simulation import _Targets
+from bounce_mjx.identify.stages import identify, joined, sensor_noise
+from bounce_mjx.identify.unknowns import make_layout
+from bounce_mjx.identify.windows import Windows, cut
+from bounce_mjx.identify.words import estimates, sentences
+from bounce_mjx.identify.world import compare, world_of
+from bounce_mjx.reports.identification import identification_page
+from bounce_mjx.runs.config import read_preset
+from bounce_mjx.world.named import read_world
+
+BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"
+NAMES = tuple(f"Joint{i}" for i in range(1, 7))
+NO_BALL = np.array([0.0, 0.0, 50.0])
+
+
+def test_elimination_gives_the_step_of_the_whole_problem() -> None:
+    """Against one dense least-squares problem of all unknowns and all starts."""
+    random = np.random.default_rng(0)
+    windows, rows, unknowns, states = 4, 30, 5, 3
+    r, at_guess = random.normal(size=(windows, rows)), random.normal(size=(windows, states))
+    a, b = (random.normal(size=(windows, rows, k)) for k in (unknowns, states))
+    reduced = _eliminate(r, a, b, at_guess)
+    prior = random.normal(size=unknowns)
+    step = -np.linalg.solve(reduced.information + np.eye(unknowns), reduced.gradient + prior)
+    size = unknowns + windows * states
+    matrix, right = [np.eye(unknowns, size)], [prior]
+    for s in range(windows):
+        place = slice(unknowns + s * states, unknowns + (s + 1) * states)
+        block = np.zeros((rows + states, size))
+        block[:rows, :unknowns], block[:rows, place] = a[s], b[s]
+        block[rows:, place] = np.eye(states)
+        matrix.append(block)
+        right.append(np.concatenate([r[s], at_guess[s]]))
+    dense = -np.linalg.lstsq(np.concatenate(matrix), np.concatenate(right), rcond=None)[0]
+    np.testing.assert_allclose(step, dense[:unknowns], atol=1e-9)
+    np.testing.assert_allclose(reduced.states(step).ravel(), dense[unknowns:], atol=1e-9)
+    whole = np.concatenate(matrix[1:]).T @ np.concatenate(matrix[1:]) + np.eye(size) * 1e-12
+    covariance = np.linalg.inv(whole)[:unknowns, :unknowns]
+    np.testing.assert_allclose(np.linalg.inv(reduced.information), covariance, rtol=1e-6)
+
+
+def flight_log(seconds: float = 6.0, gap: tuple[float, float] = (3.0, 3.5)) -> Log:
+    """A ball that bounces every 0.6 s, without pictures in a gap, and an arm that sways."""
+    times = np.arange(0.0, seconds, 0.01)
+    sway = 0.1 * np.sin(2.0 * times[:, None] + np.arange(6))
+    pictures = np.arange(0.0, seconds, 1.0 / 120.0)
+    pictures = pictures[(pictures < gap[0]) | (pictures > gap[1])]
+    since = (pictures % 0.6) - 0.3
+    height = 0.1 + 0.5 * 9.81 * (0.3**2 - since**2)
+    balls = np.stack([0.6 + 0.0 * height, 0.0 * height, height], axis=1)
+    return Log("here", times, sway, times, sway, pictures, balls, pictures)
+
+
+def windows_of(log: Log) -> Windows:
+    return cut(log, 0.001, NO_BALL)
+
+
+def test_windows_hold_each_bounce_once_and_each_measurement_at_most_once() -> None:
+    log = flight_log()
+    w = windows_of(log)
+    zero = w.origin + 0.001 * w.first
+    found = np.sort((zero + w.bounces)[w.has_ball])
+    # Those at the ends and at the begin of the gap have no flight on one side.
+    expected = [t for t in np.arange(0.6, 5.9, 0.6) if not 2.9 < t < 3.1]
+    np.testing.assert_allclose(found, expected, atol=0.012)
+    times = (zero[:, None] + w.angle_times)[w.angle_weights > 0.0]
+    assert len(np.unique(np.round(times, 6))) == len(times) > 0.9 * len(log.times)
+    pictures = (zero[:, None] + w.picture_times)[w.picture_weights > 0.0]
+    assert not np.any((pictures > 3.0) & (pictures < 3.5))
+    assert np.max(w.picture_times) < w.steps * 0.001
+
+
+def test_a_window_starts_where_the_ball_and_the_arm_were() -> None:
+    log = flight_log()
+    w = windows_of(log)
+    s = int(np.flatnonzero(w.has_ball)[2])
+    t = w.origin + 0.001 * w.first[s]
+    since = (t % 0.6) - 0.3
+    height = 0.1 + 4.905 * (0.09 - since**2)
+    np.testing.assert_allclose(w.starts[s, 12:15], [0.6, 0.0, height], atol=2e-3)
+    np.testing.assert_allclose(w.starts[s, 15:18], [0.0, 0.0, -9.81 * since], atol=2e-2)
+    np.testing.assert_allclose(w.starts[s, :6], 0.1 * np.sin(2.0 * t + np.arange(6)), atol=1e-4)
+    np.testing.assert_allclose(w.starts[s, 6:12], 0.2 * np.cos(2.0 * t + np.arange(6)), atol=5e-3)
+
+
+@pytest.mark.parametrize("latency, lag", [(0.0, 0.0), (0.0237, 0.0), (0.0082, 0.015)])
+def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
+    """Against a simulation with steps a hundred times as short."""
+    random = np.random.default_rng(1)
+    log = flight_log(1.0)
+    log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
+    w = windows_of(log)
+    found = _Targets(log, w, 0.001)(latency, lag)
+    fine = np.arange(0.0, 0.5, 1e-5) + 0.5e-5
+    index = np.searchsorted(log.target_times, fine - latency, side="right") - 1
+    late = log.servo_targets[np.maximum(index, 0)]
+    means = late.reshape(-1, 100, 6).mean(axis=1)
+    expected, state = [], log.servo_targets[0]
+    for mean in means:
+        state = mean if lag == 0.0 else mean + (state - mean) * np.exp(-0.001 / lag)
+        expected.append(state)
+    np.testing.assert_allclose(found[: len(expected)], expected, atol=2e-3)
+
+
+def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
+    """W C W' is the identity for the covariance C of noise and a bounce's common error."""
+    w, noise = windows_of(flight_log()), Noise(np.full(6, 1e-3), np.full(3, 2e-3))
+    problem = Problem(None, w, make_layout(6, True), noise)
+    weights, count = problem.weights(), w.balls.shape[1]
+    s = int(np.flatnonzero(w.has_ball)[0])
+    eye = np.zeros((3 * count, *weights.shape))
+    eye[np.arange(3 * count), s, -3 * count + np.arange(3 * count)] = 1.0
+    whitening = problem.whitened(eye, weights)[:, s, -3 * count :].T
+    after = np.maximum(w.picture_times[s] - w.bounces[s], 0.0) * w.picture_weights[s]
+    covariance = np.diag(np.repeat(w.picture_weights[s], 3))
+    for axis, deviation in enumerate((0.02, 0.02, 0.1)):
+        common = np.zeros((count, 3))
+        common[:, axis] = after * deviation / 2e-3
+        covariance += np.outer(common.ravel(), common.ravel())
+    white = whitening @ covariance @ whitening.T
+    np.testing.assert_allclose(white, np.diag(np.repeat(w.picture_weights[s], 3)), atol=1e-9)
+
+
+def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:
+    random, log = np.random.default_rng(2), flight_log(30.0)
+    noisy = log._replace(
+        joint_angles=log.joint_angles + 1e-3 * random.normal(size=log.joint_angles.shape),
+        ball_positions=log.ball_positions + 2e-3 * random.normal(size=log.ball_positions.shape),
+    )
+    noise = sensor_noise(noisy)
+    np.testing.assert_allclose(noise.angles, 1e-3, rtol=0.15)
+    np.testing.assert_allclose(noise.balls, 2e-3, rtol=0.15)
+
+
+def test_logs_are_joined_without_a_window_over_both() -> None:
+    one, other = flight_log(3.0), flight_log(2.0)
+    log = joined([one, other._replace(times=other.times + 1e6, target_times=other.times + 1e6)])
+    assert np.all(np.diff(log.times) > 0.0) and len(log.times) == 500
+    w = windows_of(log)
+    ends = w.origin + 0.001 * w.first + np.max(w.angle_times, axis=1)
+    assert not np.any((w.origin + 0.001 * w.first < 2.9) & (ends > 3.9))
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory: pytest.TempPathFactory):
+    """A hidden robot of a tuning seed: its truth, its log of 16 s, and what was identified."""
+    benchmark = runpy.run_path(str(BENCHMARK))
+    config, path = read_preset(Path("default")).env, tmp_path_factory.mktemp("hidden") / "log.csv"
+    truth = benchmark["record"](config, 1000, path, excited=10.0, played=9.0).world
+    log = read_csv(path, NAMES)
+    return truth, log, identify(config, log)
+
+
+@pytest.mark.slow
+def test_a_hidden_robot_is_identified(hidden) -> None:
+    truth, _, found = hidden
+    world = found.layout.world(found.fit.vector)
+    late, true = (w["action_latency"] + w["servo_lag"] for w in (world, truth))
+    assert abs(late - true) < 1.5e-3
+    # A lag near 0 differs from a latency only in the second order.
+    assert abs(world["servo_lag"] - truth["servo_lag"]) < 5e-3
+    assert abs(world["restitution"] - truth["restitution"]) < 0.03
+    damping, true = (w["servo_damping"] / w["servo_gain"] for w in (world, truth))
+    np.testing.assert_allclose(damping, true, rtol=0.3)
+    # The fit explains the log down to the noise, which the model's own world does not.
+    assert found.before["ball_position"] > 2.0
+    assert all(0.8 < error < 1.2 for error in found.after.values())
+    assert all(error < 1.3 for error in found.held_out.values())
+
+
+@pytest.mark.slow
+def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
+    truth, log, found = hidden
+    path = tmp_path / "world.yaml"
+    path.write_text(world_of(found, log, NAMES, None), encoding="utf-8")
+    world = read_world(path)
+    ranges = world.settings["randomization"]
+    low, high = ranges["action_latency"]
+    assert low - 3e-3 < truth["action_latency"] < high + 3e-3 and high - low < 0.01
+    assert 115.0 < np.mean(ranges["camera_rate"]) < 125.0
+    assert ranges["frame_drop"][0] < 0.05 < ranges["frame_drop"][1] + 0.02
+    # Gain and mass cannot be told apart by such a log, and the file says so.
+    assert "randomization.link_mass" in world.assumed
+    assert any("link_mass" in sentence for sentence in sentences(found, NAMES))
+    assert compare(world, found, log, NAMES) == []
+    values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    values["env"]["randomization"]["action_latency"] = [high + 0.01, high + 0.02]
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    (changed,) = compare(read_world(path), found, log, NAMES)
+    assert changed.startswith("action_latency is ") and "outside of" in changed
+
+
+@pytest.mark.slow
+def test_page_shows_every_estimate(hidden) -> None:
+    _, log, found = hidden
+    page = identification_page(found, log.source, NAMES)
+    assert all(entry.label in page for entry in estimates(found, NAMES))
+    assert "data:image/svg+xml" in page
+
+
+@pytest.mark.parametrize(
+    "args, sentence",
+    [
+        ([], "no log is given"),
+        (["nowhere.csv"], "the log nowhere.csv is no file"),
+        (["x.csv", "--check", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_identify_command_refuses(args, sentence, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["identify", *args])
+    assert end.value.code == 2 and sentence in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
