@@ -167,7 +167,7 @@ def late_arms():
         r"^\| (\d+) \| (.+) / (.+) \| (.+) / (.+) \| (.+) / (.+) \|$", table, re.MULTILINE
     )
     latency, *shares = np.array(rows, float).T
-    labels = "from the measured angles", "from the last targets", "and their lead is seen"
+    labels = "the measured angles", "the last targets", "the last targets, lead seen"
     figure, axes = plt.subplots(1, 2, figsize=(8.4, 2.8), sharey=True, layout="constrained")
     for column, title in enumerate(("episodes that last 20 s, %", "right heights, %")):
         for i, label in enumerate(labels):
@@ -175,7 +175,7 @@ def late_arms():
                 latency, shares[2 * i + column], "o-", ms=3, color=LINES[i], label=label
             )
         axes[column].set(title=title, xlabel="action latency, ms", ylim=(-3, 103))
-    axes[0].legend(title="actions add", loc="lower left")
+    axes[0].legend(title="actions add to", loc="lower left")
     return figure
 
 
