@@ -160,6 +160,25 @@ def start_times():
     return figure
 
 
+def late_arms():
+    """Share of lasting episodes and of right heights over the action latency, from notes.md."""
+    table = NOTES.read_text(encoding="utf-8").split("\n| ms | measured angles |", 1)[1]
+    rows = re.findall(
+        r"^\| (\d+) \| (.+) / (.+) \| (.+) / (.+) \| (.+) / (.+) \|$", table, re.MULTILINE
+    )
+    latency, *shares = np.array(rows, float).T
+    labels = "the measured angles", "the last targets", "the last targets, lead seen"
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 2.8), sharey=True, layout="constrained")
+    for column, title in enumerate(("episodes that last 20 s, %", "right heights, %")):
+        for i, label in enumerate(labels):
+            axes[column].plot(
+                latency, shares[2 * i + column], "o-", ms=3, color=LINES[i], label=label
+            )
+        axes[column].set(title=title, xlabel="action latency, ms", ylim=(-3, 103))
+    axes[0].legend(title="actions add to", loc="lower left")
+    return figure
+
+
 def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     """An episode of `pretrained`, which acts on the true state: times, observations and their
     layout, true quantities, metrics."""
@@ -441,8 +460,8 @@ def page():
 
 
 PICTURES = (
-    task, control_step, start_times, episode, reward_terms, sensors, two_policies, gradient, arms,
-    page, parity,
+    task, control_step, start_times, late_arms, episode, reward_terms, sensors, two_policies,
+    gradient, arms, page, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""
 

@@ -148,7 +148,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     # Playground's own program reads its flags.
     if not args or args == ["--help"] or name == "bounce_mjx.adapters.playground":
         return
-    for flag in {"--resume", "--robot"} & set(args):  # their files would have to exist
+    for flag in {"--resume", "--robot", "--world"} & set(args):  # their files would have to exist
         at = args.index(flag)
         args = args[:at] + args[at + 2 :]
     # A module that the command imports below would keep the changed function.
@@ -217,8 +217,8 @@ def leaves(plain: dict, prefix: str = "") -> dict:
     """The values of a nested mapping by dotted name."""
     found = {}
     for name, value in plain.items():
-        inner = leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else None
-        found |= inner if inner is not None else {prefix + name: value}
+        inner = leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {}
+        found |= inner or {prefix + name: value}
     return found
 
 

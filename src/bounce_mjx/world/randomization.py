@@ -170,6 +170,10 @@ class RandomizationConfig(StrictModel):
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps of the training over which the ranges grow from the nominal values."""
 
+    def __hash__(self) -> int:
+        """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
+        return hash(self.model_dump_json())
+
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
         for name in self.shares.keys() - TERMS.keys():
