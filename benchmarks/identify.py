@@ -238,7 +238,7 @@ def covered(found: Identified, hidden: Hidden) -> tuple[int, int]:
     truth = found.layout.vector(known)
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
     inside = [e.low <= x <= e.high for e, x in zip(listed, truth, strict=True) if e.seen]
-    return sum(inside), len(inside)
+    return int(sum(inside)), len(inside)
 
 
 def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:
