@@ -122,56 +122,32 @@ def minimise(
       weights: of the residuals [S, M].
       free_states: which entries [D] of the starts may change; all by default.
     """
-    layout = problem.layout
-    deviations, differences = _per_state(problem.windows)
-    guess = problem.windows.starts
-    prior_mean, prior = layout.mean, layout.deviation
+    layout, guess = problem.layout, problem.windows.starts
+    deviations, _ = _per_state(problem.windows)
+    place, now = np.flatnonzero(free), np.inf
+    of_state = np.arange(starts.shape[1]) if free_states is None else np.flatnonzero(free_states)
+    scale, reach = layout.deviation[place], deviations[of_state]
+    # The start of a window that does not count stays as it is.
+    counts = np.any(weights > 0.0, axis=1)[:, None]
 
-    def costs(r: np.ndarray, states: np.ndarray) -> np.ndarray:
+    def costs(predicted: Predicted, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
+        r = problem.whitened(problem.residuals(predicted), weights)
         of_states = np.sum(((states - guess) / deviations) ** 2, axis=2)
         return 0.5 * (np.sum(r**2, axis=2) + of_states)
 
     def of_prior(vectors: np.ndarray) -> np.ndarray:
-        return 0.5 * np.sum(((vectors - prior_mean) / prior) ** 2, axis=-1)
+        return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
-    place, now = np.flatnonzero(free), np.inf
-    of_state = np.arange(starts.shape[1]) if free_states is None else np.flatnonzero(free_states)
-    num_free, num_states = len(place), len(of_state)
-    num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
-    # Unknowns for which the pictures need another difference, if any picture counts.
-    apart = layout.ball_step[place] != layout.step[place]
-    apart = np.flatnonzero(apart & np.any(weights[:, num_angles:] > 0.0))
-    own, reach = differences[of_state], deviations[of_state]
-    # The start of a window that does not count stays as it is.
-    counts = np.any(weights > 0.0, axis=1)[:, None]
     for iteration in range(iterations):
-        vectors = np.repeat(vector[None], 1 + num_free + num_states + len(apart), axis=0)
-        states = np.repeat(starts[None], len(vectors), axis=0)
-        steps = layout.step[place].copy()
-        # Differences that stay within the limits.
-        ahead = layout.clipped(vector + layout.step)[place] - vector[place]
-        steps = np.where(np.abs(ahead) < 0.5 * steps, -steps, steps)
-        vectors[1 + np.arange(num_free), place] += steps
-        wide = layout.ball_step[place[apart]]
-        vectors[1 + num_free + num_states + np.arange(len(apart)), place[apart]] += wide
-        for i, d in enumerate(of_state):
-            states[1 + num_free + i, :, d] += differences[d]
-        predicted = problem.simulate(vectors, states)
-        r = problem.whitened(problem.residuals(predicted), weights)
-        now = float(np.sum(costs(r[:1], states[:1])) + of_prior(vector))
-        by_unknown = np.moveaxis(r[1 : 1 + num_free] - r[0], 0, -1) / steps
-        by_state = np.moveaxis(r[1 + num_free : 1 + num_free + num_states] - r[0], 0, -1) / own
-        by_ball = np.moveaxis(
-            r[1 + num_free + num_states :, :, num_angles:] - r[0, :, num_angles:], 0, -1
-        )
-        by_unknown[:, num_angles:, apart] = by_ball / wide
-        scale = prior[place]
+        line = _linearised(problem, vector, starts, place, of_state, weights)
+        now = float(np.sum(costs(line.predicted, starts[None])) + of_prior(vector))
         at_guess = (starts - guess)[:, of_state] / reach
-        reduced = _eliminate(r[0], by_unknown * scale, by_state * reach, at_guess)
-        information, gradient = reduced.information, reduced.gradient
-        at_prior = (vector[place] - prior_mean[place]) / scale
-        hessian, slope = information + np.eye(num_free), gradient + at_prior
+        reduced = _eliminate(
+            line.residuals, line.by_unknown * scale, line.by_state * reach, at_guess
+        )
+        hessian = reduced.information + np.eye(len(place))
+        slope = reduced.gradient + (vector[place] - layout.mean[place]) / scale
         tried_vectors = np.repeat(vector[None], CHUNK, axis=0)
         tried_states = np.repeat(starts[None], CHUNK, axis=0)
         for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
@@ -181,7 +157,7 @@ def minimise(
             change = (tried_vectors[i, place] - vector[place]) / scale
             tried_states[i][:, of_state] += share * reduced.states(change) * reach * counts
         outcome = problem.simulate(tried_vectors, tried_states)
-        tried = costs(problem.whitened(problem.residuals(outcome), weights), tried_states)
+        tried = costs(outcome, tried_states)
         tried = np.where(np.isfinite(tried), tried, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
         totals = np.sum(np.min(tried, axis=1), axis=1) + of_prior(tried_vectors[:: len(_SHARES)])
         damping = int(np.argmin(totals))
@@ -189,9 +165,9 @@ def minimise(
         gain = now - totals[damping]
         log(f"step {iteration + 1}: {now:.1f} -> {totals[damping]:.1f}")
         whole = np.zeros((len(vector), len(vector)))
-        whole[np.ix_(place, place)] = information / np.outer(scale, scale)
+        whole[np.ix_(place, place)] = reduced.information / np.outer(scale, scale)
         if not gain > 0.0:
-            predicted = Predicted(*(part[0] for part in predicted))
+            predicted = Predicted(*(part[0] for part in line.predicted))
             return Fit(vector, starts, whole, predicted, weights, now)
         each = np.arange(len(starts))
         vector, starts = tried_vectors[best[0]], tried_states[best, each]
@@ -200,6 +176,57 @@ def minimise(
         if gain < _CONVERGED:
             break
     return Fit(vector, starts, whole, predicted, weights, now)
+
+
+class _Linearised(NamedTuple):
+    """The residuals at a point, and their derivatives by differences."""
+
+    predicted: Predicted
+    """At the point [1, S, ...]."""
+    residuals: np.ndarray
+    """[S, M]."""
+    by_unknown: np.ndarray
+    """[S, M, F]."""
+    by_state: np.ndarray
+    """[S, M, D]."""
+
+
+def _linearised(
+    problem: Problem,
+    vector: np.ndarray,
+    starts: np.ndarray,
+    place: np.ndarray,
+    of_state: np.ndarray,
+    weights: np.ndarray,
+) -> _Linearised:
+    """Derivatives by the F unknowns at `place` and the D entries `of_state` of the starts."""
+    layout, (_, differences) = problem.layout, _per_state(problem.windows)
+    num_free, own = len(place), differences[of_state]
+    num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
+    # Unknowns for which the pictures need another difference, if any picture counts.
+    apart = layout.ball_step[place] != layout.step[place]
+    apart = np.flatnonzero(apart & np.any(weights[:, num_angles:] > 0.0))
+    at_states, at_apart = 1 + num_free, 1 + num_free + len(of_state)
+    vectors = np.repeat(vector[None], at_apart + len(apart), axis=0)
+    states = np.repeat(starts[None], len(vectors), axis=0)
+    # Differences that stay within the limits.
+    steps = layout.step[place].copy()
+    ahead = layout.clipped(vector + layout.step)[place] - vector[place]
+    steps = np.where(np.abs(ahead) < 0.5 * steps, -steps, steps)
+    vectors[1 + np.arange(num_free), place] += steps
+    wide = layout.ball_step[place[apart]]
+    vectors[at_apart + np.arange(len(apart)), place[apart]] += wide
+    for i, d in enumerate(of_state):
+        states[at_states + i, :, d] += differences[d]
+    predicted = problem.simulate(vectors, states)
+    r = problem.whitened(problem.residuals(predicted), weights)
+    change = np.moveaxis(r[1:] - r[0], 0, -1)
+    by_unknown, by_state = (
+        change[..., :num_free] / steps,
+        change[..., num_free : at_apart - 1] / own,
+    )
+    by_unknown[:, num_angles:, apart] = change[:, num_angles:, at_apart - 1 :] / wide
+    return _Linearised(Predicted(*(part[:1] for part in predicted)), r[0], by_unknown, by_state)
 
 
 class _Reduced(NamedTuple):

@@ -148,57 +148,101 @@ def identify(
     layout = make_layout(config.num_joints, with_ball, camera_rotation)
     run, noise = make_run(config, config.num_joints), sensor_noise(log)
 
-    def problem_of(log: Log) -> Problem:
+    def search_in(log: Log) -> _Search:
         windows = cut(log, config.physics_dt, _NO_BALL)
         simulate = make_simulator(run, layout, log, windows, config.physics_dt)
-        return Problem(simulate, windows, layout, noise)
+        return _Search(Problem(simulate, windows, layout, noise), progress)
 
-    problem = problem_of(log)
-    n, held = config.num_joints, np.arange(len(windows.first)) % _HELD_OUT == _HELD_OUT - 1
-    arm_state = np.arange(windows.starts.shape[1]) < 2 * n
-    training = np.where(held, 0.0, 1.0)[:, None]
+    search, fit = _arm(search_in(log), search_in(_regular(log)))
+    stages, states = ["arm"], search.arm_state
+    pictures = np.ones_like(search.problem.windows.picture_weights)
+    if with_ball:
+        fit, pictures = _ball(search, fit)
+        stages, states = ["arm", "flight", "bounce"], None
+    progress("all")
+    fit = search.run(stages, fit, pictures, 6, states)
+    tested = search.tested(fit, pictures, states)
+    fit = search.run(stages, tested, pictures, 3, states, np.ones_like(search.training))
+    return _identified(search.problem, fit, _errors(search.problem, tested))
 
-    def search(stages, fit, pictures, iterations, states=None, mask=training, free=None):
-        """A search with the problem at hand."""
-        free = layout.free(stages) if free is None else free
-        weights = problem.weights(pictures=pictures) * mask
+
+class _Search(NamedTuple):
+    """Searches with one problem, on the windows that are not held out."""
+
+    problem: Problem
+    progress: Callable[[str], None]
+
+    @property
+    def training(self) -> np.ndarray:
+        """1 for each window of the search [S, 1], 0 for those held out."""
+        index = np.arange(len(self.problem.windows.first))
+        return np.where(index % _HELD_OUT == _HELD_OUT - 1, 0.0, 1.0)[:, None]
+
+    @property
+    def arm_state(self) -> np.ndarray:
+        """Which entries [D] of a window's start are the arm's."""
+        return np.arange(self.problem.windows.starts.shape[1]) < 2 * self.problem.layout.num_joints
+
+    def run(
+        self,
+        stages: Sequence[str],
+        fit: Fit,
+        pictures: np.ndarray | float,
+        iterations: int,
+        states: np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+    ) -> Fit:
+        """The fit after a search over the unknowns of some stages.
+
+        Args:
+          pictures: weights of the pictures [S, B].
+          states: which entries [D] of the starts may change; all by default.
+          mask: weights of the windows [S, 1]; `training` by default.
+        """
+        weights = self.problem.weights(pictures=pictures)
+        weights = weights * (self.training if mask is None else mask)
+        free = self.problem.layout.free(stages) if stages else np.zeros(len(fit.vector), bool)
         return minimise(
-            problem, fit.vector, fit.starts, free, weights, iterations, states, progress
+            self.problem, fit.vector, fit.starts, free, weights, iterations, states, self.progress
         )
 
-    progress("arm")
-    fit = _first(problem, training)
-    fit = search(["arm"], fit, 0.0, 10, arm_state)
-    regular = problem_of(_regular(log))
-    if len(regular.windows.first) == len(windows.first):
-        irregular, problem = problem, regular
-        other = fit._replace(starts=regular.windows.starts)
-        other = search(["arm"], other, 0.0, 5, arm_state)
+    def tested(self, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None) -> Fit:
+        """The fit with the starts of the windows that were held out, and nothing else, searched."""
+        return self.run([], fit, pictures, 3, states, 1.0 - self.training)
+
+
+def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
+    """The arm alone, with the log's time stamps or with regular ones, if they explain it better."""
+    search.progress("arm")
+    fit = _first(search.problem, search.training)
+    fit = search.run(["arm"], fit, 0.0, 10, search.arm_state)
+    windows = regular.problem.windows
+    if len(windows.first) == len(search.problem.windows.first):
+        other = fit._replace(starts=windows.starts)
+        other = regular.run(["arm"], other, 0.0, 5, regular.arm_state)
         if other.cost < fit.cost:
-            progress("the time stamps jitter about regular steps, which explain the log better")
-            fit, windows = other, regular.windows
-        else:
-            problem = irregular
-    pictures, stages = np.ones_like(windows.picture_weights), ["arm"]
-    if with_ball:
-        progress("flight")
-        flying = windows.picture_times < windows.bounces[:, None] - _BEFORE_BOUNCE
-        fit = search(["flight"], fit, flying * 1.0, 4, ~arm_state)
-        progress("bounce")
-        fit = _first_latency(problem, fit, training)
-        fit = search(["flight", "bounce"], fit, 1.0, 5, ~arm_state)
-        nothing = np.zeros(len(fit.vector), bool)
-        tested = search([], fit, 1.0, 3, ~arm_state, 1.0 - training, nothing)
-        pictures = picture_weights(problem, tested.predicted)
-        fit = search(["flight", "bounce"], tested, pictures, 6, ~arm_state)
-        stages = ["arm", "flight", "bounce"]
-    progress("all")
-    states = None if with_ball else arm_state
-    fit = search(stages, fit, pictures, 6, states)
-    nothing = np.zeros(len(fit.vector), bool)
-    tested = search([], fit, pictures, 3, states, 1.0 - training, nothing)
-    held_out = _errors(problem, tested)
-    fit = search(stages, tested, pictures, 3, states, np.ones_like(training))
+            message = "the time stamps jitter about regular steps, which explain the log better"
+            search.progress(message)
+            return regular, other
+    return search, fit
+
+
+def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
+    """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
+    windows, ball_state = search.problem.windows, ~search.arm_state
+    search.progress("flight")
+    flying = windows.picture_times < windows.bounces[:, None] - _BEFORE_BOUNCE
+    fit = search.run(["flight"], fit, flying * 1.0, 4, ball_state)
+    search.progress("bounce")
+    fit = _first_latency(search.problem, fit, search.training)
+    fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
+    tested = search.tested(fit, 1.0, ball_state)
+    pictures = picture_weights(search.problem, tested.predicted)
+    return search.run(["flight", "bounce"], tested, pictures, 6, ball_state), pictures
+
+
+def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Identified:
+    layout, windows = problem.layout, problem.windows
     nominal = {name: TERMS[name].nominal for name in layout.unknowns if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
     shown = problem.simulate(own[None], fit.starts[None])
