@@ -106,7 +106,7 @@ def table(records: list[dict]) -> str:
             f"{100 * r['up_share']:.2f}",
             figure_text(r["results"]["horizontal position"]),
             figure_text(r["results"]["height"]),
-            figure_text(r["mean_apex_error_m"], ".1f", 100.0),
+            figure_text(100.0 * r["mean_apex_error_m"], ".1f"),
             f"{r['seconds']:.1f}",
             f"{r['peak_process_mib']:.0f}",
             f"{r['device_mib']:.0f}",

@@ -50,7 +50,6 @@ from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import in_whole_blocks
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
 _NAMES = {
@@ -152,7 +151,6 @@ def train_here(command: Command) -> None:
     """Trains in this process, and writes each evaluation as it ends."""
     (method,) = command.methods
     config = TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
-    config = in_whole_blocks(config)
     with (command.out / _RECORDS).open("a", encoding="utf-8") as file:
         TRAINERS[method](config, _Judge(command, config, method, file))
 

@@ -105,7 +105,7 @@ def table(records: list[dict], engines: tuple[str, ...]) -> str:
             *[figure_text(result["value"]) for result in r["engines"][engine]["results"]],
             "pass" if r["engines"][engine]["passed"] else "FAIL",
             f"{r['engines'][engine]['details']['mean_consecutive_bounces']:.1f}",
-            figure_text(r["engines"][engine]["details"]["mean_apex_error_m"], ".1f", 100.0),
+            figure_text(100.0 * r["engines"][engine]["details"]["mean_apex_error_m"], ".1f"),
         ]
         for r in records
         for engine in engines

@@ -14,7 +14,7 @@ from bounce_mjx import load_policy
 from bounce_mjx.resources import resource_path
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-RATE, SECONDS = 500, 7.0
+RATE, SECONDS = 500, 9.0
 
 
 class World:

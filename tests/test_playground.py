@@ -127,7 +127,7 @@ def test_program_without_playground_gives_one_sentence(tmp_path):
     )
     assert done.returncode == 2
     sentence = "error: MuJoCo Playground cannot be imported (it is not installed); install it with"
-    assert done.stderr == f"{sentence} pip install playground\n"
+    assert done.stderr == f"{sentence}: pip install 'playground<1'\n"
 
 
 @pytest.mark.slow

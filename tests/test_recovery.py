@@ -813,7 +813,7 @@ def test_file_size_limit_loses_nothing(tmp_path: Path, straight: Path) -> None:
     ) as training:
         training.wait_until_said("device:")
         process, limit = training.process.pid, resource.RLIMIT_FSIZE
-        old = resource.prlimit(process, limit, (2**16, resource.RLIM_INFINITY))
+        old = resource.prlimit(process, limit, (2**14, resource.RLIM_INFINITY))
         finish_once_there_is_room(
             training, lambda: resource.prlimit(process, limit, old), "File too large"
         )

@@ -272,7 +272,7 @@ except ImportError as error:
     shape, sentence = done.stdout.splitlines()
     assert shape == "(29,)"
     assert sentence.startswith("PyTorch cannot be imported")
-    assert sentence.endswith("install it with pip install 'bounce_mjx[torch]'")
+    assert sentence.endswith("install it with: pip install 'bounce_mjx[torch]'")
 
 
 # rsl_rl

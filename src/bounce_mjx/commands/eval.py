@@ -119,7 +119,7 @@ def _progress(console: Console) -> Iterator[Callable[[float], None]]:
                 first, started = share, time.monotonic()
             spent, left = time.monotonic() - started, 1.0 - share
             slow = spent * left >= _SILENT_SECONDS * (share - first)
-            if not console.is_terminal and slow and left and share - max(said, first) >= 0.1:
+            if not console.is_terminal and slow and left and share - max(said, first) > 0.0999:
                 said = share
                 console.print(f"{share:.0%} evaluated", highlight=False)
 

@@ -212,7 +212,7 @@ class Env:
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
             own_share, shares = self.config.randomization.share, self.config.randomization.shares
-            share, shares = (own_share, shares) if share is None else (share, {})
+            share, shares = (own_share, shares or {}) if share is None else (share, {})
             dtype = jnp.result_type(float)
             world = draw_world(ranges, world_rng, dtype, self.action_size, share, shares)
             parameters = physics_parameters(world, self.mj_model)

@@ -419,10 +419,14 @@ class _Job:
         rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         self.reporter.block(self.steps, seconds, metrics)
-        problems = [writer.problem(wait=False) for writer in self.writers]
-        self.reporter.saving_problem(next(filter(None, problems), None))
+        self._report_saving(wait=False)
         self._check_faults(faults)
         self.clock.lap("train")
+
+    def _report_saving(self, wait: bool) -> None:
+        """Says whether the last save failed; `wait` is that of `CheckpointWriter.problem`."""
+        problems = [writer.problem(wait) for writer in self.writers]
+        self.reporter.saving_problem(next(filter(None, problems), None))
 
     def _check_faults(self, faults: np.ndarray) -> None:
         """Ends a training that diverged, because its state is useless; with several seeds, the
@@ -465,6 +469,8 @@ class _Job:
         # A second signal may end the process at any time, so the log must already hold every step
         # of the checkpoint.
         self.reporter.flush()
+        # Each save waits for the one before.
+        self._report_saving(wait=True)
         several = self.config.num_seeds > 1
         library = {"library": self.trainer.library}
         plain = [member.progress.model_dump() | library for member in self.members]

@@ -165,7 +165,7 @@ class RandomizationConfig(StrictModel):
     """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
     value. A small share allows wide ranges of single terms, even if no policy can handle all their
     extremes together."""
-    shares: dict[str, UnitInterval] = {}
+    shares: dict[str, UnitInterval] | None = None
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps of the training over which the ranges grow from the nominal values."""
@@ -176,7 +176,7 @@ class RandomizationConfig(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
-        for name in self.shares.keys() - TERMS.keys():
+        for name in (self.shares or {}).keys() - TERMS.keys():
             raise ValueError(
                 f"shares has a probability for {shorten(name)}, which is no term; remove it"
             )
