@@ -383,9 +383,8 @@ class Env:
         )
         control = Control(self._ctrl([start.position for start in starts]), moving)
         setpoint = Setpoint(*map(jnp.stack, zip(*after, strict=True)))
-        kept = before._replace(setpoint=setpoint)
-        if self.config.action.base == "target":
-            kept = kept._replace(ctrl=self._ctrl([x.position for x in after]))
+        # Limits need the base target (`WorldConfig`), so the next action adds to the targets.
+        kept = before._replace(setpoint=setpoint, ctrl=self._ctrl([x.position for x in after]))
         return state.replace(pipeline_state=kept), control
 
     def _smoothing(self, dtype: jnp.dtype) -> jax.Array | None:
