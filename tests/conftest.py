@@ -37,6 +37,8 @@ if OPTIONAL and not importlib.util.find_spec("stable_baselines3"):
 
 # Before JAX starts its devices.
 os.environ.setdefault("XLA_FLAGS", OPTION)
+# `uv run pytest` sets it, and the hints of errors would begin with uv.
+os.environ.pop("UV_RUN_RECURSION_DEPTH", None)
 
 
 def pytest_configure(config: pytest.Config) -> None:

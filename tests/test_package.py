@@ -133,10 +133,7 @@ try:
 except ImportError as error:
     print(isinstance(error, UserError), error)
 """
-    environ = {k: v for k, v in os.environ.items() if k != "UV_RUN_RECURSION_DEPTH"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=environ
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == (
         "True MuJoCo Playground 1.0.2 is installed, but this adapter needs a version below 1; "
         "install it with: pip install 'playground<1'\n"

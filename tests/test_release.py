@@ -22,7 +22,7 @@ pytestmark = [
 
 def call(*words: object, folder: Path, status: int = 0, **variables: str) -> str:
     """The output of a program."""
-    hidden = ("PYTHONPATH", "VIRTUAL_ENV", "UV_RUN_RECURSION_DEPTH")
+    hidden = ("PYTHONPATH", "VIRTUAL_ENV")
     environ = {name: value for name, value in os.environ.items() if name not in hidden}
     done = subprocess.run(
         [str(word) for word in words],

@@ -502,7 +502,6 @@ def test_adopting_ends_by_itself_and_view_shows_the_arm(tmp_path, monkeypatch, c
 
 def test_a_missing_package_of_a_robot_names_the_command_of_the_docs(monkeypatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
     page = (Path(__file__).parents[1] / "docs/other-robots.md").read_text(encoding="utf-8")
     mjcf_file = Path("package:robosuite/models/assets/robots/panda/robot.xml")
     for variable, command in (({}, "pip install"), ({"UV_RUN_RECURSION_DEPTH": "1"}, "uv pip")):
