@@ -173,6 +173,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
 @pytest.mark.parametrize(
     ("values", "words"),
     [
+        ({"restitution_slope": (0, 0.02)}, "restitution_slope is given without restitution; give"),
         ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range; give the lower end first"),
         ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
