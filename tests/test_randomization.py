@@ -45,6 +45,7 @@ RANGES = {
     name: (max(term.limits[0], 0.8), min(term.limits[1], 0.9)) for name, term in TERMS.items()
 }
 RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
+RANGES |= {"restitution_slope": (0.02, 0.05)}
 
 
 def test_draws_are_uniform_in_their_ranges() -> None:
