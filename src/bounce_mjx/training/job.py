@@ -194,7 +194,9 @@ class _Job:
             envs = f"{self.config.ppo.num_envs:,} environments"
             return f"{self.device} has too little memory for {envs} ({reason}); lower num_envs"
         fewer = ", with --num-devices 1 if one is left" if self.trainer.mesh.size > 1 else ""
-        return f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice()}{fewer}"
+        return (
+            f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice()}{fewer}"
+        )
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process or a device."""
