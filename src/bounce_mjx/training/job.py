@@ -124,6 +124,9 @@ def train(
             job.train()
             job.finish()
         except jax.errors.JaxRuntimeError as error:
+            if jax.process_count() > 1:
+                # It may be the death of another process, which `hosts` reports.
+                raise
             raise UserError(job.failure(error)) from error
         return job.members
 
@@ -203,8 +206,8 @@ class _Job:
         latest = self._latest()
         if latest is None:
             return "start again, as no checkpoint had been saved yet"
-        hosts = " on every host" if jax.process_count() > 1 else ""
-        return f"{self._go_on}{hosts} (the last checkpoint is {latest.folder})"
+        everywhere = " on every host" if jax.process_count() > 1 else ""
+        return f"{self._go_on}{everywhere} (the last checkpoint is {latest.folder})"
 
     def _latest(self) -> folders.Checkpoint | None:
         with contextlib.suppress(UserError):
