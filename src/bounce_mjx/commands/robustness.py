@@ -10,7 +10,7 @@ from rich.progress import Progress
 from bounce_mjx.commands.run_options import PolicyCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
     DEFAULT_CONDITION_EPISODES,
     DEFAULT_SEED,
@@ -30,6 +30,8 @@ class RobustnessCommand(PolicyCommand):
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
     numbers is a condition too."""
+    assumed: bool = False
+    """Only the world itself and twice each of its assumed numbers, without the suite."""
     suite: Path | None = None
     """YAML file of the perturbations, or the name of one in configs/; the default is robustness,
     which is version 1, and robustness_v2 is version 2."""
@@ -66,17 +68,23 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.runs.reading import read_policy
         from bounce_mjx.training.setup import set_up_jax
 
+    if command.assumed and command.world is None:
+        raise UserError("--assumed is about a named world; give one with --world, or leave it out")
     console = Console()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
     config = command.config(checkpoint.run)
     suite = resource_path("configs/robustness.yaml")
     if command.suite is not None:
         suite = named_file(command.suite, "configs")
-    world, assumed = None, None
+    world, assumed = None, {}
     if command.world is not None:
         there, named = in_world(config, command.world)
         world, assumed = there.env, named.doubled()
     conditions = load_suite(suite, config.env, world, assumed)
+    version = read_suite(suite).version
+    if command.assumed:
+        conditions, version = conditions[: 1 + len(assumed)], ""
+        suite = f"twice what {command.world} assumes"
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
     policy = read_policy(checkpoint, config)
     shipped = checkpoint.run in map(resource_path, POLICIES.values())
@@ -98,7 +106,7 @@ def main(args: Sequence[str]) -> None:
         checkpoint=str(checkpoint.folder),
         steps=checkpoint.steps,
         suite=str(suite),
-        version=read_suite(suite).version,
+        version=version,
         episodes=command.episodes,
         seed=command.seed,
         measured=outcomes[0].measured,
