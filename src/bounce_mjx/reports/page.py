@@ -17,7 +17,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
@@ -37,7 +37,7 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     config = load_run_config(checkpoint.run)
     policy = read_policy(checkpoint, config)
     env = Env(config.env)
-    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    networks = networks_of(config.ppo)(env)
     evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
     return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
 

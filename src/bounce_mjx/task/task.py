@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
@@ -206,11 +206,6 @@ class Task:
         """What a viewer writes over an environment, by name; the first stands for all where there
         is little room."""
         return {}
-
-    def script(self) -> Callable[[Kinematics, Values], jax.Array] | None:
-        """A hand-written controller to compare a policy with: (truth, command) -> action [n];
-        None if there is none for this robot."""
-        return None
 
     def focus(self) -> tuple[float, float, float]:
         """Point at which a viewer looks, m: the paddle below the ball at a reset."""
