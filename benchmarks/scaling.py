@@ -1,133 +1,199 @@
 """Scaling of the training with the number of seeds and with the number of devices.
 
-    python benchmarks/scaling.py --num-seeds 1 4 16 --num-devices 1 2 4
+    python benchmarks/scaling.py --num-seeds 1 16
+    python benchmarks/scaling.py --config transfer --num-devices 1 2 --num-envs 8192 32768
 
-Seeds: the time of one block of training with S seeds in one program, relative to one seed. Devices:
-environment steps per second on D devices with `--num-envs` environments on each, relative to one
-device. The hyperparameters come from the preset. Only the compiled block is timed. The fastest
-repeat counts, because other work on the machine can only slow a repeat down.
+Each program trains the same environments per seed on all its devices together, so that the global
+batch is equal. The programs take turns: a turn is one compiled block of each, and the table has the
+median of the blocks and of each turn's ratio to the first program. `--profile` also says, from one
+more block of each program, how long a device computes, exchanges, and waits.
 """
 
+import concurrent.futures
+import itertools
+import statistics
 import sys
+import tempfile
 import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated
 
 import jax
+from jax.profiler import ProfileData
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
-from bounce_mjx import BounceBall
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.ppo import make_trainer, population
-from bounce_mjx.runs.config import read_preset
-from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
-from bounce_mjx.training.setup import compiler_options, set_up_gpu
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.runs.config import TrainConfig, read_preset
+from bounce_mjx.training.ppo_trainer import PPOTrainer
+from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.training.trainer import iterations_per_block
 
-Counts = tuple[Annotated[int, Field(ge=1)], ...]
+Count = Annotated[int, Field(ge=1)]
+Counts = tuple[Count, ...]
 
 
 class Command(StrictModel):
     """The command line."""
 
-    num_seeds: Counts = (1, 16)
-    """Numbers of seeds, each on one device."""
+    config: Path | None = None
+    """The preset. The default is this machine's."""
+    num_seeds: Counts = (1,)
+    """Numbers of seeds, which the devices divide among them."""
     num_devices: Counts = (1,)
-    """Numbers of devices, each with one seed."""
-    num_envs: Annotated[int, Field(ge=1)] = 4096
-    """Environments on each device."""
-    num_minibatches: Annotated[int, Field(ge=1)] | None = None
+    """Numbers of devices."""
+    num_envs: Counts = ()
+    """Numbers of environments of one seed, on all devices together. The default is the preset's."""
+    num_minibatches: Count | None = None
     """Minibatches in an epoch. The default is the preset's."""
-    iterations: Annotated[int, Field(ge=1)] = 8
+    iterations: Count = 8
     """Iterations in one measured block."""
-    repeats: Annotated[int, Field(ge=1)] = 8
-    """Measurements of each block."""
+    turns: Count = 12
+    """Turns."""
+    profile: bool = False
+    """Whether to profile one more block of each program."""
     out: Path = Path("benchmarks/results")
     """Folder for scaling.json and scaling.md."""
 
 
-def measure(command: Command, num_seeds: int, num_devices: int) -> dict:
-    """The time of one block of training."""
-    preset = dict(read_preset(None).ppo)
-    preset["num_envs"] = command.num_envs * num_devices
-    preset["num_minibatches"] = command.num_minibatches or preset["num_minibatches"]
-    config = PPOConfig(**preset)
-    mesh = make_mesh(num_devices, config, num_seeds)
-    env = BounceBall()
-    sharing = num_devices if num_seeds == 1 else 1
-    trainer = make_trainer(config, env, env.config.episode_steps, sharing)
-    key = jax.random.PRNGKey(0)
-    if num_seeds > 1:
-        trainer, key = population(trainer), jax.random.split(key, num_seeds)
-    sharding = state_sharding(mesh, jax.eval_shape(trainer.init, key), num_seeds)
+def configs(command: Command) -> list[TrainConfig]:
+    """The config of each program."""
+    preset = read_preset(command.config)
+    made = []
+    for num_envs, num_seeds, num_devices in itertools.product(
+        command.num_envs or (preset.ppo.num_envs,), command.num_seeds, command.num_devices
+    ):
+        minibatches = command.num_minibatches or preset.ppo.num_minibatches
+        ppo = preset.ppo.model_copy(update={"num_envs": num_envs, "num_minibatches": minibatches})
+        update = {
+            "ppo": ppo,
+            "num_seeds": num_seeds,
+            "num_devices": num_devices,
+            "block_steps": command.iterations * ppo.batch_steps,
+        }
+        made.append(preset.model_copy(update=update))
+    return made
+
+
+def program(config: TrainConfig) -> Callable[[], None]:
+    """Compiles a training and runs its first block; the function runs one more block."""
+    trainer = PPOTrainer(config, Env(config.env))
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        trainer.compile(pool)
+    trainer.start()
+
+    def block() -> None:
+        trainer.run(iterations_per_block(config), lambda: False)
+
+    block()
+    return block
+
+
+def seconds_of(block: Callable[[], None]) -> float:
     started = time.perf_counter()
-    state = jax.jit(trainer.init, out_shardings=sharding)(key)
-    run = jax.jit(
-        lambda state: trainer.run(state, command.iterations),
-        in_shardings=(sharding,),
-        out_shardings=(sharding, replicated(mesh) if num_seeds == 1 else None),
-        donate_argnums=0,
-        compiler_options=compiler_options(tunes_products=True),
-    )
-    state, metrics = jax.block_until_ready(run(state))
-    compile_seconds = time.perf_counter() - started
-    seconds = []
-    for _ in range(command.repeats):
-        started = time.perf_counter()
-        state, metrics = jax.block_until_ready(run(state))
-        seconds.append(time.perf_counter() - started)
-    steps = num_seeds * command.iterations * config.batch_steps
+    block()
+    return time.perf_counter() - started
+
+
+def profile(block: Callable[[], None]) -> dict[str, float]:
+    """Milliseconds of a block in which the first device computes, only exchanges, and does neither
+    (it waits for the processor or for the other devices' start)."""
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            seconds = seconds_of(block)
+        (file,) = Path(folder).rglob("*.xplane.pb")
+        plane = ProfileData.from_file(str(file)).find_plane_with_name("/device:GPU:0")
+        if plane is None:
+            raise UserError(f"--profile needs a GPU, but JAX runs on {device_name()}; leave it out")
+        kernels = [
+            ("nccl" in event.name.lower(), event.start_ns, event.start_ns + event.duration_ns)
+            for line in plane.lines
+            if line.name.startswith("Stream")
+            for event in line.events
+        ]
+    busy = covered((start, end) for _, start, end in kernels)
+    computing = covered((start, end) for exchanges, start, end in kernels if not exchanges)
     return {
-        "num_seeds": num_seeds,
-        "num_devices": num_devices,
-        "num_envs": config.num_envs,
-        "seconds": min(seconds),
-        "steps_per_second": steps / min(seconds),
-        "compile_seconds": compile_seconds,
+        "compute_ms": 1e-6 * computing,
+        "exchange_ms": 1e-6 * (busy - computing),
+        "wait_ms": 1e3 * seconds - 1e-6 * busy,
     }
+
+
+def covered(intervals: Iterable[tuple[float, float]]) -> float:
+    """Length of the union of intervals."""
+    total, reached = 0.0, -float("inf")
+    for start, end in sorted(intervals):
+        total += max(0.0, end - max(start, reached))
+        reached = max(reached, end)
+    return total
+
+
+def measure(command: Command) -> list[dict]:
+    """The blocks of every program, in turns."""
+    measured = configs(command)
+    blocks = [program(config) for config in measured]
+    turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]
+    records = []
+    for config, block, seconds in zip(measured, blocks, zip(*turns, strict=True), strict=True):
+        steps = config.num_seeds * config.block_steps
+        first = measured[0].num_seeds * measured[0].block_steps
+        ratios = [(steps / s) / (first / turn[0]) for s, turn in zip(seconds, turns, strict=True)]
+        records.append(
+            {
+                "num_seeds": config.num_seeds,
+                "num_devices": config.num_devices,
+                "num_envs": config.ppo.num_envs,
+                "seconds": seconds,
+                "steps_per_second": steps / statistics.median(seconds),
+                "ratio": statistics.median(ratios),
+                "ratios": ratios,
+            }
+            | (profile(block) if command.profile else {})
+        )
+    return records
 
 
 def table(records: list[dict]) -> str:
     """Milliseconds per block and steps per second, absolute and relative to the first row."""
-    first = records[0]
+    header = [
+        "seeds",
+        "devices",
+        "environments",
+        "ms per block",
+        "M steps/s",
+        "x",
+        "lowest to highest",
+    ]
+    profiled = [name for name in ("compute_ms", "exchange_ms", "wait_ms") if name in records[0]]
     rows = [
         [
             str(r["num_seeds"]),
             str(r["num_devices"]),
             f"{r['num_envs']:,}",
-            f"{1e3 * r['seconds']:.1f}",
-            f"{r['steps_per_second'] / 1e6:.2f}",
-            f"{r['seconds'] / first['seconds']:.2f}",
-            f"{r['steps_per_second'] / first['steps_per_second']:.2f}",
-            f"{r['compile_seconds']:.1f}",
+            f"{1e3 * statistics.median(r['seconds']):.1f}",
+            f"{r['steps_per_second'] / 1e6:.3g}",
+            f"{r['ratio']:.2f}",
+            f"{min(r['ratios']):.2f} to {max(r['ratios']):.2f}",
+            *(f"{r[name]:.1f}" for name in profiled),
         ]
         for r in records
     ]
-    header = [
-        "seeds",
-        "devices",
-        "environments per seed",
-        "ms per block",
-        "M steps/s",
-        "time x",
-        "steps/s x",
-        "compile and first block, s",
-    ]
-    return markdown_table(header, rows)
+    return markdown_table([*header, *(name.replace("_", ", ") for name in profiled)], rows)
 
 
 def main() -> None:
     """Runs the command line."""
     with exit_on_user_error():
-        set_up_gpu()
         command = parse(
             Command, sys.argv[1:], prog="benchmarks/scaling.py", description=__doc__.split("\n")[0]
         )
-        records = [measure(command, seeds, 1) for seeds in command.num_seeds]
-        records += [measure(command, 1, devices) for devices in command.num_devices if devices > 1]
+        set_up_jax(read_preset(command.config).env)
+        records = measure(command)
         device = device_name()
         record = {"device": device, "jax": jax.__version__, "records": records}
         write(command.out, "scaling", record, f"Device: {device}\n\n{table(records)}")

@@ -97,3 +97,12 @@ def test_adapter_is_measured(tmp_path):
     (record,) = json.loads((tmp_path / "adapter.json").read_text(encoding="utf-8"))["records"]
     assert set(record["seconds"]) == {"jitted step alone", "TorchVectorEnv", "RslRlVecEnv"}
     assert all(seconds > 0.0 for seconds in record["seconds"].values())
+
+
+def test_time_in_which_any_kernel_runs(monkeypatch):
+    """Kernels of several streams overlap; a union has each instant once."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from scaling import covered
+
+    assert covered([(5, 7), (0, 2), (1, 3), (1, 2), (6, 6.5)]) == 5
+    assert covered([]) == 0

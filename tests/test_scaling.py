@@ -238,15 +238,51 @@ def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, mon
 # Several devices
 
 
+DEVICE_THAT_FAILS = """
+import jax, sys
+from bounce_mjx.commands.train import main
+from bounce_mjx.training.ppo_trainer import PPOTrainer
+run = PPOTrainer.run
+def failing(self, *args):
+    if int(self.state.iteration) == 3:
+        raise jax.errors.JaxRuntimeError("INTERNAL: CUDA_ERROR_UNKNOWN\\nin a graph")
+    return run(self, *args)
+PPOTrainer.run = failing
+main(sys.argv[1:])
+"""
+
+
 @pytest.mark.slow
-def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_training_continues_on_the_devices_that_are_left(
+    alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Eight devices train as one does, and one after a device failed as all eight would have."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
     flags = [*SHARED, "--num-devices", "8", "--log-dir", tmp_path / "runs"]
-    with job(tmp_path / "log", *flags) as eight:
-        assert eight.wait() == 0, eight.said
+    with job(tmp_path / "log", *flags, code=DEVICE_THAT_FAILS) as eight:
+        assert eight.wait() == 2, eight.said
     assert "device: 8 x cpu" in eight.said
+    assert "Traceback" not in eight.said
     (run,) = (tmp_path / "runs").iterdir()
+    latest = latest_checkpoint(run)
+    assert eight.said.splitlines()[-1] == (
+        "error: 8 x cpu failed after 384 steps (INTERNAL: CUDA_ERROR_UNKNOWN in a graph); "
+        f"continue with: bounce-mjx train --resume {run} (the last checkpoint is {latest.folder}), "
+        "with --num-devices 1 if one is left"
+    )
+    train_command.main(["--resume", str(run), "--num-devices", "1", "--no-report"])
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
+
+
+def test_a_full_device_is_told_in_one_sentence(tmp_path: Path, monkeypatch, capsys):
+    def full(self, *args):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setattr(PPOTrainer, "start", full)
+    with pytest.raises(SystemExit):
+        train(tmp_path)
+    reason = "too little memory for 16 environments (RESOURCE_EXHAUSTED: Out of memory)"
+    assert capsys.readouterr().err == f"error: cpu has {reason}; lower num_envs\n"
 
 
 MESSAGES = """

@@ -20,7 +20,7 @@ from rich.console import Console
 
 import bounce_mjx
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import StopRequest
@@ -110,8 +110,8 @@ def train(
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
-        another process trains in the run's folder, the hosts have different configs, the training
-        diverged, or its final state could not be saved.
+        another process trains in the run's folder, the hosts have different configs, a device
+        failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT or SIGTERM came; the state is saved.
     """
     hosts.agree(config, options.resume)
@@ -119,9 +119,15 @@ def train(
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         job = _Job(config, console, make_trainer, options, stop, stack)
-        job.compile()
-        job.train()
-        job.finish()
+        try:
+            job.compile()
+            job.train()
+            job.finish()
+        except jax.errors.JaxRuntimeError as error:
+            if jax.process_count() > 1:
+                # It may be the death of another process, which `hosts` reports.
+                raise
+            raise UserError(job.failure(error)) from error
         return job.members
 
 
@@ -155,6 +161,7 @@ class _Job:
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
         self.steps = 0
+        self.writers: list[CheckpointWriter] = []
         self.run = folders.find_run(options.resume) if self.resumed else self._create()
         hosts.advise(self._advice)
         if hosts.is_leader():
@@ -181,12 +188,26 @@ class _Job:
     def _go_on(self) -> str:
         return f"continue with: {self.options.command} --resume {shlex.quote(str(self.run))}"
 
+    def failure(self, error: jax.errors.JaxRuntimeError) -> str:
+        """What a device's failure means to the user, once the last state is saved."""
+        for writer in self.writers:
+            writer.problem()
+        reason = shorten(reason_of(error), 200)
+        if reason.startswith("RESOURCE_EXHAUSTED"):
+            envs = f"{self.config.ppo.num_envs:,} environments"
+            return f"{self.device} has too little memory for {envs} ({reason}); lower num_envs"
+        fewer = ", with --num-devices 1 if one is left" if self.trainer.mesh.size > 1 else ""
+        return (
+            f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice()}{fewer}"
+        )
+
     def _advice(self) -> str:
-        """The advice to the user after the death of a process."""
+        """The advice to the user after the death of a process or a device."""
         latest = self._latest()
         if latest is None:
             return "start again, as no checkpoint had been saved yet"
-        return f"{self._go_on} on every host (the last checkpoint is {latest.folder})"
+        everywhere = " on every host" if jax.process_count() > 1 else ""
+        return f"{self._go_on}{everywhere} (the last checkpoint is {latest.folder})"
 
     def _latest(self) -> folders.Checkpoint | None:
         with contextlib.suppress(UserError):
@@ -259,7 +280,6 @@ class _Job:
             hosts.any_of(False)
             self.trainer.start(self.state)
             self.state = None
-        self.writers: list[CheckpointWriter] = []
         if hosts.is_leader():
             self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
         for writer in self.writers:
