@@ -40,6 +40,7 @@ BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
 LAYOUT = EnvConfig().layout
 DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
+METRICS = "bounced", "n_bounces", "apex_error", "apex_offset"
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def states(rows) -> State:
     """A batch (batch axis last) from one dict of values per episode."""
     defaults = {
         "x": TARGET_X, "y": 0.0, "vz": 0.0, "reward": 0.0, "done": 0.0,
-        "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0,
+        "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0, "apex_offset": 0.0,
     }  # fmt: skip
     columns = {
         name: jnp.array([row.get(name, default) for row in rows], jnp.float32)
@@ -66,7 +67,7 @@ def states(rows) -> State:
         qpos=physics.qpos.at[6].set(columns["x"]).at[7].set(columns["y"]),
         qvel=physics.qvel.at[8].set(columns["vz"]),
     )
-    metrics = {name: columns[name] for name in ("bounced", "n_bounces", "apex_error")}
+    metrics = {name: columns[name] for name in METRICS}
     return batch.replace(
         pipeline_state=batch.pipeline_state._replace(physics=physics),
         reward=columns["reward"],

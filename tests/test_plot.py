@@ -407,6 +407,11 @@ def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
     report_command.main([str(run)])
     check_report(run)
     assert other.read_text() == "mine"
+    page = (run / "report.html").read_text("utf-8")
+    assert 'src="replay.html"' in page and (run / "replay.html").stat().st_size > 10_000
+    assert "Peitian AIR4-560" in page and "MuJoCo 3." in page
+    # On a phone, what is wide scrolls by itself.
+    assert page.count("<table>") + page.count("<img ") == page.count('<div class="wide"><')
     assert capsys.readouterr().out.endswith("run/report.html\n")
 
 

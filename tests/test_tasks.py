@@ -38,10 +38,11 @@ PUBLIC = re.compile(
 # A row of the results of `REST`.
 RESULT = r"rests +episodes"
 
-# A ball that hits something in the physics of the world; a default or an example in a sentence for
-# users; and the keys of older files.
+# A baseline for bouncing; a ball that hits something in the physics of the world; a default or an
+# example in a sentence for users; and the keys of older files.
 ALLOWED = {
-    "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py",
+    "__init__.py", "baselines/mirror.py",
+    "deploy/metadata.py", "commands/main.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
     "world/ball_filter.py", "world/observation.py", "identify/fit.py", "identify/stages.py",

@@ -84,7 +84,9 @@ def main(args: Sequence[str]) -> None:
                 done += 1
             task_and_robot = of_row[0].task, robot_name(of_row[0].env)
             rows.append(reports.Row(str(path), *task_and_robot, figures))
-            console.out("  ".join(reports.cells(rows[-1])), highlight=False)
+            console.out(
+                "  ".join(reports.cells(rows[-1], list(figures[-1].ranking))), highlight=False
+            )
     engine = "mujoco" if command.physics == "mujoco" else Env(configs[0][0].env).engine.name
     benchmark = reports.Benchmark(
         version=bounce_mjx.__version__,

@@ -68,7 +68,7 @@ def main(args: Sequence[str]) -> None:
     (commands, *_) = [given_commands(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
     show(
-        [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
+        [load_shown(*shown, console) for shown in zip(chosen, configs, strict=True)],
         command.viewing,
         commands=commands,
         console=console,
@@ -85,7 +85,7 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     return config.model_copy(update={"env": env})
 
 
-def _load(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
+def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor

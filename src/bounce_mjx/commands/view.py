@@ -25,7 +25,7 @@ class ViewCommand(StrictModel):
 
     actions: Literal["random", "zero", "mirror"] = "random"
     """random: uniform; zero: the servos hold their angles; mirror: the mirror law, a model-based
-    controller of a bouncing ball."""
+    controller."""
     task: str = DEFAULT
     """Name of the task, or FILE.py:CLASS for one of your own."""
     robot: Path | None = None

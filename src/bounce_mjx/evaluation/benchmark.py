@@ -8,26 +8,28 @@ import numpy as np
 import pydantic
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.env.state import State
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.episodes import reset_episodes
-from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+from bounce_mjx.evaluation.results import episodes_of
 from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_conditions
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.evaluation.suite import load_suite, neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.resources import resource_path
-from bounce_mjx.tasks.bounce import SETTLING_SECONDS, Bounce
-from bounce_mjx.tasks.track import Track
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 MOST_HITS = 10_000
-"""Hits after which an episode of `measure_hits` ends."""
-HIT_EPISODES = 16
-"""Episodes of `measure_hits`."""
+"""Hits after which an episode without a time limit ends."""
+MOST_SECONDS = 20_000.0
+"""Longest episode without a time limit, s."""
+HIT_EPISODES, TIMED_EPISODES = 16, 256
+"""Episodes without a time limit, and those of a task that counts no hits."""
 MIN_STABLE = 0.99
 """Share of the episodes that last within a policy's limits."""
 LIMITS = {"latency_ms": "action latency", "push_m_s": "push every 2 s"}
-"""The figures that are limits, and their perturbations in configs/benchmark.yaml."""
+"""The figures that are limits, and their perturbations in configs/robustness_limits.yaml."""
 
 
 class Figures(pydantic.BaseModel):
@@ -43,12 +45,8 @@ class Figures(pydantic.BaseModel):
     """Largest push every 2 s up to which `MIN_STABLE` of the episodes last, m/s."""
     hits: float | None = None
     """Median of the hits until the ball is lost, at most `MOST_HITS`."""
-    apex_rms_cm: float | None = None
-    """Root mean square of apex minus target height, cm."""
-    apex_bias_cm: float | None = None
-    """Mean of apex minus target height, cm."""
-    moving_cm: float | None = None
-    """RMS distance of apex and moving point at 0.25 to 0.3 m/s, cm."""
+    ranking: dict[str, float | None] = {}
+    """The task's own figures (`Task.ranking`)."""
 
 
 def measure(
@@ -68,7 +66,7 @@ def measure(
     """
     suite, limits = (
         load_suite(resource_path(f"configs/{name}.yaml"), trained)
-        for name in ("robustness", "benchmark")
+        for name in ("robustness", "robustness_limits")
     )
     conditions = [*suite, *limits]
     share = 0.8 / len(conditions)
@@ -81,14 +79,9 @@ def measure(
         "suite_conditions": len(suite),
         **{key: largest_stable(of_limits, name) for key, name in LIMITS.items()},
     }
-    world = trained.model_copy(update={"randomization": RandomizationConfig()})
-    if issubclass(trained.task, Bounce):
-        figures |= measure_hits(policy, actor, world, options.seed)
-    if issubclass(trained.task, Track):
-        report = evaluate_policy(policy, trained, actor, options._replace(nominal=True)).report
-        (figures["moving_cm"],) = (r.value for r in report.results if r.name == "fast error")
+    hits, ranking = measure_nominal(policy, actor, trained, options.seed)
     progress(1.0)
-    return Figures(**figures)
+    return Figures(**figures, hits=hits, ranking=ranking)
 
 
 def largest_stable(outcomes: Sequence[ConditionOutcome], perturbation: str) -> float:
@@ -102,45 +95,40 @@ def largest_stable(outcomes: Sequence[ConditionOutcome], perturbation: str) -> f
     return largest
 
 
-def measure_hits(
-    policy: Policy | None, actor: Callable[[Env], Actor], world: WorldConfig, seed: int
-) -> dict[str, float | None]:
-    """The figures of bouncing without a time limit: hits, and apexes after the first seconds."""
-    env = Env(world)
-    acting = actor(env)
-    settled = round(SETTLING_SECONDS / env.dt)
-    ranges = {
-        name: (jnp.array([low]), jnp.array([high]))
-        for name, (low, high) in neutral_commands(world).items()
-    }
+def measure_nominal(
+    policy: Policy | None, actor: Callable[[Env], Actor], trained: WorldConfig, seed: int
+) -> tuple[float | None, dict[str, float | None]]:
+    """The median of the hits of a task that counts them, and the task's ranking, in the nominal
+    world: in episodes without a time limit, or in episodes of the usual length without hits."""
+    env = Env(trained.model_copy(update={"randomization": RandomizationConfig()}))
+    acting, commands, hits = actor(env), neutral_commands(trained), env.task.hits
+    ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in commands.items()}
+    # A ball that rests on the paddle is never lost.
+    most_steps = int(MOST_SECONDS / env.dt) if hits else env.config.episode_steps
 
     @jax.jit
-    def run(policy: Policy | None, key: jax.Array) -> tuple[jax.Array, ...]:
-        def advance(carry):
-            states, alive, hits, sums, step = carry
+    def run(policy: Policy | None, key: jax.Array) -> Statistics:
+        states = reset_episodes(env, key, HIT_EPISODES if hits else TIMED_EPISODES, ranges or None)
+
+        def unfinished(now: tuple[State, Statistics, jax.Array]) -> jax.Array:
+            return jnp.any(now[1].running) & (now[2] < most_steps)
+
+        def advance(
+            now: tuple[State, Statistics, jax.Array],
+        ) -> tuple[State, Statistics, jax.Array]:
+            states, statistics, step = now
             actions = acting.act(policy, states.obs.T).T
-            before, states = states, jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions)
-            hit = alive & (states.metrics["bounced"] > 0)
-            now = before.pipeline_state
-            error = jnp.where(
-                hit & (step >= settled), now.task.apex - now.command["target_height"], 0.0
-            )
-            sums += jnp.stack([hit & (step >= settled), error, jnp.square(error)])
-            hits += hit
-            return states, alive & (states.done == 0) & (hits < MOST_HITS), hits, sums, step + 1
+            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions)
+            statistics = accumulate(env, statistics, states, step)
+            if hits:
+                goes_on = statistics.running & (statistics.tally.sums[hits] < MOST_HITS)
+                statistics = statistics._replace(running=goes_on)
+            return states, statistics, step + 1
 
-        states = reset_episodes(env, key, HIT_EPISODES, ranges)
-        start = jnp.ones(HIT_EPISODES, bool), jnp.zeros(HIT_EPISODES), jnp.zeros((3, HIT_EPISODES))
-        # A ball that rests on the paddle is never lost.
-        most = jnp.int32(2 * MOST_HITS / env.dt)
-        carry = states, *start, jnp.int32(0)
-        end = jax.lax.while_loop(lambda c: jnp.any(c[1]) & (c[4] < most), advance, carry)
-        return end[2], end[3]
+        start = states, empty_statistics(env, states), jnp.int32(0)
+        return jax.lax.while_loop(unfinished, advance, start)[1]
 
-    hits, sums = jax.device_get(run(policy, jax.random.PRNGKey(seed)))
-    count, error, square = sums.astype(float).sum(axis=1)
-    return {
-        "hits": float(np.median(hits)),
-        "apex_rms_cm": 100.0 * float(np.sqrt(square / count)) if count else None,
-        "apex_bias_cm": 100.0 * float(error / count) if count else None,
-    }
+    statistics = run(policy, jax.random.PRNGKey(seed))
+    statistics = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
+    counted = float(np.median(statistics.tally.sums[hits])) if hits else None
+    return counted, env.task.ranking(episodes_of(env, statistics, commands))

@@ -10,17 +10,7 @@ from bounce_mjx.evaluation.benchmark import Figures
 from bounce_mjx.reports.page import STYLE, table
 
 BENCHMARK_FILE = "benchmark.json"
-HEADER = (
-    "policy",
-    "seeds",
-    "suite met",
-    "latency, ms",
-    "push, m/s",
-    "hits",
-    "apex RMS, cm",
-    "apex bias, cm",
-    "moving point, cm",
-)
+_HEADER = ("policy", "seeds", "suite met", "latency, ms", "push, m/s", "hits")
 _RESAMPLES = 10_000
 
 
@@ -45,9 +35,28 @@ class Benchmark:
     seed: int
     rows: list[Row]
 
+    @property
+    def ranking(self) -> list[str]:
+        """Names of the tasks' own figures."""
+        return list(dict.fromkeys(n for r in self.rows for f in r.figures for n in f.ranking))
 
-def cells(row: Row) -> list[str]:
-    """A row of the table: the mean over the seeds and, for several, its interval."""
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The columns of the table."""
+        return *_HEADER, *self.ranking
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """The rows of the table."""
+        return [cells(row, self.ranking) for row in self.rows]
+
+
+def cells(row: Row, ranking: Sequence[str]) -> list[str]:
+    """A row of the table: the mean over the seeds and, for several, its interval.
+
+    Args:
+      ranking: names of the tasks' own figures.
+    """
     suite = interval([f.suite_met for f in row.figures], ".0f")
     return [
         row.name,
@@ -56,9 +65,7 @@ def cells(row: Row) -> list[str]:
         interval([f.latency_ms for f in row.figures], ".0f"),
         interval([f.push_m_s for f in row.figures], ".2f"),
         interval([f.hits for f in row.figures], ",.0f"),
-        interval([f.apex_rms_cm for f in row.figures], ".1f"),
-        interval([f.apex_bias_cm for f in row.figures], "+.1f"),
-        interval([f.moving_cm for f in row.figures], ".2f"),
+        *(interval([f.ranking.get(name) for f in row.figures], ".2f") for name in ranking),
     ]
 
 
@@ -79,7 +86,8 @@ def interval(values: Sequence[float | None], spec: str) -> str:
 
 def markdown(benchmark: Benchmark) -> str:
     """The table in Markdown."""
-    rows = [HEADER, ["---"] * len(HEADER), *map(cells, benchmark.rows)]
+    header = benchmark.header
+    rows = [header, ["---"] * len(header), *benchmark.cells]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows) + f"\n\n{caption(benchmark)}\n"
 
 
@@ -105,7 +113,7 @@ def page(benchmark: Benchmark) -> str:
 </head>
 <body>
 <h1>Benchmark</h1>
-{table(HEADER, map(cells, benchmark.rows))}
+{table(benchmark.header, benchmark.cells)}
 <p>{caption(benchmark)}</p>
 </body>
 </html>

@@ -98,6 +98,9 @@ class Task:
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset draws for the task."""
+    hits: ClassVar[str] = ""
+    """The sum of `tally` that counts hits; the benchmark then measures episodes without a time
+    limit, up to a number of hits."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
     """Metrics that the value network sees by default, because the reward depends on them and the
     observation does not contain them."""
@@ -178,6 +181,11 @@ class Task:
 
     def details(self, episodes: Episodes) -> dict[str, Figure]:
         """Further figures by name; a unit is the end of the name, such as `mean_error_m`."""
+        return {}
+
+    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
+        """Further figures for the benchmark, which rank policies that meet all results; a unit
+        follows a comma."""
         return {}
 
     def recorded(self, moment: Moment) -> Values:

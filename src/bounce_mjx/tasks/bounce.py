@@ -200,6 +200,7 @@ class Bounce(Task):
         Curve("task/n_bounces", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)
+    hits = "hits"
 
     def reset(self, start: Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
@@ -233,6 +234,7 @@ class Bounce(Task):
                 "n_bounces": after.n_bounces,
                 "ball_xy_error": inputs.err_xy,
                 "apex_error": jnp.where(bounced, jnp.abs(state.apex - target), 0.0),
+                "apex_offset": jnp.where(bounced, state.apex - target, 0.0),
             },
         )
 
@@ -337,6 +339,9 @@ class Bounce(Task):
                 "settled_bounces": judged,
                 "accurate_bounces": judged & accurate,
                 "apex_error": jnp.where(judged, metrics["apex_error"], 0.0),
+                "apex_error^2": jnp.where(judged, jnp.square(metrics["apex_error"]), 0.0),
+                "apex_offset": jnp.where(judged, metrics["apex_offset"], 0.0),
+                "hits": bounced,
                 "rising_steps": vz > 0.0,
                 "rising_speed": jnp.maximum(vz, 0.0),
             },
@@ -393,6 +398,16 @@ class Bounce(Task):
         return {
             "mean_consecutive_bounces": float(episodes.maxima["n_bounces"].mean()),
             "mean_apex_error_m": error,
+        }
+
+    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
+        """The root mean square and the mean of apex minus target height."""
+        sums = {name: float(each.sum()) for name, each in episodes.sums.items()}
+        if not (count := sums["settled_bounces"]):
+            return {"apex RMS, cm": None, "apex bias, cm": None}
+        return {
+            "apex RMS, cm": 100.0 * math.sqrt(sums["apex_error^2"] / count),
+            "apex bias, cm": 100.0 * sums["apex_offset"] / count,
         }
 
     def recorded(self, moment: Moment) -> dict[str, jax.Array]:

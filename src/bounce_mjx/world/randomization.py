@@ -178,7 +178,7 @@ class RandomizationConfig(StrictModel):
     def _check_ranges(self):
         for name in (self.shares or {}).keys() - TERMS.keys():
             raise ValueError(
-                f"shares has a probability for {shorten(name)}, which is no term; remove it"
+                f"shares has a probability for {shorten(name)}, which is not a term; remove it"
             )
         for name in self.terms:
             (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
