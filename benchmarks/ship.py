@@ -1,5 +1,5 @@
-"""Makes the policy that comes with the package from a run, for maintainers:
-`python benchmarks/ship.py RUN`."""
+"""Makes a policy that comes with the package from a run, for maintainers:
+`python benchmarks/ship.py RUN --name NAME`."""
 
 import shutil
 import sys
@@ -17,19 +17,28 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
-from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.resources import POLICIES, PRETRAINED
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, runs_folder
+from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    TrainConfig,
+    load_run_config,
+    read_preset,
+    runs_folder,
+)
+from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.folders import (
+    Checkpoint,
     best_checkpoint,
     find_checkpoint,
-    save_config,
+    write_config,
 )
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.setup import set_up_jax
 
@@ -40,7 +49,7 @@ class ShipCommand(StrictModel):
     run: Annotated[Path, tyro.conf.Positional]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
     name: Literal[tuple(POLICIES)] = PRETRAINED
-    """Name of the policy in the package."""
+    """Name of the policy in the package; an arm's is of a run with that arm as --robot."""
     out: Path | None = None
     """Folder to write, by default the policy's own; an existing one is replaced."""
 
@@ -52,7 +61,7 @@ def main(args: Sequence[str] | None = None) -> None:
             ShipCommand,
             sys.argv[1:] if args is None else args,
             prog="benchmarks/ship.py",
-            description="Makes the policy that comes with the package from a run.",
+            description="Makes a policy that comes with the package from a run.",
         )
         set_up_jax()
         out = command.out or Path(POLICIES[command.name])
@@ -69,25 +78,64 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
     if out.exists() and not (out / CONFIG_FILE).is_file():
         raise UserError(f"--out {out} is not a folder that this command made; give another")
     checkpoint = find_checkpoint(run)
-    trained_with = load_run_config(checkpoint.run)
-    if trained_with.env.mjcf is not None:
-        raise UserError(
-            f"{checkpoint.run} was trained with --mjcf {trained_with.env.mjcf}, which is not "
-            "part of the package; give a run of the package's own arm"
-        )
+    trained_with = _with_packaged_arm(checkpoint.run, load_run_config(checkpoint.run), name)
     policy = read_policy(checkpoint, trained_with)
-    report, physics, _ = run_interruptible(
+    evaluation = run_interruptible(
         evaluate_policy,
         policy,
         trained_with.env,
         networks_of(trained_with.ppo),
         EvaluationOptions(nominal=True),
     )
-    console.print(results_table(report, f"{checkpoint.folder}, {physics}"))
+    report = evaluation.report
+    console.print(results_table(report, f"{checkpoint.folder}, {evaluation.engine}"))
     console.print(details_line(report), highlight=False)
     if not report.passed:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")
+    write_policy(checkpoint, trained_with, evaluation, out, name)
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    console.out(f"written: {out} ({size / 1000:.0f} kB)", highlight=False)
 
+
+def _with_packaged_arm(run: Path, config: TrainConfig, name: str) -> TrainConfig:
+    """The config with the MJCF as the arm's config names it, in a Python package, in place of the
+    run's copy, whose meshes are too large to ship.
+
+    Raises:
+      UserError: the run is of another arm than the policy's name says.
+    """
+    if name not in ARM_POLICIES:
+        if config.env.mjcf is not None:
+            raise UserError(
+                f"{run} was trained with --mjcf {config.env.mjcf}, and {name} is a policy of the "
+                "package's own arm; give one of its runs"
+            )
+        return config
+    mjcf = read_preset(Path("default"), robot=Path(name)).env.mjcf
+    with tempfile.TemporaryDirectory() as scratch:
+        copy_robot(mjcf, Path(scratch))
+        files = [folder / ROBOT / MANIFEST_FILE for folder in (Path(scratch), run)]
+        if not files[1].is_file() or files[0].read_bytes() != files[1].read_bytes():
+            raise UserError(
+                f"{run} was trained with another arm than {mjcf}; give a run with --robot {name}"
+            )
+    return config.model_copy(update={"env": config.env.model_copy(update={"mjcf": mjcf})})
+
+
+def write_policy(
+    checkpoint: Checkpoint,
+    trained_with: TrainConfig,
+    evaluation: PolicyEvaluation,
+    out: Path,
+    name: str,
+) -> None:
+    """Writes the folder of a policy.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    report, physics, _ = evaluation
+    policy = read_policy(checkpoint, trained_with)
     made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": runs_folder(trained_with.env.task)})
@@ -109,7 +157,7 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
         with tempfile.TemporaryDirectory(dir=out.absolute().parent) as scratch:
             made = Path(scratch) / name
             made.mkdir()
-            save_config(made, config)
+            write_config(made, config)
             writer = CheckpointWriter(made, config)
             writer.save(("best",), checkpoint.steps, policy, results=results)
             writer.close()
@@ -125,8 +173,6 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
         raise UserError(
             f"--out {out} cannot be written ({error.strerror}); give another folder"
         ) from error
-    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    console.out(f"written: {out} ({size / 1000:.0f} kB)", highlight=False)
 
 
 def _policies_inside(out: Path) -> list[Path]:

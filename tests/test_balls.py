@@ -330,14 +330,18 @@ def test_noise_and_pushes_differ_between_the_balls():
 
 
 def test_c_moves_several_balls_as_the_engine_does():
-    """With a push, and with drag in each physics step."""
-    env = Env(Two.Config(randomization={"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5)}))
+    """With a push, and with the forces of the air in each physics step."""
+    drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}
+    env = Env(Two.Config(randomization=drawn))
     count, num_steps = 2, env.config.num_substeps
     keys = jax.random.split(jax.random.PRNGKey(0), count)
     states = jax.vmap(env.reset, out_axes=-1)(keys)
     physics = states.pipeline_state.physics
+    spins = [i for ball in find_addresses(env.mj_model).balls for i in ball.qvel[3:]]
+    physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
     push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
-    control = Control(physics.qpos[:6], air_drag=jnp.full(count, 0.5), ball_push=push)
+    air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}
+    control = Control(physics.qpos[:6], **air, ball_push=push)
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
     simulated = c_episodes.full_states(env.mj_model, physics)
     balls = c_episodes._ball_velocity(env.mj_model)
@@ -345,7 +349,7 @@ def test_c_moves_several_balls_as_the_engine_does():
     models, data = [env.mj_model] * count, [mujoco.MjData(env.mj_model)]
     with mujoco.rollout.Rollout(nthread=0) as pool:
         simulated = c_episodes._next_states(
-            pool, models, data, simulated, np.asarray(targets), np.asarray(control.air_drag)
+            pool, models, data, simulated, np.asarray(targets), *map(np.asarray, air.values())
         )
     expected = c_episodes.physics_states(env.mj_model, simulated)
     step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)

@@ -1,5 +1,6 @@
 """An arm's limits in the environment: its commands, late and lagged, on every engine."""
 
+import json
 from typing import NamedTuple
 
 import jax
@@ -9,10 +10,14 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.commands.main import main
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.limits import limit_shares
 from bounce_mjx.physics import servo_targets
 from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
+from bounce_mjx.task.shown import Recording
+from test_deploy import make_run
 
 VELOCITY, ACCELERATION, JERK = 2.0, 15.0, 7500.0
 LIMITS = {
@@ -188,3 +193,56 @@ def test_a_mistake_is_one_sentence(limits: dict, wrong: str) -> None:
         settings = {"robot": {"limits": limits}, "action": {"base": "target"}}
         validate(EnvConfig, settings, "my.yaml")
     assert "\n" not in str(caught.value)
+
+
+def recorded(velocities: np.ndarray) -> Recording:
+    """An episode with these velocities of the commands [T, 6], which ends five steps early."""
+    running = np.arange(len(velocities))[:, None] < len(velocities) - 5
+    empty = np.zeros((len(velocities), 3, 1))
+    joint_angles = np.zeros((len(velocities), 6, 1))
+    return Recording(joint_angles, empty, empty, {}, {}, running, velocities[..., None])
+
+
+@pytest.mark.parametrize("smooth", (False, True))
+@pytest.mark.parametrize("rate", (500, 1000))
+def test_shares_of_the_limits(smooth: bool, rate: int) -> None:
+    """Full acceleration, then full speed, use the limits up; 10% more acceleration of a joint is
+    seen."""
+    config = EnvConfig(
+        robot={"limits": LIMITS | ({} if smooth else {"jerk": None})}, action={"base": "target"}
+    )
+    full = np.minimum(0.01 * ACCELERATION * np.arange(1.0, 40.0), VELOCITY)
+    velocities = np.tile(full[:, None], 6)
+    shares = {x.quantity: x.share for x in limit_shares(config, recorded(velocities), rate)}
+    assert shares.keys() == {"velocity", "acceleration", *(["jerk"] if smooth else [])}
+    assert shares["velocity"] == pytest.approx(1.0, abs=1e-9)
+    assert shares["acceleration"] == pytest.approx(1.0, abs=1e-9)
+    if smooth:
+        # The mean is over 4 ms, so a step of the acceleration has the jerk 15 / 0.004, half of the
+        # limit. At 500 Hz, two of the three pieces of the difference's quadratic spline see it:
+        # 1/6 and 2/3.
+        assert shares["jerk"] == pytest.approx(0.5 if rate == 1000 else 0.5 * 5 / 6, abs=1e-6)
+    hasty = velocities.copy()
+    hasty[:, 3] = np.minimum(0.011 * ACCELERATION * np.arange(1.0, 40.0), VELOCITY)
+    _, acceleration, *_ = limit_shares(config, recorded(hasty), rate)
+    assert acceleration.share == pytest.approx(1.1, abs=1e-6) and acceleration.joint == 4
+    # What follows the end of an episode does not count.
+    late = velocities.copy()
+    late[-5:] = 100.0
+    assert limit_shares(config, recorded(late), rate)[0].share == pytest.approx(1.0)
+
+
+def test_eval_shows_the_shares(tmp_path, capsys: pytest.CaptureFixture) -> None:
+    """A random policy wishes more than the limits allow, and stays within them."""
+    limited = {"robot": {"limits": LIMITS}, "action": {"base": "target"}, "action_scale": 0.1}
+    run = make_run(tmp_path / "run", limited | {"episode_seconds": 0.3})
+    file = tmp_path / "results.json"
+    with pytest.raises(SystemExit):
+        main(["eval", str(run), "--episodes", "4", "--limits", "--json", str(file)])
+    assert "limits that commands at 1 kHz use in 32 episodes: velocity " in capsys.readouterr().out
+    shares = {x["quantity"]: x["share"] for x in json.loads(file.read_text())["limits"]}
+    assert shares.keys() == {"velocity", "acceleration", "jerk"}
+    assert max(shares.values()) == pytest.approx(1.0, abs=1e-4)
+    with pytest.raises(SystemExit):
+        main(["eval", "pretrained", "--limits"])
+    assert "has no limits of its commands" in " ".join(capsys.readouterr().err.split())

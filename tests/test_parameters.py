@@ -33,6 +33,7 @@ from bounce_mjx.physics.fused.model import in_world
 from bounce_mjx.physics.parameters import shapes
 from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
 from random_worlds import own_parameters, random_parameters
+from test_impact import push_by_air
 from test_physics import (
     DT,
     ONE_STEP,
@@ -231,9 +232,9 @@ def test_paddle_position_follows_its_parameter(mj_model, choice):
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
-    """Free run against C over control steps, in random worlds with friction, air drag and filtered
-    servos at their limits."""
-    count, num_substeps, air_drag = 4, 5, 0.2
+    """Free run against C over control steps, in random worlds with friction, spin in air and
+    filtered servos at their limits."""
+    count, num_substeps, air_drag, air_lift = 4, 5, 0.2, 0.05
     model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     assert model.na == 6
     start = bouncing_states(model, np.random.default_rng(1))
@@ -252,7 +253,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
         data.append((c_model, mujoco.MjData(c_model)))
         data[i][1].qpos[:], data[i][1].qvel[:], data[i][1].act[:] = (x[i] for x in state)
     engine = make_engine(model, "mjx")
-    control = partial(Control, air_drag=air_drag)
+    control = partial(Control, air_drag=air_drag, air_lift=air_lift)
     step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
     contacts = 0
     for i in range(6):
@@ -261,9 +262,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
         for j, (c_model, d) in enumerate(data):
             d.ctrl[:] = ctrl[j]
             for _ in range(num_substeps):
-                drag = air_drag * np.linalg.norm(d.qvel[6:9]) * d.qvel[6:9]
-                ball = c_model.body("ball_link")
-                d.xfrc_applied[ball.id, :3] = -ball.mass[0] * drag
+                push_by_air(c_model, d, air_drag, air_lift)
                 mujoco.mj_step(c_model, d)
                 contacts += d.ncon
     expected = (np.array([getattr(d, name) for _, d in data]) for name in ("qpos", "qvel", "act"))
@@ -344,7 +343,12 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
     config = EnvConfig(
         episode_seconds=0.3,
         ball_init_pos=(0.58856, 0.0, 0.1),
-        randomization={"air_drag": (5.0, 20.0)},
+        randomization={
+            "air_drag": (5.0, 20.0),
+            "air_lift": (0.0, 0.01),
+            "restitution": (0.7, 0.95),
+            "restitution_slope": (0.05, 0.1),
+        },
     )
     key = jax.random.PRNGKey(0)
     env = BounceBall(config, randomize=heavy_and_light)

@@ -45,6 +45,7 @@ RANGES = {
     name: (max(term.limits[0], 0.8), min(term.limits[1], 0.9)) for name, term in TERMS.items()
 }
 RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
+RANGES |= {"restitution_slope": (0.02, 0.05)}
 
 
 def test_draws_are_uniform_in_their_ranges() -> None:
@@ -173,6 +174,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
 @pytest.mark.parametrize(
     ("values", "words"),
     [
+        ({"restitution_slope": (0, 0.02)}, "restitution_slope is given without restitution; give"),
         ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range; give the lower end first"),
         ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx import BounceBall
+from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.env import vector
 from bounce_mjx.gpu import elementwise, rows
 from bounce_mjx.gpu.rows import Rows
@@ -236,10 +236,19 @@ def test_a_loop_unpacks_the_rows_of_its_steps(monkeypatch):
         np.testing.assert_array_equal(steps[name], expected)
 
 
-def test_the_control_step_is_one_kernel(monkeypatch):
+SPIN = {
+    "restitution": (0.7, 0.95),
+    "restitution_slope": (0.01, 0.05),
+    "contact_friction": (0.1, 0.3),
+    "air_lift": (0.0, 0.006),
+}
+
+
+@pytest.mark.parametrize("terms", ({}, SPIN), ids=("plain", "spin"))
+def test_the_control_step_is_one_kernel(monkeypatch, terms):
     """Physics, task, reward, terminations, time-outs and resets, against the program without a
     kernel."""
-    env = BounceBall()
+    env = BounceBall(EnvConfig(randomization=terms))
     reset_key, action_key, fresh_key = jax.random.split(jax.random.PRNGKey(0), 3)
     state = jax.jit(lambda key: vector.reset(env, key, BATCH))(reset_key)
     # Some time out at this step, and some lose the ball.

@@ -1,5 +1,6 @@
 """Named worlds: their files, and the commands that take one."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
+from test_deploy import make_run
 
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
 WORLD = {
@@ -116,6 +118,20 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
         in_world(config, Path("ur5e_rtde"))
+
+
+def test_robustness_measures_twice_the_assumed_alone(tmp_path, capsys) -> None:
+    run = make_run(tmp_path / "run", {"episode_seconds": 0.05})
+    with pytest.raises(SystemExit):
+        main(["robustness", str(run), "--assumed"])
+    assert "--assumed is about a named world" in capsys.readouterr().err
+    world = ["--world", str(written(tmp_path)), "--assumed", "--episodes", "2"]
+    with pytest.raises(SystemExit):
+        main(["robustness", str(run), *world, "--out", str(tmp_path / "out")])
+    report = json.loads((tmp_path / "out" / "robustness.json").read_text())
+    names = [outcome["perturbation"] for outcome in report["outcomes"]]
+    assert names == ["nominal", "twice randomization.frame_drop"]
+    assert report["suite"].startswith("twice what ") and report["version"] == ""
 
 
 def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:

@@ -35,7 +35,7 @@ class EvalCommand(WorldCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of another task), or mirror for the
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for the
     mirror law, a model-based baseline. The default is the newest run, or the task's policy in the
     package if there is no run."""
     episodes: Count = DEFAULT_EPISODES
@@ -47,6 +47,9 @@ class EvalCommand(WorldCommand):
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
     episodes."""
+    limits: bool = False
+    """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
+    1 kHz use, in 32 episodes."""
     physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
@@ -59,8 +62,9 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
     with no_garbage_collection():
-        from bounce_mjx.evaluation.contacts import describe_contacts
-        from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_contacts
+        from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
+        from bounce_mjx.evaluation.limits import describe_limits, limit_shares
+        from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_episodes
         from bounce_mjx.evaluation.recording import RECORDED_EPISODES
         from bounce_mjx.reports.tables import details_line, results_table
         from bounce_mjx.runs.files import check_output, to_json, writable, write_output
@@ -73,6 +77,11 @@ def main(args: Sequence[str]) -> None:
     if command.nominal and command.world is not None:
         raise UserError("--nominal and --world exclude each other; leave one out")
     config = command.config_of(checkpoint)
+    if command.limits and config.env.robot.limits.velocity is None:
+        raise UserError(
+            "the arm of this policy has no limits of its commands (env.robot.limits); leave "
+            "--limits out, or give a run with an arm that has them, such as --robot ur5e"
+        )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
     policy, actor = read_actor(checkpoint, config)
@@ -94,16 +103,21 @@ def main(args: Sequence[str]) -> None:
         console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)
-    contacts = None
-    if command.contacts:
-        contacts = recorded_contacts(policy, config.env, actor, options)
-        described = describe_contacts(contacts, RECORDED_EPISODES)
-        console.print(described, markup=False, highlight=False, soft_wrap=True)
+    found = {}
+    if command.contacts or command.limits:
+        recording = recorded_episodes(policy, config.env, actor, options)
+        for name, wanted, measure, describe in (
+            ("contacts", command.contacts, arm_contacts, describe_contacts),
+            ("limits", command.limits, limit_shares, describe_limits),
+        ):
+            if wanted:
+                found[name] = measure(config.env, recording)
+                described = describe(found[name], RECORDED_EPISODES)
+                console.print(described, markup=False, highlight=False, soft_wrap=True)
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
-        if contacts is not None:
-            plain["contacts"] = [contact._asdict() for contact in contacts]
+        plain |= {name: [entry._asdict() for entry in entries] for name, entries in found.items()}
         with writable(command.json_file, "give another file with --json"):
             write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)

@@ -12,7 +12,7 @@ from rich.progress import Progress
 from bounce_mjx.commands.run_options import ActorCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
     DEFAULT_CONDITION_EPISODES,
     DEFAULT_SEED,
@@ -32,13 +32,15 @@ class RobustnessCommand(ActorCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of another task), or mirror for the
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for the
     mirror law, a model-based baseline. The default is the newest run, or the task's policy in the
     package if there is no run."""
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
     numbers is a condition too."""
+    assumed: bool = False
+    """Only the world itself and twice each of its assumed numbers, without the suite."""
     suite: Path | None = None
     """YAML file of the perturbations, or the name of one in configs/; the default is robustness,
     which is version 1, and robustness_v2 is version 2."""
@@ -75,17 +77,23 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.runs.reading import read_actor
         from bounce_mjx.training.setup import set_up_jax
 
+    if command.assumed and command.world is None:
+        raise UserError("--assumed is about a named world; give one with --world, or leave it out")
     console = Console()
     checkpoint = command.choose(command.checkpoint, console)
     config = command.config_of(checkpoint)
     suite = resource_path("configs/robustness.yaml")
     if command.suite is not None:
         suite = named_file(command.suite, "configs")
-    world, assumed = None, None
+    world, assumed = None, {}
     if command.world is not None:
         there, named = in_world(config, command.world)
         world, assumed = there.env, named.doubled()
     conditions = load_suite(suite, config.env, world, assumed)
+    version = read_suite(suite).version
+    if command.assumed:
+        conditions, version = conditions[: 1 + len(assumed)], ""
+        suite = f"twice what {command.world} assumes"
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
     policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
@@ -107,7 +115,7 @@ def main(args: Sequence[str]) -> None:
         checkpoint=str(checkpoint.folder),
         steps=checkpoint.steps,
         suite=str(suite),
-        version=read_suite(suite).version,
+        version=version,
         episodes=command.episodes,
         seed=command.seed,
         measured=outcomes[0].measured,

@@ -115,8 +115,8 @@ class PolicyCommand(RunCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
-    policy that comes with the package: pretrained, robust, or the name of another task. The default
-    is the newest run, or the task's policy in the package if there is no run."""
+    policy that comes with the package: pretrained, robust, or the name of a task or an arm. The
+    default is the newest run, or the task's policy in the package if there is no run."""
 
 
 def parse_with_commands(

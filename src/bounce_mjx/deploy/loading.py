@@ -5,16 +5,16 @@ from pathlib import Path
 
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.resources import POLICIES, present_policies, resource_path
 
 
 def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
     Args:
-      policy: the name of a policy that comes with the package, "pretrained", "robust" or that of a
-        task such as "juggle"; a `.onnx` file from `bounce-mjx export`; or a run's folder or a
-        checkpoint in it, which is first exported with JAX.
+      policy: the name of a policy that comes with the package, "pretrained", "robust", or that of a
+        task such as "juggle" or of an arm; a `.onnx` file from `bounce-mjx export`; or a run's
+        folder or a checkpoint in it, which is first exported with JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
 
     Raises:
@@ -25,7 +25,7 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
         if not path.is_file():
             raise UserError(
                 f"the policy {policy} is not in this version of the package; give one of "
-                f"{', '.join(n for n in POLICIES if n != policy)}, a .onnx file or a run's folder"
+                f"{present_policies()}, a .onnx file or a run's folder"
             )
         return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
     path = Path(policy)
@@ -35,7 +35,7 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
         return DeployedPolicy(path.read_bytes(), str(path))
     except OSError as error:
         raise UserError(
-            f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
+            f"the policy {path} cannot be read ({error.strerror}); give {present_policies()}, "
             "a .onnx file or a run's folder"
         ) from error
 

@@ -19,7 +19,7 @@ from bounce_mjx.physics import (
     make_engine,
 )
 from bounce_mjx.physics.control import Moving
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS, direct_solref
 from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
     BallAddresses,
@@ -33,10 +33,11 @@ from bounce_mjx.robot.model import (
 )
 from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
-from bounce_mjx.world import actuation, noise, sensing
+from bounce_mjx.world import actuation, impact, noise, sensing
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.estimator import Estimate, Estimator
+from bounce_mjx.world.impact import Impact
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import (
     TERMS,
@@ -67,6 +68,8 @@ class Memory(NamedTuple):
     actuation: Actuation | None
     sensing: Sensing | None
     estimate: Estimate | None = None
+    impact: Impact | None = None
+    """For a restitution that depends on the speed."""
 
 
 class EnvState(NamedTuple):
@@ -255,7 +258,7 @@ class Env:
                 memory = memory._replace(
                     command_ranges=jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends)
                 )
-            state = state._replace(memory=memory)
+            state = self._with_impact(state._replace(memory=memory), truth)
         zero = jnp.zeros((), draws.dtype)
         # The names alone: no step is computed.
         step = Step(truth, command, no_action, no_action)
@@ -339,8 +342,8 @@ class Env:
             world, memory.actuation, control, config.control_dt, config.num_substeps
         )
         memory = memory._replace(counter=noise.next_counter(memory.counter), actuation=queue)
-        if "air_drag" in world:
-            control = control._replace(air_drag=world["air_drag"])
+        air = {name: world[name] for name in ("air_drag", "air_lift") if name in world}
+        control = control._replace(**air)
         if "push_speed" in world:
             push = actuation.push(
                 world,
@@ -506,6 +509,7 @@ class Env:
         )
         if before.memory is not None:
             after = after._replace(memory=self._next_memory(after, truth))
+            after = self._with_impact(after, truth)
         return state.replace(
             pipeline_state=after,
             obs=self.observe(after, truth),
@@ -572,6 +576,9 @@ class Env:
                 moving=self._limits is not None,
             ),
             sensing=None,
+            impact=impact.first_impact(state.world, direct_solref(self.mj_model)[0])
+            if "restitution_slope" in state.world
+            else None,
         )
         return self._first_measurements(state, truth, memory) if self._needs_sensing else memory
 
@@ -620,6 +627,33 @@ class Env:
         own = {name: past.seen[name] for name in config.observation.seen("task")}
         task, own = self.task.next_quantities(past.task, own, measured)
         return memory._replace(sensing=Sensing(balls, picture, seen | own, task))
+
+    def _with_impact(self, state: EnvState, truth: Kinematics) -> EnvState:
+        """The state with the contact's damping in the next control step."""
+        if state.memory.impact is None:
+            return state
+        qpos, addresses, parameters = state.physics.qpos, self._addresses, state.parameters
+        moving = [jnp.zeros_like(qpos[0])] * self.mj_model.nq
+        for i, address in enumerate(addresses.arm_qpos):
+            moving[address] = truth.joint_velocities[i]
+        _, velocity = jax.jvp(
+            lambda qpos: self.engine.paddle_position(parameters, qpos),
+            (qpos,),
+            (jnp.stack(moving),),
+        )
+        radius = parameters.ball_radius
+        if radius is None:
+            radius = self.mj_model.geom_size[addresses.ball_geom, 0]
+        height = radius + np.min(self.mj_model.geom_size[addresses.paddle_geom])
+        memory = state.memory._replace(
+            impact=impact.next_impact(
+                state.memory.impact,
+                gap=truth.ball_position[..., 2] - truth.paddle_position[2] - height,
+                speed=velocity[2] - truth.ball_velocity[..., 2],
+            )
+        )
+        parameters = parameters._replace(contact_damping=impact.damping(memory.impact))
+        return state._replace(memory=memory, parameters=parameters)
 
     def _picture(
         self, world: World, balls: jax.Array, last: sensing.Picture, memory: Memory

@@ -19,6 +19,7 @@ from bounce_mjx.physics import (
     edited_model,
     servo_targets,
 )
+from bounce_mjx.physics.parameters import contact_pairs
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.randomization import Ranges
 
@@ -51,7 +52,17 @@ def make_mujoco_evaluator(
         actions = actor.act(policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
         targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-        return actions, states, targets, control.ball_push, control.air_drag
+        memory = states.pipeline_state.memory
+        varies = memory is not None and memory.impact is not None
+        damping = states.pipeline_state.parameters.contact_damping if varies else None
+        return (
+            actions,
+            states,
+            targets,
+            control.ball_push,
+            damping,
+            (control.air_drag, control.air_lift),
+        )
 
     @jax.jit
     def finish(states, actions, physics, statistics, step):
@@ -68,10 +79,14 @@ def make_mujoco_evaluator(
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
                 actions, states, *inputs = decide(policy, states)
-                targets, push, air_drag = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
+                targets, push, damping, air = jax.tree.map(
+                    lambda x: np.asarray(x, np.float64), inputs
+                )
+                if damping is not None:
+                    _set_damping(models, damping)
                 if push is not None:
                     simulated[:, ball_velocity] += push.reshape(-1, episodes).T
-                simulated = _next_states(pool, models, data, simulated, targets, air_drag)
+                simulated = _next_states(pool, models, data, simulated, targets, *air)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics = finish(states, actions, physics, statistics, step)
                 if step % 100 < 99:
@@ -91,29 +106,58 @@ def _next_states(
     data: list[mujoco.MjData],
     states: np.ndarray,
     targets: np.ndarray,
-    air_drag: np.ndarray | None,
+    air_drag: np.ndarray | None = None,
+    air_lift: np.ndarray | None = None,
 ) -> np.ndarray:
-    """States [N, size] after one control step. The drag needs the velocity in each physics step.
+    """States [N, size] after one control step. The forces of the air need the velocity in each
+    physics step.
 
     Args:
       targets: servo targets [N, substeps, nu].
-      air_drag: deceleration [N] of the balls by the air divided by their squared speed, 1/m.
+      air_drag: that of `Control` for each state [N].
+      air_lift: likewise.
     """
-    if air_drag is None:
+    if air_drag is None and air_lift is None:
         trajectory, _ = pool.rollout(models, data, states, targets, control_spec=_CTRL)
         return trajectory[:, -1]
-    balls = [ball.body for ball in find_addresses(models[0]).balls]
-    ball_velocity = _ball_velocity(models[0])
-    drag = air_drag[:, None] * [model.body_mass[balls] for model in models]
+    balls = find_addresses(models[0]).balls
+    bodies, first_velocity = [ball.body for ball in balls], 1 + models[0].nq
+    mass = np.array([model.body_mass[bodies] for model in models])
+    drag, lift = (0.0 if x is None else x[:, None] * mass for x in (air_drag, air_lift))
     forces = np.zeros((len(states), models[0].nbody, 6))
+
+    def of_balls(start: int, entries: list[tuple[int, ...]]) -> np.ndarray:
+        return states[:, start + np.array(entries)]
+
     for target in np.moveaxis(targets, 1, 0):
-        velocity = states[:, ball_velocity].reshape(len(states), -1, 3)
+        velocity = of_balls(first_velocity, [ball.qvel[:3] for ball in balls])
         speed = np.linalg.norm(velocity, axis=2)
-        forces[:, balls, :3] = -(drag * speed)[:, :, None] * velocity
+        forces[:, bodies, :3] = -(drag * speed)[:, :, None] * velocity
+        if air_lift is not None:
+            spin = _turned(
+                of_balls(1, [ball.qpos[3:] for ball in balls]),
+                of_balls(first_velocity, [ball.qvel[3:] for ball in balls]),
+            )
+            forces[:, bodies, :3] += lift[:, :, None] * np.cross(spin, velocity)
         control = np.concatenate([target, forces.reshape(len(states), -1)], axis=1)[:, None]
         trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
         states = trajectory[:, 0]
     return states
+
+
+def _turned(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] of a body's frame in the world, at its orientation [..., 4]."""
+    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    w, axis = unit[..., :1], unit[..., 1:]
+    across = 2.0 * np.cross(axis, vector)
+    return vector + w * across + np.cross(axis, across)
+
+
+def _set_damping(models: list[mujoco.MjModel], damping: np.ndarray) -> None:
+    """Sets the damping [N] of each model's contacts, 1/s."""
+    pairs = contact_pairs(models[0])
+    for model, value in zip(models, damping, strict=True):
+        model.pair_solref[pairs, 1] = -value
 
 
 def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:

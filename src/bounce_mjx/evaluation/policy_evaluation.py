@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
-from bounce_mjx.evaluation.contacts import ArmContact, arm_contacts
 from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
+from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -67,21 +67,21 @@ def evaluate_policy(
     )
 
 
-def recorded_contacts(
+def recorded_episodes(
     policy: Policy | None,
     env_config: WorldConfig,
     actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
-) -> list[ArmContact]:
-    """Contacts of the arm with itself and the floor in `RECORDED_EPISODES` episodes; the arguments
-    are those of `evaluate_policy`. In place of MuJoCo's C engine, the config's simulates."""
+) -> Recording:
+    """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`. In
+    place of MuJoCo's C engine, the config's simulates."""
     env = Env(_with_options(env_config, options))
     commands = _commands(env_config, options)
     evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
     key = jax.random.PRNGKey(options.seed)
     _, recording = evaluate(policy, key, ranges if commands else None)
-    return arm_contacts(env.config, recording)
+    return jax.device_get(recording)
 
 
 def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:

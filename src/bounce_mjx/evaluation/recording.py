@@ -51,6 +51,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
 
     def one(state: State, running: jax.Array) -> Recording:
         now = moment(env, state, step)
+        setpoint = state.pipeline_state.setpoint
         return Recording(
             joint_angles=now.truth.joint_angles,
             ball=now.truth.ball_position,
@@ -58,6 +59,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             command=now.command,
             task=env.task.recorded(now),
             running=running,
+            command_velocity=None if setpoint is None else setpoint.velocity,
         )
 
     return jax.vmap(one, in_axes=-1, out_axes=-1)(states, running)

@@ -413,6 +413,8 @@ def _atan2(y: Scalar, x: Scalar) -> Scalar:
 
 # Operations that Mosaic GPU does not compile, expressed with operations that it does.
 _REWRITTEN: dict[str, Callable[..., Scalar]] = {
+    # The sum of a derivative's parts.
+    "add_any": lax.add,
     "acos": lambda x: _atan2(_sqrt((1.0 - x) * (1.0 + x)), x),
     "asin": lambda x: _atan2(x, _sqrt((1.0 - x) * (1.0 + x))),
     "atan": _atan,

@@ -13,9 +13,10 @@ from mujoco import mjx
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
+from bounce_mjx.physics.fused.friction import turning_of
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 _INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_EULER,
@@ -149,14 +150,12 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps."""
     balls = constants.addresses.balls
-    velocities = [np.array(ball.qvel[:3]) for ball in balls]
+    in_air = control.air_drag is not None or control.air_lift is not None
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
-        braked = [] if control.air_drag is None else zip(balls, velocities, strict=True)
-        for ball, velocity in braked:
-            acceleration = jnp.stack(drag(control.air_drag, data.qvel[velocity]))
-            force = model.body_mass[ball.body] * acceleration
+        for ball in balls if in_air else ():
+            force = model.body_mass[ball.body] * _by_air(control, ball, data)
             applied = data.xfrc_applied.at[ball.body, :3].set(force)
             data = data.replace(xfrc_applied=applied)
         return mjx.step(_with_saturated_servos(model, constants, data), data)
@@ -165,12 +164,24 @@ def step(
         model = in_world(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
-            pushed = np.concatenate(velocities)
+            pushed = np.concatenate([ball.qvel[:3] for ball in balls])
             data = data.replace(qvel=data.qvel.at[pushed].add(jnp.ravel(control.ball_push)))
         if state.act is not None:
             data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
+
+
+def _by_air(control: Control, ball: BallAddresses, data: mjx.Data) -> jax.Array:
+    """Acceleration [3] of a ball by the air, m/s^2."""
+    velocity, spin = (data.qvel[np.array(part)] for part in (ball.qvel[:3], ball.qvel[3:]))
+    acceleration = jnp.zeros_like(velocity)
+    if control.air_drag is not None:
+        acceleration += jnp.stack(drag(control.air_drag, velocity))
+    if control.air_lift is not None:
+        spin = jnp.stack(turning_of(tuple(data.qpos[np.array(ball.qpos[3:])]), tuple(spin)).spin)
+        acceleration += control.air_lift * jnp.cross(spin, velocity)
+    return acceleration
 
 
 def _with_saturated_servos(model: mjx.Model, constants: MjxModel, data: mjx.Data) -> mjx.Model:

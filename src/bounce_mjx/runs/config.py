@@ -156,7 +156,7 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
     path = run / CONFIG_FILE
     values = _read(path)
     config = validate(train_config(task_of_run(values["task"], run, task)), values, str(path))
-    if config.env.mjcf is not None:
+    if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
         check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
     return config
 

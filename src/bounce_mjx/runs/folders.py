@@ -34,7 +34,13 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
+from bounce_mjx.resources import (
+    POLICIES,
+    PRETRAINED,
+    TASK_POLICIES,
+    present_policies,
+    resource_path,
+)
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
@@ -106,6 +112,11 @@ def save_config(run: Path, config: TrainConfig) -> None:
         # The run's folder may be moved.
         env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
         config = config.model_copy(update={"env": env})
+    write_config(run, config)
+
+
+def write_config(run: Path, config: TrainConfig) -> None:
+    """Writes the run's config as it is, without copies."""
     head = f"# bounce_mjx {bounce_mjx.__version__}\n"
     write_atomically(run / CONFIG_FILE, head + dump_config(config))
 
@@ -210,10 +221,9 @@ def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
     """Checkpoint of a policy in `POLICIES`."""
     folder = resource_path(POLICIES[name])
     if not folder.is_dir():
-        others = ", ".join(other for other in POLICIES if other != name)
         raise UserError(
-            f"the policy {name} is not in this version of the package; give {others} or a run's "
-            "folder"
+            f"the policy {name} is not in this version of the package; give {present_policies()} "
+            "or a run's folder"
         )
     return best_checkpoint(folder)
 

@@ -37,6 +37,9 @@ class Recording(NamedTuple):
     """What `Task.recorded` gave [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
+    command_velocity: jax.Array | None = None
+    """Velocities of the joints' commands at the end of the step [T, n, K], rad/s; None if the
+    commands do not move within limits."""
 
 
 class Curve(NamedTuple):

@@ -52,11 +52,16 @@ _ANY = (-math.inf, math.inf)
 _FACTOR = (1e-3, 1e3)
 _NOT_NEGATIVE = (0.0, math.inf)
 
+IMPACT_SPEED = 2.45
+"""Speed of the impact that the restitution is of if it has a slope, m/s."""
+
 TERMS: dict[str, Term] = {
     "restitution": Term((), 0.85, (0.6, 0.98)),
+    "restitution_slope": Term((), 0.0, (0.0, 0.1)),
     "ball_mass": Term((), 1.0, _FACTOR),
     "ball_radius": Term((), 1.0, _FACTOR),
     "air_drag": Term((), 0.0, _NOT_NEGATIVE),
+    "air_lift": Term((), 0.0, _NOT_NEGATIVE),
     "contact_friction": Term((), 0.0, _NOT_NEGATIVE),
     "servo_gain": Term(None, 1.0, _FACTOR),
     "servo_damping": Term(None, 1.0, _FACTOR),
@@ -95,6 +100,10 @@ class RandomizationConfig(StrictModel):
 
     restitution: Range | None = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
+    restitution_slope: Range | None = None
+    """Fall of the restitution for each m/s of the impact's speed beyond 2.45 m/s, that of the
+    ITTF's drop from 30.5 cm, s/m; with restitution. Balls bounce less in faster impacts (Hubbard
+    and Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
     ball_mass: Range | None = None
     """Factor of the ball's mass."""
     ball_radius: Range | None = None
@@ -102,6 +111,11 @@ class RandomizationConfig(StrictModel):
     air_drag: Range | None = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
+    air_lift: Range | None = None
+    """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
+    velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
+    speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
+    "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
     contact_friction: Range | None = None
     """Coefficient of sliding friction between ball and paddle."""
     servo_gain: Range | None = None
@@ -180,6 +194,8 @@ class RandomizationConfig(StrictModel):
             raise ValueError(
                 f"shares has a probability for {shorten(name)}, which is not a term; remove it"
             )
+        if self.restitution_slope is not None and self.restitution is None:
+            raise ValueError("restitution_slope is given without restitution; give both")
         for name in self.terms:
             (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
             if not low <= high:

@@ -27,10 +27,12 @@ from bounce_mjx.physics.fused.contact import (
 )
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
 from bounce_mjx.physics.fused.scalars import (
+    ZERO3,
     Quaternion,
     Scalar,
     Vec3,
     add,
+    cross,
     dot,
     is_constant,
     matmul,
@@ -54,7 +56,7 @@ class Ball(NamedTuple):
     position: Vec3
     velocity: Vec3
     turning: friction.Turning | None
-    """Spin and orientation; None without friction, as the spin is then constant."""
+    """Spin and orientation; None if the spin is constant and has no effect."""
 
 
 class Motion(NamedTuple):
@@ -77,14 +79,15 @@ def step(
     Given parameters are inputs of the program; the others fold into it as constants. The loop
     carries the coordinates as scalars. Without friction the contact's force goes through the ball's
     centre and the spin stays constant, so one rotation over the whole interval updates the
-    orientation.
+    orientation, unless the spin lifts the ball.
     """
     addresses = model.addresses
     frictional = model.contacts[0].friction is not None or parameters.contact_friction is not None
+    turns = frictional or control.air_lift is not None
     motion = Motion(
         q=tuple(state.qpos[i] for i in addresses.arm_qpos),
         v=tuple(state.qvel[i] for i in addresses.arm_qvel),
-        balls=tuple(_ball(at, state, frictional) for at in addresses.balls),
+        balls=tuple(_ball(at, state, turns) for at in addresses.balls),
     )
     if control.ball_push is not None:
         pushes = jnp.reshape(control.ball_push, (-1, 3))
@@ -98,7 +101,7 @@ def step(
     numbers, given = jax.tree.flatten(scalars_of(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
-    turns = [
+    turned = [
         (turn(*_orientation_and_spin(at, state), num_substeps * model.dt), None)
         if ball.turning is None
         else (ball.turning.orientation, friction.spin_in_ball(ball.turning))
@@ -109,7 +112,7 @@ def step(
     qvel = [state.qvel[i] for i in range(model.nv)]
     _put(qpos, addresses.arm_qpos, motion.q)
     _put(qvel, addresses.arm_qvel, motion.v)
-    for at, ball, (quaternion, spin) in zip(addresses.balls, motion.balls, turns, strict=True):
+    for at, ball, (quaternion, spin) in zip(addresses.balls, motion.balls, turned, strict=True):
         _put(qpos, at.qpos, (*ball.position, *quaternion))
         _put(qvel, at.qvel[:3], ball.velocity)
         if spin is not None:
@@ -117,11 +120,11 @@ def step(
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 
-def _ball(at: BallAddresses, state: PhysicsState, frictional: bool) -> Ball:
+def _ball(at: BallAddresses, state: PhysicsState, turns: bool) -> Ball:
     return Ball(
         position=tuple(state.qpos[i] for i in at.qpos[:3]),
         velocity=tuple(state.qvel[i] for i in at.qvel[:3]),
-        turning=friction.turning_of(*_orientation_and_spin(at, state)) if frictional else None,
+        turning=friction.turning_of(*_orientation_and_spin(at, state)) if turns else None,
     )
 
 
@@ -193,8 +196,9 @@ def _substeps(
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
         world = in_world(model, parameters)
-        if control.air_drag is not None:
-            world = dataclasses.replace(world, air_drag=control.air_drag)
+        air = {"air_drag": control.air_drag, "air_lift": control.air_lift}
+        air = {name: value for name, value in air.items() if value is not None}
+        world = dataclasses.replace(world, **air)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
@@ -295,14 +299,14 @@ def constraint_response(
     pose: chain.Pose,
     inertia: chain.SquareMatrix,
     applied: list[Scalar],
-) -> tuple[list[Scalar], list[Vec3], list[Vec3 | None]]:
+) -> tuple[list[Scalar], list[Vec3], list[Vec3]]:
     """Joint forces from the contacts and dry friction, and of each ball the total acceleration
-    (m/s^2) and the angular acceleration (rad/s^2, world; None without sliding friction)."""
+    (m/s^2) and the angular acceleration (rad/s^2, world)."""
     contacts = _contacts(model, motion, pose)
     free = [_free_acceleration(model, i, ball) for i, ball in enumerate(motion.balls)]
-    if motion.balls[0].turning is None:
+    if model.contacts[0].friction is None:
         torque, balls = _normal_response(model, motion, pose, inertia, applied, contacts, free)
-        return torque, balls, [None] * len(balls)
+        return torque, balls, [ZERO3] * len(balls)
     factor = stored(chain.cholesky(inertia))
     response = friction.contact_response(
         model,
@@ -396,9 +400,11 @@ def _contacts(model: FusedModel, motion: Motion, pose: chain.Pose) -> list[Conta
 def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec3:
     """Acceleration of a ball without contacts, m/s^2."""
     free = scale(model.gravity, model.balls[index].weight)
-    if is_constant(model.air_drag):
-        return free
-    return vadd(free, drag(model.air_drag, ball.velocity))
+    if not is_constant(model.air_drag):
+        free = vadd(free, drag(model.air_drag, ball.velocity))
+    if not is_constant(model.air_lift):
+        free = vadd(free, scale(cross(ball.turning.spin, ball.velocity), model.air_lift))
+    return free
 
 
 def _normal_jacobian(
@@ -419,7 +425,7 @@ def integrate(
     servo_damping: Sequence[Scalar],
     torque: list[Scalar],
     ball_accelerations: Sequence[Vec3],
-    spin_accelerations: Sequence[Vec3 | None],
+    spin_accelerations: Sequence[Vec3],
 ) -> Motion:
     """MuJoCo's integrators implicitfast and Euler: semi-implicit Euler, implicit in the
     velocity-dependent forces of joint damping and, with implicitfast, of servos (documentation,
@@ -439,7 +445,7 @@ def integrate(
     return Motion(q, v, tuple(_moved(*ball, dt) for ball in accelerations))
 
 
-def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3 | None, dt: float) -> Ball:
+def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -> Ball:
     """The ball one step later."""
     velocity = vadd(ball.velocity, scale(acceleration, dt))
     position = vadd(ball.position, scale(velocity, dt))

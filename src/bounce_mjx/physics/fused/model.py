@@ -107,6 +107,9 @@ class FusedModel:
     """Whether the joints' dry friction acts (the flag `frictionloss`)."""
     air_drag: Scalar = 0.0
     """Deceleration of a ball by the air divided by its squared speed, 1/m."""
+    air_lift: Scalar = 0.0
+    """Acceleration of a ball by the Magnus force divided by the cross product of its spin and
+    velocity."""
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:

@@ -1,0 +1,69 @@
+"""Commands of recorded episodes at the rate of an arm's controller, against the arm's limits."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.robot.setpoints import Setpoint, command
+from bounce_mjx.task.shown import Recording
+from bounce_mjx.world.config import WorldConfig
+
+
+class LimitShare(NamedTuple):
+    """The most that the commands of recorded episodes use of a limit."""
+
+    quantity: str
+    """velocity, acceleration or jerk."""
+    share: float
+    """Largest size, of the limit of its joint."""
+    joint: int
+    """The joint with this share, from 1 at the base."""
+
+
+def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) -> list[LimitShare]:
+    """The largest velocity, acceleration and jerk of recorded commands, of each one's limit: the
+    differences of the commands that a controller gets at a rate, one to three times.
+
+    The commands are computed in float64 from the recorded velocities, as a deployed policy does it
+    (`robot.setpoints`).
+
+    Args:
+      config: of an arm with limits of velocity and acceleration.
+      rate: of the controller, Hz; rounded to whole commands in a control step.
+    """
+    limits = config.robot.limits
+    given = {name: getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
+    bounds = {name: np.array(bound)[:, None] for name, bound in given.items() if bound is not None}
+    smoothing = None
+    if limits.jerk is not None:
+        smoothing = 2.0 * bounds["acceleration"] / bounds["jerk"]
+    velocities, running = (np.asarray(x) for x in (recording.command_velocity, recording.running))
+    duration = config.control_dt
+    count = max(1, round(duration * rate))
+    tick = duration / count
+    still = np.zeros(velocities.shape[1:])
+    start, sent = Setpoint(still, still, still), [still] * len(bounds)
+    largest = {name: still for name in bounds}
+    for after, counts in zip(velocities.astype(np.float64), running, strict=True):
+        acceleration = (after - start.velocity) / duration
+        times = tick * np.arange(1, count + 1)
+        sent += [command(start, acceleration, time, np, smoothing) for time in times]
+        change = np.array(sent)
+        for name, bound in bounds.items():
+            change = np.diff(change, axis=0) / tick
+            most = np.max(np.abs(change[-count:]), axis=0) / bound
+            largest[name] = np.maximum(largest[name], np.where(counts, most, 0.0))
+        sent = sent[-len(bounds) :]
+        position = start.position + 0.5 * (start.velocity + after) * duration
+        start = Setpoint(position, after, acceleration)
+    each = {name: np.max(shares, axis=1) for name, shares in largest.items()}
+    return [LimitShare(name, float(x.max()), int(x.argmax()) + 1) for name, x in each.items()]
+
+
+def describe_limits(shares: Iterable[LimitShare], episodes: int) -> str:
+    """Shares in one line."""
+    each = [f"{quantity} {100 * share:.1f}% (joint {joint})" for quantity, share, joint in shares]
+    return f"most of the arm's limits that commands at 1 kHz use in {episodes} episodes: " + (
+        ", ".join(each)
+    )

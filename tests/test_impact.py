@@ -1,0 +1,152 @@
+"""Air on a spinning ball, and restitution that falls with the impact's speed, against MuJoCo's C
+engine with the same forces and damping applied by hand."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.evaluation.c_episodes import episode_models
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.world.impact import Impact, damping, first_impact
+from test_friction import converged
+from test_physics import bouncing_states, difference
+
+COUNT, DRAG, LIFT = 4, 0.2, 0.05
+
+
+def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float, lift: float) -> None:
+    """Applies the force of the air on the ball by hand."""
+    ball = model.body("ball_link")
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, data.qpos[9:13] / np.linalg.norm(data.qpos[9:13]))
+    velocity, spin = data.qvel[6:9], rotation.reshape(3, 3) @ data.qvel[9:12]
+    force = lift * np.cross(spin, velocity) - drag * np.linalg.norm(velocity) * velocity
+    data.xfrc_applied[ball.id, :3] = ball.mass[0] * force
+
+
+@pytest.mark.parametrize("friction", (None, 0.3))
+@pytest.mark.usefixtures("float64")
+def test_a_spinning_ball_in_air_is_mujocos(mj_model, friction, record_property):
+    """Free runs of 300 steps with bounces; the ball also spins without friction."""
+    start = bouncing_states(mj_model, np.random.default_rng(0))
+    qpos, qvel = start.qpos[:COUNT].copy(), start.qvel[:COUNT].copy()
+    qpos[:, 8] -= 0.03
+    qvel[:, 9:12] = np.random.default_rng(1).uniform(-50.0, 50.0, (COUNT, 3))
+    given = None if friction is None else np.float64(friction)
+    parameters = PhysicsParameters(contact_friction=given)
+    engine = make_engine(mj_model, "fused")
+
+    def advance(state, ctrl):
+        control = Control(ctrl, air_drag=DRAG, air_lift=LIFT)
+        return engine.step(parameters, state, control, 300)
+
+    after = jax.jit(jax.vmap(advance))(PhysicsState(qpos, qvel), qpos[:, :6])
+    model = edited_model(mj_model, parameters)
+    converged(model, 20)
+    contacts, ends = 0, []
+    for start in zip(qpos, qvel, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = start
+        data.ctrl[:] = start[0][:6]
+        for _ in range(300):
+            push_by_air(model, data, DRAG, LIFT)
+            mujoco.mj_step(model, data)
+            contacts += data.ncon
+        ends.append((data.qpos.copy(), data.qvel.copy()))
+    expected = PhysicsState(*(np.array(x) for x in zip(*ends, strict=True)))
+    error = max(difference(after, expected))
+    record_property("largest_difference", error)
+    assert contacts >= 20
+    assert error < 1e-9
+
+
+def test_lift_turns_a_flight_to_the_side_that_the_spin_says(mj_model):
+    """Backspin lifts: spin about -y, flight along x."""
+    engine = make_engine(mj_model, "fused")
+    qpos = jnp.asarray(mj_model.qpos0).at[8].set(1.0)
+    qvel = jnp.zeros(mj_model.nv).at[6].set(3.0).at[10].set(-100.0)
+    control = Control(qpos[:6], air_lift=jnp.float32(0.005))
+    after = engine.step(PhysicsParameters(), PhysicsState(qpos, qvel), control, 10)
+    assert float(after.qvel[8]) == pytest.approx(0.01 * (0.005 * 100.0 * 3.0 - 9.81), rel=1e-3)
+
+
+SLOPED = {
+    "restitution": (0.75, 0.95),
+    "restitution_slope": (0.02, 0.05),
+    "contact_friction": (0.1, 0.4),
+    "air_drag": (0.1, 0.2),
+    "air_lift": (0.002, 0.006),
+}
+WORLDS, STEPS = 3, 60
+
+
+@pytest.mark.usefixtures("float64")
+def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
+    """Each engine runs freely; here the damping of each control step is set in the C model."""
+    env = BounceBall(EnvConfig(randomization=SLOPED, ball_init_pos=(0.58856, 0.0, 0.2)))
+    keys = jax.random.split(jax.random.PRNGKey(0), WORLDS)
+    start = jax.vmap(env.reset)(keys)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (STEPS, WORLDS, 6))
+    step, state, controls, physics = jax.jit(jax.vmap(env.step)), start, [], []
+    for action in actions:
+        controls.append(
+            np.asarray(jax.vmap(env.servo_targets)(state.pipeline_state.physics, action))
+        )
+        state = step(state, action)
+        physics.append(state.pipeline_state.physics)
+    pipeline = start.pipeline_state
+    models = episode_models(env, jax.tree.map(lambda x: np.moveaxis(x, 0, -1), pipeline.parameters))
+    contacts, errors, speeds = 0, [], set()
+    for w, model in enumerate(models):
+        converged(model, 20)
+        world = {name: float(value[w]) for name, value in pipeline.world.items()}
+        paddle = find_addresses(model).paddle_geom
+        reach = model.geom_size[paddle].min() + model.geom_size[find_addresses(model).ball_geom, 0]
+        slow, fast = np.asarray(pipeline.memory.impact.damping)[w]
+        data, jacobian, speed = mujoco.MjData(model), np.zeros((3, model.nv)), 0.0
+        data.qpos[:], data.qvel[:] = (np.asarray(x)[w] for x in pipeline.physics[:2])
+        for t in range(STEPS):
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jacGeom(model, data, jacobian, None, paddle)
+            if data.qpos[8] - data.geom_xpos[paddle, 2] - reach > 0.01:
+                speed = (jacobian @ data.qvel)[2] - data.qvel[8]
+            model.pair_solref[0, 1] = -(slow + (speed - 1.0) / 3.0 * (fast - slow))
+            data.ctrl[:] = controls[t][w]
+            for _ in range(10):
+                push_by_air(model, data, world["air_drag"], world["air_lift"])
+                mujoco.mj_step(model, data)
+                contacts += data.ncon
+                if data.ncon:
+                    speeds.add(round(speed, 3))
+            ours = PhysicsState(*(np.asarray(x)[w] for x in physics[t][:2]))
+            errors.append(max(difference(ours, PhysicsState(data.qpos, data.qvel))))
+    record_property("largest_difference", max(errors))
+    assert contacts >= 10 * WORLDS and np.ptp(list(speeds)) > 0.3
+    assert max(errors) < 1e-9
+
+
+@pytest.mark.parametrize("speed", (1.5, 2.45, 3.5))
+def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed):
+    """On C, in the mean over the phases of the first contact's physics step."""
+    world = {"restitution": jnp.float32(0.88), "restitution_slope": jnp.float32(0.03)}
+    impact: Impact = first_impact(world, 98696.0)
+    given = PhysicsParameters(contact_damping=damping(impact._replace(speed=jnp.float32(speed))))
+    model = edited_model(mj_model, given)
+    rebounds = []
+    for gap in speed * np.linspace(0.001, 0.002, 10, endpoint=False):
+        data = mujoco.MjData(model)
+        data.qpos[:6] = data.ctrl[:6] = EnvConfig().default_joint_angles
+        mujoco.mj_kinematics(model, data)
+        height = [0.0, 0.0, 0.0225 + gap]
+        data.qpos[6:9] = data.geom_xpos[find_addresses(model).paddle_geom] + height
+        data.qvel[8] = -speed
+        while data.qvel[8] < 0.0 or data.ncon:
+            mujoco.mj_step(model, data)
+        rebounds.append(data.qvel[8] / speed)
+    expected = 0.88 - 0.03 * (speed - 2.45)
+    assert np.mean(rebounds) == pytest.approx(expected, abs=0.015)
