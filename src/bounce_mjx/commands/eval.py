@@ -35,9 +35,9 @@ class EvalCommand(WorldCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for the
-    mirror law, a model-based baseline. The default is the newest run, or the task's policy in the
-    package if there is no run."""
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
+    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
+    the package if there is no run."""
     episodes: Count = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = DEFAULT_SEED

@@ -32,9 +32,9 @@ class RobustnessCommand(ActorCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for the
-    mirror law, a model-based baseline. The default is the newest run, or the task's policy in the
-    package if there is no run."""
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
+    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
+    the package if there is no run."""
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
