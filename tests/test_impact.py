@@ -12,6 +12,7 @@ from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.impact import Impact, damping, first_impact
+from bounce_mjx.world.randomization import physics_parameters
 from test_friction import converged
 from test_physics import bouncing_states, difference
 
@@ -128,6 +129,26 @@ def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
     record_property("largest_difference", max(errors))
     assert contacts >= 10 * WORLDS and np.ptp(list(speeds)) > 0.3
     assert max(errors) < 1e-9
+
+
+def test_a_changed_world_keeps_the_slope():
+    """As the sliders of a viewer change it."""
+    env = BounceBall(EnvConfig(randomization=SLOPED))
+    state = env.reset(jax.random.PRNGKey(0))
+    before, memory = state.pipeline_state, state.pipeline_state.memory
+    fast = before._replace(memory=memory._replace(impact=memory.impact._replace(speed=4.0)))
+
+    def damped(world: dict) -> float:
+        changed = state.replace(pipeline_state=env.in_world(fast, world))
+        begun, _ = env.begin_step(changed, jnp.zeros(6))
+        return float(begun.pipeline_state.parameters.contact_damping)
+
+    own = damped(before.world)
+    assert own == pytest.approx(float(damping(fast.memory.impact)), rel=1e-6)
+    flat = before.world | {"restitution_slope": jnp.float32(0.0)}
+    level = physics_parameters(flat, env.mj_model).contact_damping
+    assert damped(flat) == pytest.approx(float(level), rel=1e-5)
+    assert own > 1.05 * damped(flat)
 
 
 @pytest.mark.parametrize("speed", (1.5, 2.45, 3.5))

@@ -358,6 +358,9 @@ class Env:
         if "command_interval" in world:
             command, memory = self._next_command(world, command, memory)
         now = state.pipeline_state._replace(command=command, memory=memory)
+        if memory.impact is not None:
+            damping = impact.damping(memory.impact)
+            now = now._replace(parameters=now.parameters._replace(contact_damping=damping))
         return state.replace(pipeline_state=now), control
 
     def _commanded(
@@ -576,9 +579,7 @@ class Env:
                 moving=self._limits is not None,
             ),
             sensing=None,
-            impact=impact.first_impact(state.world, direct_solref(self.mj_model)[0])
-            if "restitution_slope" in state.world
-            else None,
+            impact=self._first_impact(state.world),
         )
         return self._first_measurements(state, truth, memory) if self._needs_sensing else memory
 
@@ -629,7 +630,7 @@ class Env:
         return memory._replace(sensing=Sensing(balls, picture, seen | own, task))
 
     def _with_impact(self, state: EnvState, truth: Kinematics) -> EnvState:
-        """The state with the contact's damping in the next control step."""
+        """The state that knows the speed of the next impact."""
         if state.memory.impact is None:
             return state
         qpos, addresses, parameters = state.physics.qpos, self._addresses, state.parameters
@@ -645,15 +646,26 @@ class Env:
         if radius is None:
             radius = self.mj_model.geom_size[addresses.ball_geom, 0]
         height = radius + np.min(self.mj_model.geom_size[addresses.paddle_geom])
-        memory = state.memory._replace(
-            impact=impact.next_impact(
-                state.memory.impact,
-                gap=truth.ball_position[..., 2] - truth.paddle_position[2] - height,
-                speed=velocity[2] - truth.ball_velocity[..., 2],
-            )
+        following = impact.next_impact(
+            state.memory.impact,
+            gap=truth.ball_position[..., 2] - truth.paddle_position[2] - height,
+            speed=velocity[2] - truth.ball_velocity[..., 2],
         )
-        parameters = parameters._replace(contact_damping=impact.damping(memory.impact))
-        return state._replace(memory=memory, parameters=parameters)
+        return state._replace(memory=state.memory._replace(impact=following))
+
+    def in_world(self, state: EnvState, world: World) -> EnvState:
+        """The state with other values of the terms of its world."""
+        memory = state.memory
+        if memory.impact is not None:
+            damping = self._first_impact(world).damping
+            memory = memory._replace(impact=memory.impact._replace(damping=damping))
+        parameters = physics_parameters(world, self.mj_model)
+        return state._replace(world=world, parameters=parameters, memory=memory)
+
+    def _first_impact(self, world: World) -> Impact | None:
+        if "restitution_slope" not in world:
+            return None
+        return impact.first_impact(world, direct_solref(self.mj_model)[0])
 
     def _picture(
         self, world: World, balls: jax.Array, last: sensing.Picture, memory: Memory

@@ -13,7 +13,7 @@ from bounce_mjx.env.state import State
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.viewers.controllers import Controller
-from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters
+from bounce_mjx.world.randomization import TERMS, Ranges, World
 
 
 class EnvFrame(NamedTuple):
@@ -278,8 +278,7 @@ def _changed(env: Env, states: State, changes: _Changes) -> State:
     )
 
     def in_world(state: EnvState) -> EnvState:
-        terms = _given_or_drawn(changes.world, state.world)
-        return state._replace(world=terms, parameters=physics_parameters(terms, env.mj_model))
+        return env.in_world(state, _given_or_drawn(changes.world, state.world))
 
     if changes.world:
         changed = jax.vmap(in_world, in_axes=-1, out_axes=-1)(changed)
