@@ -27,6 +27,7 @@ from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.config import load_config
+from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
 
@@ -235,10 +236,17 @@ def covered(found: Identified, hidden: Hidden) -> tuple[int, int]:
     zero = ("servo_lag", "air_drag", "contact_friction", "joint_frictionloss")
     nominal = dict.fromkeys(zero, 0.0) | hidden.world
     known = {name: nominal[name] for name in found.layout.unknowns if name in nominal}
-    truth = found.layout.vector(known)
+    world = found.layout.world(found.layout.vector(known))
+    truth = np.concatenate([np.ravel(world[name]) for name in found.layout.unknowns])
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
     inside = [e.low <= x <= e.high for e, x in zip(listed, truth, strict=True) if e.seen]
     return int(sum(inside)), len(inside)
+
+
+def widths(found: Identified) -> dict[str, float]:
+    """Half the width of the 95% interval of each term that is one number."""
+    listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
+    return {e.label: 0.5 * (e.high - e.low) for e in listed if e.label in found.layout.unknowns}
 
 
 def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:
@@ -266,6 +274,7 @@ def main() -> None:
     folder = given.logs or Path(tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
     config = load_config(resource_path("configs/default.yaml")).env
+    set_up_jax(config)
     model = world_model(config, visual=False)
     home, names = np.array(config.default_joint_angles), joint_names(model)
     rows = []
@@ -274,18 +283,22 @@ def main() -> None:
         if not path.exists():
             record(config, seed, path)
         hidden, begin = hidden_robot(seed), time.perf_counter()
+        begin_processor = time.process_time()
         found = identify(config, read_csv(path, names))
         seconds = time.perf_counter() - begin
+        processor = time.process_time() - begin_processor
         inside, shown = covered(found, hidden)
         rows.append(
             {
                 "seed": seed,
                 "flaw": hidden.flaw,
                 "seconds": seconds,
+                "processor seconds": processor,
                 "errors": errors(found, hidden, model, home),
                 "held out": found.held_out,
                 "covered": inside,
                 "shown": shown,
+                "widths": widths(found),
                 "dropped": found.dropped,
             }
         )

@@ -115,10 +115,28 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     np.testing.assert_allclose(found[: len(expected)], expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("latency, lag", [(0.03, 0.0), (0.012, 0.0007), (0.0, 0.02)])
+def test_entries_of_latency_and_lag_are_the_delay_and_its_variance(latency, lag) -> None:
+    """Against the moments of the filter's answer to an impulse."""
+    layout, dt = make_layout(6, True, 0.001), 0.001
+    vector = layout.vector({"action_latency": latency, "servo_lag": lag})
+    share = -np.expm1(-dt / lag) if lag else 1.0
+    times = dt * np.arange(2000)
+    answer = share * (1.0 - share) ** np.arange(2000)
+    mean = answer @ times
+    places = layout.slices()
+    np.testing.assert_allclose(vector[places["action_latency"]], latency + mean, atol=1e-9)
+    variance = answer @ (times - mean) ** 2
+    np.testing.assert_allclose(vector[places["servo_lag"]], variance, atol=1e-11)
+    world = layout.world(vector)
+    assert abs(world["action_latency"] - latency) < 1e-6
+    assert abs(world["servo_lag"] - lag) < 6e-5
+
+
 def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
     """W C W' is the identity for the covariance C of noise and a bounce's common error."""
     w, noise = windows_of(flight_log()), Noise(np.full(6, 1e-3), np.full(3, 2e-3))
-    problem = Problem(None, w, make_layout(6, True), noise)
+    problem = Problem(None, w, make_layout(6, True, 0.001), noise)
     weights, count = problem.weights(), w.balls.shape[1]
     s = int(np.flatnonzero(w.has_ball)[0])
     eye = np.zeros((3 * count, *weights.shape))

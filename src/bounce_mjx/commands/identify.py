@@ -54,7 +54,7 @@ def main(args: Sequence[str]) -> None:
         raise UserError("no log is given; name the CSV files or bags to identify from")
     with no_garbage_collection():
         from bounce_mjx.identify.bags import Topics, is_bag, read_bag
-        from bounce_mjx.identify.log import check, read_csv
+        from bounce_mjx.identify.log import check, in_one_clock, read_csv
         from bounce_mjx.identify.stages import identify, joined
         from bounce_mjx.identify.words import estimates, sentences
         from bounce_mjx.identify.world import compare, world_of
@@ -80,7 +80,7 @@ def main(args: Sequence[str]) -> None:
         log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
         for warning in check(log, names, ranges):
             console.print(f"warning: {warning}", markup=False)
-        logs.append(log)
+        logs.append(in_one_clock(log))
     set_up_jax(config)
     log = joined(logs)
     found = identify(

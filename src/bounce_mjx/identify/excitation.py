@@ -22,8 +22,11 @@ _SLOW = 0.25
 # Height by which the paddle is lifted first, m, and the time for it and for the way back, s.
 _LIFT = 0.2
 _LIFTING = 1.5
-_FAST = (0.6, 4.0)
+# Frequencies of a sweep, Hz. A delay and a servo's time constant part at the high ones alone.
+_FAST = (0.6, 10.0)
 _RAMP = 0.5
+# Share of a limit that targets use.
+_BELOW_LIMIT = 0.9
 _TOGETHER = (0.53, 0.71, 0.89, 1.13, 1.37, 1.61, 1.83, 2.11)
 # Time between two poses that are checked for contacts, s.
 _CHECKED = 0.02
@@ -50,7 +53,7 @@ def excite(
     """Plans an excitation that starts and ends at `config.default_joint_angles`.
 
     The arm first lifts the paddle, for room above the floor. The joints' amplitudes are halved
-    until no pose has a contact.
+    until no pose has a contact. Of a robot with `robot.limits`, all targets keep to them.
 
     Args:
       max_velocity: largest speed of a target, of each joint or of all, rad/s.
@@ -62,7 +65,7 @@ def excite(
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     addresses, n = find_addresses(model), config.num_joints
     home = np.array(config.default_joint_angles)
-    speeds = np.broadcast_to(np.asarray(max_velocity, float), (n,))
+    bounds = _Bounds.of(config, max_velocity)
     ranges = model.jnt_range[list(addresses.arm_joints)]
     limited = ranges[:, 0] < ranges[:, 1]
     centre = _lifted(model, home)
@@ -76,7 +79,7 @@ def excite(
     times = np.arange(round(seconds / config.control_dt)) * config.control_dt
     every = max(round(_CHECKED / config.control_dt), 1)
     names = joint_names(model)
-    lifting = np.maximum(_LIFTING, 1.5 * np.max(np.abs(centre - home) / speeds))
+    lifting = np.maximum(_LIFTING, np.max(bounds.time_of_step(np.abs(centre - home))))
     if times[-1] < 2.0 * lifting + 1.0 * n:
         raise UserError(
             f"{seconds:g} s are too short to move {n} joints; give at least "
@@ -87,7 +90,7 @@ def excite(
     while True:
         targets = home + lift
         moving = np.isin(times, inner)
-        targets[moving] += _motion(inner - inner[0], amplitudes, speeds)
+        targets[moving] += _motion(inner - inner[0], amplitudes, bounds)
         hit = next((t for t in range(0, len(times), every) if contacts.at(targets[t])), None)
         if hit is None:
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
@@ -120,13 +123,51 @@ def _lifted(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
     return angles
 
 
+class _Bounds(NamedTuple):
+    """Largest derivatives of each joint's target [n]."""
+
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    jerk: np.ndarray
+
+    @classmethod
+    def of(cls, config: WorldConfig, max_velocity: float | Sequence[float]) -> "_Bounds":
+        limits, n = config.robot.limits, config.num_joints
+        velocity, acceleration, jerk = (
+            np.full(n, np.inf) if given is None else _BELOW_LIMIT * np.array(given)
+            for given in (limits.velocity, limits.acceleration, limits.jerk)
+        )
+        return cls(np.minimum(velocity, max_velocity), acceleration, jerk)
+
+    def amplitude(self, joint: int, rate: np.ndarray | float) -> np.ndarray:
+        """Largest amplitude of a sine with an angular frequency, rad/s."""
+        return np.minimum(
+            np.minimum(self.velocity[joint] / rate, self.acceleration[joint] / rate**2),
+            self.jerk[joint] / rate**3,
+        )
+
+    def within(self, joint: int, path: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """A path [T], smaller where its ramps exceed the limits of acceleration and jerk."""
+        share, dt = 1.0, times[1] - times[0]
+        for order, limit in ((2, self.acceleration[joint]), (3, self.jerk[joint])):
+            largest = np.max(np.abs(np.diff(path, order))) / dt**order
+            share = min(share, limit / max(largest, 1e-9))
+        return share * path
+
+    def time_of_step(self, distance: np.ndarray) -> np.ndarray:
+        """Shortest duration [n] of `_smooth` over a distance [n]."""
+        by_jerk = np.cbrt(60.0 * distance / self.jerk)
+        by_acceleration = np.sqrt(5.8 * distance / self.acceleration)
+        return np.maximum(np.maximum(1.9 * distance / self.velocity, by_acceleration), by_jerk)
+
+
 def _smooth(share: np.ndarray) -> np.ndarray:
-    """A step from 0 to 1 without a jump of speed, clipped outside."""
+    """A step from 0 to 1 without a jump of acceleration, clipped outside."""
     share = np.clip(share, 0.0, 1.0)
-    return share * share * (3.0 - 2.0 * share)
+    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
 
-def _motion(times: np.ndarray, amplitudes: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+def _motion(times: np.ndarray, amplitudes: np.ndarray, bounds: _Bounds) -> np.ndarray:
     """Displacements [T, n]: a slot of each joint alone, slow and then fast; then one of all."""
     n, length = len(amplitudes), times[-1] + times[1] - times[0]
     alone = 0.7 * length / n
@@ -135,31 +176,38 @@ def _motion(times: np.ndarray, amplitudes: np.ndarray, speeds: np.ndarray) -> np
         t = times - j * alone
         slow = (t >= 0.0) & (t < 0.5 * alone)
         fast = (t >= 0.5 * alone) & (t < alone)
-        moved[:, j] += slow * _slow(t, 0.5 * alone, amplitudes[j], speeds[j])
-        moved[:, j] += fast * _sweep(t - 0.5 * alone, 0.5 * alone, amplitudes[j], speeds[j])
+        by_slow = slow * _slow(t, 0.5 * alone, amplitudes[j], bounds, j)
+        by_fast = fast * _sweep(t - 0.5 * alone, 0.5 * alone, amplitudes[j], bounds, j)
+        moved[:, j] += sum(bounds.within(j, part, times) for part in (by_slow, by_fast))
     t = times - n * alone
     ramp = _smooth(np.minimum(t, length - n * alone - t) / _RAMP)
     for j in range(n):
         rates = 2.0 * np.pi * np.array(_TOGETHER[j % 4 :: 4])
         wave = np.sum(np.sin(rates * t[:, None] + j), axis=1) / len(rates)
-        size = 0.5 * min(amplitudes[j], 0.6 * speeds[j] / float(np.max(rates)))
-        moved[:, j] += (t >= 0.0) * ramp * size * wave
+        size = 0.5 * min(amplitudes[j], 0.6 * float(bounds.amplitude(j, np.max(rates))))
+        moved[:, j] += bounds.within(j, (t >= 0.0) * ramp * size * wave, times)
     return moved
 
 
-def _slow(t: np.ndarray, length: float, amplitude: float, speed: float) -> np.ndarray:
-    """A triangle there and back at a quarter of the speed, which shows dry friction."""
-    size = min(amplitude, 0.25 * speed * _SLOW * length)
-    return size * 2.0 / np.pi * np.arcsin(0.9999 * np.sin(2.0 * np.pi * t / length))
+def _slow(
+    t: np.ndarray, length: float, amplitude: float, bounds: _Bounds, joint: int
+) -> np.ndarray:
+    """A sine there and back at a quarter of the speed, which shows dry friction."""
+    rate = 2.0 * np.pi / length
+    size = min(amplitude, _SLOW * float(bounds.amplitude(joint, rate)))
+    # From rest to rest.
+    return size * np.sin(rate * t) * _smooth(np.minimum(t, length - t) / (0.25 * length))
 
 
-def _sweep(t: np.ndarray, length: float, amplitude: float, speed: float) -> np.ndarray:
-    """A sine of rising frequency, whose speed stays within the limit."""
+def _sweep(
+    t: np.ndarray, length: float, amplitude: float, bounds: _Bounds, joint: int
+) -> np.ndarray:
+    """A sine of rising frequency, whose derivatives stay within the limits."""
     low, high = _FAST
-    rate = low + (high - low) * np.clip(t / length, 0.0, 1.0)
+    rate = 2.0 * np.pi * (low + (high - low) * np.clip(t / length, 0.0, 1.0))
     phase = 2.0 * np.pi * (low * t + 0.5 * (high - low) * t * t / length)
-    window = np.clip(np.minimum(t, length - t) / (0.2 * length), 0.0, 1.0)
-    size = np.minimum(amplitude, 0.7 * speed / (2.0 * np.pi * rate))
+    window = _smooth(np.minimum(t, length - t) / (0.2 * length))
+    size = np.minimum(amplitude, 0.7 * bounds.amplitude(joint, rate))
     return size * window * np.sin(phase)
 
 
@@ -228,7 +276,11 @@ class _Contacts:
         bodies = [int(m.body_weldid[m.geom_bodyid[geom]]) for geom in pair]
         parents = [int(m.body_weldid[m.body_parentid[body]]) for body in bodies]
         joined = bodies[0] == parents[1] or bodies[1] == parents[0]
-        return joined and not self._planes.keys() & set(pair)
+        if not self._planes.keys() & set(pair):
+            return joined
+        # A link that turns about a vertical axis on its base comes no closer to a plane.
+        joint = m.body_jntadr[bodies[0] or bodies[1]]
+        return joined and joint >= 0 and abs(self._data.xaxis[joint][2]) > 0.999
 
     def _is_fixed(self, geom: int) -> bool:
         m = self._model

@@ -11,14 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.identify.simulation import CHUNK, Predicted, Simulate
-from bounce_mjx.identify.unknowns import Layout
+from bounce_mjx.identify.simulation import Predicted, Simulate
+from bounce_mjx.identify.unknowns import ARM, Layout
 from bounce_mjx.identify.windows import Windows
 
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
 # velocities (rad/s); the ball's position (m), velocity (m/s) and spin (rad/s).
 _START_DEVIATIONS = (0.01, 1.0, 0.1, 3.0, 10.0)
 _START_STEPS = (3e-3, 0.1, 0.01, 0.1, 5.0)
+# Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
+_SEARCHED = (True, False, True, True, True)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
 # by side: the best damping for all, and the best share for each window.
 _DAMPINGS = np.array([0.0, 1e-2, 0.3, 10.0])
@@ -72,6 +74,11 @@ class Problem(NamedTuple):
     layout: Layout
     noise: Noise
 
+    def at(self, vector: np.ndarray, starts: np.ndarray) -> Predicted:
+        """What the sensors would have measured, in one world."""
+        shown = self.simulate(vector[None], starts[None], np.ones((1, len(starts)), bool))
+        return Predicted(shown.angles[0], shown.balls[0])
+
     def residuals(self, predicted: Predicted) -> np.ndarray:
         """Residuals [C, S, A n + 3 B] in units of the noise."""
         w, count = self.windows, len(predicted.angles)
@@ -123,12 +130,13 @@ def minimise(
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
-    deviations, _ = _per_state(problem.windows)
+    deviations, _, searched = _per_state(problem.windows)
     place, now = np.flatnonzero(free), np.inf
-    of_state = np.arange(starts.shape[1]) if free_states is None else np.flatnonzero(free_states)
+    of_state = np.flatnonzero(searched if free_states is None else searched & free_states)
     scale, reach = layout.deviation[place], deviations[of_state]
     # The start of a window that does not count stays as it is.
-    counts = np.any(weights > 0.0, axis=1)[:, None]
+    used = np.any(weights > 0.0, axis=1)
+    num_tried = len(_DAMPINGS) * len(_SHARES)
 
     def costs(predicted: Predicted, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
@@ -148,15 +156,15 @@ def minimise(
         )
         hessian = reduced.information + np.eye(len(place))
         slope = reduced.gradient + (vector[place] - layout.mean[place]) / scale
-        tried_vectors = np.repeat(vector[None], CHUNK, axis=0)
-        tried_states = np.repeat(starts[None], CHUNK, axis=0)
+        tried_vectors = np.repeat(vector[None], num_tried, axis=0)
+        tried_states = np.repeat(starts[None], num_tried, axis=0)
         for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
             change = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
             tried_vectors[i, place] += change * scale
             tried_vectors[i] = layout.clipped(tried_vectors[i])
             change = (tried_vectors[i, place] - vector[place]) / scale
-            tried_states[i][:, of_state] += share * reduced.states(change) * reach * counts
-        outcome = problem.simulate(tried_vectors, tried_states)
+            tried_states[i][:, of_state] += share * reduced.states(change) * reach * used[:, None]
+        outcome = problem.simulate(tried_vectors, tried_states, np.tile(used, (num_tried, 1)))
         tried = costs(outcome, tried_states)
         tried = np.where(np.isfinite(tried), tried, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
         totals = np.sum(np.min(tried, axis=1), axis=1) + of_prior(tried_vectors[:: len(_SHARES)])
@@ -191,6 +199,52 @@ class _Linearised(NamedTuple):
     """[S, M, D]."""
 
 
+class _Difference(NamedTuple):
+    """One simulation for derivatives."""
+
+    columns: np.ndarray
+    """Derivatives that it gives: F unknowns, then D entries of the starts. Of several, each is that
+    of one joint's angles."""
+    steps: np.ndarray
+    """Change of each."""
+    of_angles: bool
+    of_pictures: bool
+
+
+def _differences(
+    problem: Problem, vector: np.ndarray, place: np.ndarray, of_state: np.ndarray
+) -> list[_Difference]:
+    """The simulations for the F unknowns at `place` and the D entries `of_state` of the starts."""
+    layout, n = problem.layout, problem.layout.num_joints
+    ahead = layout.clipped(vector + layout.step) - vector
+    # Differences that stay within the limits.
+    steps = np.where(np.abs(ahead) < 0.5 * layout.step, -layout.step, layout.step)
+    column = {int(p): np.array([f]) for f, p in enumerate(place)}
+    found = []
+    for name, at in layout.slices().items():
+        unknown, entries = layout.unknowns[name], [p for p in range(at.start, at.stop)]
+        if at.start not in column:
+            continue
+        of_angles = name in ARM
+        if unknown.own:
+            together = np.concatenate([column[p] for p in entries])
+            found.append(_Difference(together, steps[at], True, False))
+        for p in entries:
+            step, apart = steps[[p]], unknown.ball_step is not None
+            if not unknown.own:
+                found.append(_Difference(column[p], step, of_angles, not apart))
+            if unknown.ball_step:
+                found.append(_Difference(column[p], layout.ball_step[[p]], False, True))
+    own, start = _per_state(problem.windows)[1], len(place)
+    arm = np.flatnonzero(of_state < n)
+    if len(arm):
+        # A servo has forgotten its start before the first picture.
+        found.append(_Difference(start + arm, own[of_state[arm]], True, False))
+    for d in np.flatnonzero(of_state >= 2 * n):
+        found.append(_Difference(start + np.array([d]), own[of_state[[d]]], False, True))
+    return found
+
+
 def _linearised(
     problem: Problem,
     vector: np.ndarray,
@@ -200,33 +254,41 @@ def _linearised(
     weights: np.ndarray,
 ) -> _Linearised:
     """Derivatives by the F unknowns at `place` and the D entries `of_state` of the starts."""
-    layout, (_, differences) = problem.layout, _per_state(problem.windows)
-    num_free, own = len(place), differences[of_state]
+    n, num_free = problem.layout.num_joints, len(place)
     num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
-    # Unknowns for which the pictures need another difference, if any picture counts.
-    apart = layout.ball_step[place] != layout.step[place]
-    apart = np.flatnonzero(apart & np.any(weights[:, num_angles:] > 0.0))
-    at_states, at_apart = 1 + num_free, 1 + num_free + len(of_state)
-    vectors = np.repeat(vector[None], at_apart + len(apart), axis=0)
-    states = np.repeat(starts[None], len(vectors), axis=0)
-    # Differences that stay within the limits.
-    steps = layout.step[place].copy()
-    ahead = layout.clipped(vector + layout.step)[place] - vector[place]
-    steps = np.where(np.abs(ahead) < 0.5 * steps, -steps, steps)
-    vectors[1 + np.arange(num_free), place] += steps
-    wide = layout.ball_step[place[apart]]
-    vectors[at_apart + np.arange(len(apart)), place[apart]] += wide
-    for i, d in enumerate(of_state):
-        states[at_states + i, :, d] += differences[d]
-    predicted = problem.simulate(vectors, states)
-    r = problem.whitened(problem.residuals(predicted), weights)
-    change = np.moveaxis(r[1:] - r[0], 0, -1)
-    by_unknown, by_state = (
-        change[..., :num_free] / steps,
-        change[..., num_free : at_apart - 1] / own,
+    angles, pictures = (
+        np.any(part > 0.0, axis=1) for part in np.split(weights, [num_angles], axis=1)
     )
-    by_unknown[:, num_angles:, apart] = change[:, num_angles:, at_apart - 1 :] / wide
-    return _Linearised(Predicted(*(part[:1] for part in predicted)), r[0], by_unknown, by_state)
+    tried = [
+        d
+        for d in _differences(problem, vector, place, of_state)
+        if (d.of_angles and np.any(angles)) or (d.of_pictures and np.any(pictures))
+    ]
+    vectors = np.repeat(vector[None], 1 + len(tried), axis=0)
+    states = np.repeat(starts[None], len(vectors), axis=0)
+    used = np.tile(angles | pictures, (len(vectors), 1))
+    for i, difference in enumerate(tried, 1):
+        for column, step in zip(difference.columns, difference.steps, strict=True):
+            if column < num_free:
+                vectors[i, place[column]] += step
+            else:
+                states[i, :, of_state[column - num_free]] += step
+        used[i] = (difference.of_angles & angles) | (difference.of_pictures & pictures)
+    predicted = problem.simulate(vectors, states, used)
+    r = problem.whitened(problem.residuals(predicted), weights)
+    by = np.zeros((*r.shape[1:], num_free + len(of_state)))
+    for i, difference in enumerate(tried, 1):
+        change = r[i] - r[0]
+        for j, (column, step) in enumerate(zip(difference.columns, difference.steps, strict=True)):
+            if difference.of_angles:
+                stride = n if len(difference.columns) > 1 else 1
+                first = j if stride > 1 else 0
+                by[:, first:num_angles:stride, column] = change[:, first:num_angles:stride] / step
+            if difference.of_pictures:
+                by[:, num_angles:, column] = change[:, num_angles:] / step
+    return _Linearised(
+        Predicted(*(part[:1] for part in predicted)), r[0], by[..., :num_free], by[..., num_free:]
+    )
 
 
 class _Reduced(NamedTuple):
@@ -268,10 +330,12 @@ def _eliminate(
     return _Reduced(information, gradient, b, a, q, r)
 
 
-def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
     n = windows.angles.shape[2]
     sizes = (n, n, 3, 3, 3)
-    return np.repeat(_START_DEVIATIONS, sizes), np.repeat(_START_STEPS, sizes)
+    of_all = (_START_DEVIATIONS, _START_STEPS, _SEARCHED)
+    return tuple(np.repeat(values, sizes) for values in of_all)
 
 
 def picture_weights(problem: Problem, predicted: Predicted) -> np.ndarray:
@@ -284,6 +348,3 @@ def picture_weights(problem: Problem, predicted: Predicted) -> np.ndarray:
     count = np.maximum(np.sum(w.picture_weights, axis=1), 1.0)
     mean = np.sum(np.minimum(size, _WORST) ** 2 * w.picture_weights, axis=1) / count
     return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * (mean < _NO_FLIGHT)[:, None]
-
-
-assert len(_DAMPINGS) * len(_SHARES) == CHUNK

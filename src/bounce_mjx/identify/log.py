@@ -28,6 +28,11 @@ _LARGEST_ANGLE = 4.0 * np.pi
 _FARTHEST_BALL = 20.0
 _LONGEST_STEP = 0.2
 _MIN_ROWS = 100
+# Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
+# the clocks count as one, and age of a picture (s) beyond which they do not.
+_STRETCHES = 12
+_DRIFT = 1e-3
+_LARGEST_AGE = 1.0
 
 
 class Log(NamedTuple):
@@ -123,6 +128,27 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
             f"{times[i]:.6g} s; give rows in the order of one clock"
         )
     return log
+
+
+def in_one_clock(log: Log) -> Log:
+    """The log with the pictures' time stamps in the clock of their arrivals.
+
+    A camera with its own clock is off by a constant and drifts by some parts in 1e5. The shortest
+    times from a stamp to its arrival show it: a line through those of each stretch. A drift of less
+    than a millisecond, and an offset of less than a second, count as none.
+    """
+    if len(log.picture_times) < _STRETCHES * 20:
+        return log
+    ages = log.arrivals - log.picture_times
+    parts = np.array_split(np.arange(len(ages)), _STRETCHES)
+    youngest = np.array([part[np.argmin(ages[part])] for part in parts])
+    times, least = log.arrivals[youngest], ages[youngest]
+    slope, constant = np.polyfit(times - times[0], least, 1)
+    drift = slope * (log.arrivals - times[0])
+    if np.ptp(drift) < _DRIFT:
+        drift = np.zeros_like(ages)
+    offset = constant if abs(constant) > _LARGEST_AGE else 0.0
+    return log._replace(picture_times=log.picture_times + drift + offset)
 
 
 def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> list[str]:

@@ -2,6 +2,7 @@
 training."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -18,8 +19,8 @@ from bounce_mjx.robot.model import find_addresses, resting_activations
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
-CHUNK = 8
-"""Candidates that are simulated at a time; more would not fit the processor's cache."""
+_LANES = 512
+"""Windows that are simulated at a time; more would not fit the processor's cache."""
 
 
 class Predicted(NamedTuple):
@@ -31,8 +32,10 @@ class Predicted(NamedTuple):
     """The ball in each picture [C, S, B, 3], m."""
 
 
-Simulate = Callable[[np.ndarray, np.ndarray], Predicted]
-"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 9]) -> what they would measure."""
+Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], Predicted]
+"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 9], which windows count [C, S]) ->
+what they would measure; a window that does not count has the numbers of the first candidate, or 0
+if that has none."""
 
 
 Run = Callable[..., tuple[jax.Array, jax.Array]]
@@ -70,74 +73,79 @@ def make_run(config: WorldConfig, num_joints: int) -> Run:
         return engine.step(parameters, state, Control(jnp.stack(ctrl), air_drag=drag), 1)
 
     def at(path: jax.Array, speeds: jax.Array, times: jax.Array) -> jax.Array:
-        """A path [T, k, C, S] at times [M, C, S], by the nearest step and its velocity."""
+        """A path [T, k, L] at times [M, L], by the nearest step and its velocity."""
         step = jnp.clip(jnp.round(times / dt), 0, len(path) - 1).astype(jnp.int32)
         near, speed = (jnp.take_along_axis(x, step[:, None], axis=0) for x in (path, speeds))
         return near + speed * (times - step * dt)[:, None]
 
     @jax.jit
     def run(world, starts, targets, angle_times, picture_times, middle):
-        num_steps, _, count, num_windows = targets.shape
-        spread = lambda x: jnp.repeat(jnp.moveaxis(x, 0, -1), num_windows, axis=-1)  # noqa: E731
-        each = {name: spread(value) for name, value in world.items()}
         parameters = jax.vmap(lambda w: physics_parameters(w, model), -1, -1)(
-            {k: v for k, v in each.items() if k != "encoder_bias"}
+            {k: v for k, v in world.items() if k != "encoder_bias"}
         )
-        flat = jnp.moveaxis(starts, -1, 0).reshape(starts.shape[-1], -1)
-        state = jax.vmap(first_state, -1, -1)(flat)
-        bias = each["encoder_bias"]
-        ctrl = targets.reshape(num_steps, n, -1) - bias
+        bias = world["encoder_bias"]
 
         def body(state, target):
-            after = jax.vmap(advance, -1, -1)(parameters, state, target, each["air_drag"])
+            after = jax.vmap(advance, -1, -1)(parameters, state, target - bias, world["air_drag"])
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))
 
-        _, paths = jax.lax.scan(body, state, ctrl)
-        path, speed = (x.reshape(num_steps, n + 3, count, num_windows) for x in paths)
-        sampled = angle_times.T[:, None]
-        sampled = jnp.broadcast_to(sampled, (len(sampled), count, num_windows))
-        angles = at(path[:, :n], speed[:, :n], sampled) + bias.reshape(n, count, num_windows)
-        latency = world["ball_latency"][:, None]
-        balls = at(path[:, n:], speed[:, n:], picture_times.T[:, None] - latency)
-        turned = jnp.cross(
-            world[CAMERA_ROTATION].T[None, :, :, None], balls - middle[:, None, None], axis=1
-        )
-        balls = balls + turned + world["ball_position_bias"].T[:, :, None]
-        return jnp.transpose(angles, (2, 3, 0, 1)), jnp.transpose(balls, (2, 3, 0, 1))
+        state = jax.vmap(first_state, -1, -1)(starts)
+        _, (path, speed) = jax.lax.scan(body, state, targets)
+        angles = at(path[:, :n], speed[:, :n], angle_times) + bias
+        balls = at(path[:, n:], speed[:, n:], picture_times - world["ball_latency"])
+        turned = jnp.cross(world[CAMERA_ROTATION][None], balls - middle[:, None], axis=1)
+        return angles, balls + turned + world["ball_position_bias"]
 
     return run
 
 
-def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows, dt: float) -> Simulate:
-    """Binds a log and its windows to a simulation.
-
-    Args:
-      dt: physics time step, s.
-    """
-    sent, n = _Targets(log, windows, dt), layout.num_joints
+def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simulate:
+    """Binds a log and its windows to a simulation."""
+    sent, n = _Targets(log, windows, layout.physics_dt), layout.num_joints
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
-    of_log = windows.angle_times, windows.picture_times, middle
-    fixed = [jnp.asarray(array, jnp.float32) for array in of_log]
     steps = windows.first + np.arange(windows.steps)[:, None]
+    angle_times, picture_times = (
+        times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
+    )
 
-    def simulate(vectors: np.ndarray, starts: np.ndarray) -> Predicted:
-        parts = []
-        for i in range(0, len(vectors), CHUNK):
-            # The last chunk is filled up, as another size would be compiled again.
-            index = np.minimum(np.arange(i, i + CHUNK), len(vectors) - 1)
-            world = _whole_world(layout.world(vectors[index]), n)
-            pairs = zip(world["action_latency"], world["servo_lag"], strict=True)
-            # [T, n, C, S] from the targets [T, S, n] of each candidate.
-            targets = np.stack([sent(float(a), float(b))[steps] for a, b in pairs])
-            targets = np.ascontiguousarray(np.transpose(targets, (1, 3, 0, 2)))
-            given = {k: jnp.asarray(v, jnp.float32) for k, v in world.items()}
-            first = jnp.asarray(starts[index], jnp.float32)
-            out = run(given, first, jnp.asarray(targets), *fixed)
-            parts.append([np.asarray(x)[: len(vectors) - i] for x in out])
-        angles, balls = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-        return Predicted(angles.astype(float), balls.astype(float))
+    def simulated(
+        vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
+    ) -> list[np.ndarray]:
+        """Angles and pictures [L, ...] of the windows s [L] in the candidates c [L]."""
+        count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
+        # Another size would be compiled again.
+        c, s = c[fill], s[fill]
+        world = _whole_world(layout.world(vectors[c]), n)
+        targets = np.empty((windows.steps, n, _LANES), np.float32)
+        for i in np.unique(c):
+            pair = layout.world(vectors[i])
+            of_candidate = sent(float(pair["action_latency"]), float(pair["servo_lag"]))
+            targets[:, :, c == i] = np.moveaxis(of_candidate[steps[:, s[c == i]]], 2, 1)
+        given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
+        first = starts[c, s].T.astype(np.float32)
+        out = run(
+            given, first, targets, angle_times[:, s], picture_times[:, s], middle.astype(np.float32)
+        )
+        return [np.moveaxis(np.asarray(x), 2, 0)[:count].astype(float) for x in out]
+
+    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
+        pairs = np.nonzero(used)
+        blocks = [slice(i, i + _LANES) for i in range(0, len(pairs[0]), _LANES)]
+        with ThreadPoolExecutor() as pool:
+            parts = list(
+                pool.map(lambda b: simulated(vectors, starts, pairs[0][b], pairs[1][b]), blocks)
+            )
+        results = []
+        for k, measured in enumerate((windows.angles, windows.balls)):
+            result = np.zeros((len(vectors), *measured.shape))
+            values = np.concatenate([part[k] for part in parts])
+            first = pairs[0] == 0
+            result[:, pairs[1][first]] = values[first]
+            result[pairs] = values
+            results.append(result)
+        return Predicted(*results)
 
     return simulate
 
@@ -174,11 +182,13 @@ class _Targets:
     def __call__(self, latency: float, lag: float) -> np.ndarray:
         """Targets [T, n], rad, in float32."""
         key = latency, lag
-        if key not in self._kept:
-            if len(self._kept) > 64:
-                self._kept.clear()
-            self._kept[key] = self._computed(latency, lag)
-        return self._kept[key]
+        kept = self._kept
+        if key not in kept:
+            if len(kept) > 64:
+                # A new one, as another thread may read the old.
+                kept = self._kept = {}
+            kept[key] = self._computed(latency, lag)
+        return kept[key]
 
     def _computed(self, latency: float, lag: float) -> np.ndarray:
         at, times = self._edges - latency, self._times

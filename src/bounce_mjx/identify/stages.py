@@ -1,5 +1,6 @@
 """The search for a robot's world: the arm alone, the ball's flights, its bounces, all together."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,9 +17,12 @@ from bounce_mjx.world.randomization import TERMS
 
 # Every fifth window is held out of the search until its last stage.
 _HELD_OUT = 5
-# Latencies and lags of the first candidates, s.
+# Latencies and lags of the first candidates, s, and frictions of the ball.
 _LATENCIES = (0.002, 0.01, 0.02, 0.03, 0.04, 0.055)
-_BALL_LATENCIES = np.arange(-0.01, 0.06, 0.005)
+_BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
+_FRICTIONS = (0.01, 0.2)
+# Windows in which the first candidates are compared.
+_FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
 # Time before a bounce at which a flight counts as over, s: the camera's jitter and half a contact.
 _BEFORE_BOUNCE = 0.012
@@ -145,12 +149,12 @@ def identify(
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
-    layout = make_layout(config.num_joints, with_ball, camera_rotation)
+    layout = make_layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
     run, noise = make_run(config, config.num_joints), sensor_noise(log)
 
     def search_in(log: Log) -> _Search:
         windows = cut(log, config.physics_dt, _NO_BALL)
-        simulate = make_simulator(run, layout, log, windows, config.physics_dt)
+        simulate = make_simulator(run, layout, log, windows)
         return _Search(Problem(simulate, windows, layout, noise), progress)
 
     search, fit = _arm(search_in(log), search_in(_regular(log)))
@@ -160,7 +164,7 @@ def identify(
         fit, pictures = _ball(search, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
-    fit = search.run(stages, fit, pictures, 6, states)
+    fit = search.run(stages, fit, pictures, 3, states)
     tested = search.tested(fit, pictures, states)
     fit = search.run(stages, tested, pictures, 3, states, np.ones_like(search.training))
     return _identified(search.problem, fit, _errors(search.problem, tested))
@@ -214,17 +218,17 @@ class _Search(NamedTuple):
 def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
     """The arm alone, with the log's time stamps or with regular ones, if they explain it better."""
     search.progress("arm")
-    fit = _first(search.problem, search.training)
-    fit = search.run(["arm"], fit, 0.0, 10, search.arm_state)
+    first = _first(search.problem, search.training)
+    fit = search.run(["arm"], first, 0.0, 2, search.arm_state)
     windows = regular.problem.windows
     if len(windows.first) == len(search.problem.windows.first):
-        other = fit._replace(starts=windows.starts)
-        other = regular.run(["arm"], other, 0.0, 5, regular.arm_state)
+        other = first._replace(starts=windows.starts)
+        other = regular.run(["arm"], other, 0.0, 2, regular.arm_state)
         if other.cost < fit.cost:
             message = "the time stamps jitter about regular steps, which explain the log better"
             search.progress(message)
-            return regular, other
-    return search, fit
+            search, fit = regular, other
+    return search, search.run(["arm"], fit, 0.0, 8, search.arm_state)
 
 
 def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
@@ -234,10 +238,21 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     flying = windows.picture_times < windows.bounces[:, None] - _BEFORE_BOUNCE
     fit = search.run(["flight"], fit, flying * 1.0, 4, ball_state)
     search.progress("bounce")
-    fit = _first_latency(search.problem, fit, search.training)
+    # A ball that slips and one that sticks are two valleys, and each latency may be one.
+    tried = [
+        _flown(search.problem, fit, latency, friction)
+        for latency, friction in itertools.product(_BALL_LATENCIES, _FRICTIONS)
+    ]
+    used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
+    few = np.zeros_like(search.training)
+    few[used[:: max(len(used) // _FEW, 1)]] = 1.0
+    for kept in (4, 1):
+        found = [search.run(["flight", "bounce"], t, 1.0, 2, ball_state, few) for t in tried]
+        tried = sorted(found, key=lambda fit: fit.cost)[:kept]
+    (fit,) = tried
     fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
     tested = search.tested(fit, 1.0, ball_state)
-    pictures = picture_weights(search.problem, tested.predicted)
+    pictures = picture_weights(search.problem, search.problem.at(tested.vector, tested.starts))
     return search.run(["flight", "bounce"], tested, pictures, 6, ball_state), pictures
 
 
@@ -245,8 +260,7 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
     layout, windows = problem.layout, problem.windows
     nominal = {name: TERMS[name].nominal for name in layout.unknowns if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
-    shown = problem.simulate(own[None], fit.starts[None])
-    before = fit._replace(predicted=Predicted(shown.angles[0], shown.balls[0]))
+    before = fit._replace(predicted=problem.at(own, fit.starts))
     of_balls = fit.weights[:, -3 * windows.balls.shape[1] :]
     dropped = windows.has_ball & np.all(of_balls == 0.0, axis=1)
     return Identified(
@@ -264,39 +278,45 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
 
 def _first(problem: Problem, mask: np.ndarray) -> Fit:
     """The best of candidates that differ in latency and lag, which the search could confuse."""
-    layout, places = problem.layout, problem.layout.slices()
-    pairs = [(latency, lag) for latency in _LATENCIES for lag in _LAGS]
-    vectors = np.repeat(layout.mean[None], len(pairs), axis=0)
-    vectors[:, places["action_latency"].start] = [pair[0] for pair in pairs]
-    vectors[:, places["servo_lag"].start] = [pair[1] for pair in pairs]
-    starts = np.repeat(problem.windows.starts[None], len(pairs), axis=0)
+    layout, own = problem.layout, problem.layout.world(problem.layout.mean)
+    vectors = np.stack(
+        [
+            layout.vector(own | {"action_latency": latency, "servo_lag": lag})
+            for latency, lag in itertools.product(_LATENCIES, _LAGS)
+        ]
+    )
     weights = problem.weights(pictures=0.0) * mask
-    predicted = problem.simulate(vectors, starts)
-    costs = 0.5 * np.sum(problem.residuals(predicted) ** 2 * weights, axis=(1, 2))
+    starts = np.repeat(problem.windows.starts[None], len(vectors), axis=0)
+    costs = np.sum(_costs(problem, vectors, starts, weights), axis=1)
     best = int(np.nanargmin(costs))
     none = np.zeros((len(layout.mean), len(layout.mean)))
-    shown = Predicted(predicted.angles[best], predicted.balls[best])
-    return Fit(vectors[best], starts[best], none, shown, weights, float(costs[best]))
+    nothing = Predicted(np.zeros(0), np.zeros(0))
+    return Fit(vectors[best], starts[best], none, nothing, weights, float(costs[best]))
 
 
-def _first_latency(problem: Problem, fit: Fit, mask: np.ndarray) -> Fit:
-    """The best of candidates that differ in the ball's latency, each with the flights that explain
+def _flown(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
+    """The fit with another latency of the ball and friction on the paddle, and flights that explain
     the pictures before the bounces equally well."""
-    place, n = problem.layout.slices()["ball_latency"].start, problem.layout.num_joints
-    vectors = np.repeat(fit.vector[None], len(_BALL_LATENCIES), axis=0)
-    vectors[:, place] = _BALL_LATENCIES
-    later = (vectors[:, place] - fit.vector[place])[:, None, None]
-    starts = np.repeat(fit.starts[None], len(vectors), axis=0)
+    places, n = problem.layout.slices(), problem.layout.num_joints
+    vector, starts = fit.vector.copy(), fit.starts.copy()
+    later = latency - vector[places["ball_latency"].start]
+    vector[places["ball_latency"]], vector[places["contact_friction"]] = latency, friction
     position, velocity = slice(2 * n, 2 * n + 3), slice(2 * n + 3, 2 * n + 6)
-    starts[:, :, position] += later * starts[:, :, velocity] + 0.5 * later**2 * GRAVITY
-    starts[:, :, velocity] += later * GRAVITY
-    weights = problem.weights(with_angles=False) * mask
-    predicted = problem.simulate(vectors, starts)
-    # The middle of the windows, as some are of a ball in a hand.
-    costs = np.sum(problem.whitened(problem.residuals(predicted), weights) ** 2, axis=2)
-    used = np.any(weights > 0.0, axis=1)
-    best = int(np.argmin(np.median(costs[:, used], axis=1)))
-    return fit._replace(vector=vectors[best], starts=starts[best])
+    starts[:, position] += later * starts[:, velocity] + 0.5 * later**2 * GRAVITY
+    starts[:, velocity] += later * GRAVITY
+    return fit._replace(vector=vector, starts=starts)
+
+
+def _costs(
+    problem: Problem, vectors: np.ndarray, starts: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Half the sum of squared residuals [C, K] of candidates in some of the windows that count."""
+    counts = np.flatnonzero(np.any(weights > 0.0, axis=1))
+    counts = counts[:: max(len(counts) // _FEW, 1)]
+    used = np.zeros((len(vectors), len(weights)), bool)
+    used[:, counts] = True
+    residuals = problem.residuals(problem.simulate(vectors, starts, used))
+    return 0.5 * np.sum(problem.whitened(residuals, weights) ** 2, axis=2)[:, counts]
 
 
 def _errors(problem: Problem, fit: Fit) -> dict[str, float]:

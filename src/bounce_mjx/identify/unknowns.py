@@ -26,17 +26,21 @@ class Unknown(NamedTuple):
     ball_step: float | None = None
     """The difference for the pictures, if it is another one: it must move a bounce's instant by
     more than the physics step to which a simulation rounds it. The arm's must be small, as latency
-    and lag differ only in the second order."""
+    and lag differ only in the second order. 0 if pictures show nothing that angles do not."""
+    own: bool = False
+    """Whether each joint's entry moves, nearly, that joint alone: one simulation then serves the
+    angles of all."""
 
 
 _JOINTS = None
 ARM = {
-    "action_latency": Unknown(0.02, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
-    "servo_lag": Unknown(0.015, 0.02, 5e-4, "s", "arm", limits=(0.0, 0.2), ball_step=3e-3),
-    "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0)),
-    "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15),
-    "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf)),
-    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0)),
+    # The entries of both are the delay and its variance: see Layout.
+    "action_latency": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
+    "servo_lag": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
+    "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, True),
+    "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, True),
+    "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, True),
+    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
     "gravity_tilt": Unknown(0.0, 0.03, 8e-3, "rad", "flight", 2),
 }
@@ -55,10 +59,17 @@ unless its prior deviation is given."""
 
 
 class Layout(NamedTuple):
-    """The unknowns in one vector."""
+    """The unknowns in one vector.
+
+    A latency and a short lag delay the angles equally, and differ by the square of the lag. The
+    entry of `action_latency` therefore holds the mean delay of both, s, and that of `servo_lag` the
+    delay's variance, s^2; measured angles are nearly linear in these.
+    """
 
     unknowns: Mapping[str, Unknown]
     num_joints: int
+    physics_dt: float
+    """Step of the lag's filter, s."""
 
     def slices(self) -> dict[str, slice]:
         """Place of each unknown."""
@@ -108,17 +119,26 @@ class Layout(NamedTuple):
 
     def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Each unknown's value [..., size], or [...] of a number."""
-        return {
+        world = {
             name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
             for name, place in self.slices().items()
         }
+        # Mean m and variance m (m + dt) of the filter y += (1 - exp(-dt / lag)) (x - y).
+        dt, variance = self.physics_dt, np.maximum(world["servo_lag"], 1e-14)
+        mean = 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
+        latency = np.maximum(world["action_latency"] - mean, 0.0)
+        return world | {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)}
 
     def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
         """The vector [P] of values by name; a missing one has its prior mean."""
-        vector = self.mean
-        for name, place in self.slices().items():
+        vector, places = self.mean, self.slices()
+        for name, place in places.items():
             if name in world:
                 vector[place] = world[name]
+        if {"action_latency", "servo_lag"} <= set(world):
+            mean = self.physics_dt / np.expm1(self.physics_dt / max(world["servo_lag"], 2e-5))
+            vector[places["action_latency"]] += mean
+            vector[places["servo_lag"]] = mean * (mean + self.physics_dt)
         return vector
 
     def free(self, stages: Sequence[str]) -> np.ndarray:
@@ -140,11 +160,14 @@ class Layout(NamedTuple):
         return labels
 
 
-def make_layout(num_joints: int, with_ball: bool, camera_rotation: float = 0.0) -> Layout:
+def make_layout(
+    num_joints: int, with_ball: bool, physics_dt: float, camera_rotation: float = 0.0
+) -> Layout:
     """Layout of the unknowns that a log can show.
 
     Args:
       with_ball: whether it shows bounces.
+      physics_dt: step of the simulation, s.
       camera_rotation: prior standard deviation of the camera's rotation, rad.
     """
     unknowns = dict(ARM) | (BALL if with_ball else {})
@@ -153,4 +176,4 @@ def make_layout(num_joints: int, with_ball: bool, camera_rotation: float = 0.0) 
     if with_ball and camera_rotation > 0.0:
         unknowns[CAMERA_ROTATION] = Unknown(0.0, camera_rotation, 3e-3, "rad", "bounce", 3)
     assert set(unknowns) <= {*TERMS, CAMERA_ROTATION}
-    return Layout(unknowns, num_joints)
+    return Layout(unknowns, num_joints, physics_dt)

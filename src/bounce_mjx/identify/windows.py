@@ -21,6 +21,8 @@ _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
 # Speed that the ball must have before and after a bounce, m/s.
 _BOUNCING = 0.5
+# Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
+_AT_BOUNCE = 0.01
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
@@ -44,7 +46,7 @@ class Windows(NamedTuple):
     balls: np.ndarray
     """The ball in each picture [S, B, 3], m."""
     picture_weights: np.ndarray
-    """1 for a picture, 0 for padding [S, B]."""
+    """1 for a picture, 0 for padding and at a bounce [S, B]."""
     bounces: np.ndarray
     """Time [S] of the bounce since the window's start, s; NaN for the arm alone."""
     starts: np.ndarray
@@ -90,6 +92,8 @@ def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240
         of_pictures, log.picture_times, zero, log.ball_positions
     )
     bounces = np.array([bounce for _, _, bounce in spans]) - zero
+    near = np.abs(picture_times - bounces[:, None]) < _AT_BOUNCE
+    picture_weights = np.where(near, 0.0, picture_weights)
     starts = np.stack(
         [
             np.concatenate(

@@ -53,14 +53,41 @@ class Estimate(NamedTuple):
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them."""
     layout, width = found.layout, _WIDTH * found.deviation * misfit(found)
+    world = layout.world(found.fit.vector)
+    values = np.concatenate([np.ravel(world[name]) for name in layout.unknowns])
+    low, high = values - width, values + width
+    for name, ends in _delays(found).items():
+        place = layout.slices()[name]
+        low[place], high[place] = ends
     seen = found.deviation < _UNSEEN * layout.deviation
     units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
+    labels = layout.labels(joint_names)
     return [
-        Estimate(label, unit, float(x), float(x - w), float(x + w), bool(s))
-        for label, unit, x, w, s in zip(
-            layout.labels(joint_names), units, found.fit.vector, width, seen, strict=True
-        )
+        Estimate(label, unit, float(x), float(a), float(b), bool(s))
+        for label, unit, x, a, b, s in zip(labels, units, values, low, high, seen, strict=True)
     ]
+
+
+def _delays(found: Identified) -> dict[str, tuple[float, float]]:
+    """Intervals of latency and lag from those of the delay and its variance. The latency is the
+    delay less the lag, whose error is not normal near 0: its interval adds the change over the
+    variance's interval to the delay's own error at a given variance."""
+    layout, vector, places = found.layout, found.fit.vector, found.layout.slices()
+    delay, variance = (places[name].start for name in ("action_latency", "servo_lag"))
+    width = _WIDTH * found.deviation[variance] * misfit(found)
+    slope = found.covariance[delay, variance] / found.covariance[variance, variance]
+    own = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
+    own = _WIDTH * misfit(found) * np.sqrt(max(own, 0.0))
+    ends = np.repeat(vector[None], 3, axis=0)
+    ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
+    ends[:, delay] += slope * (ends[:, variance] - vector[variance])
+    world = layout.world(ends)
+    latency, lag = world["action_latency"], world["servo_lag"]
+    below, above = (np.hypot(f(latency) - latency[1], own) for f in (np.min, np.max))
+    return {
+        "action_latency": (max(latency[1] - below, 0.0), latency[1] + above),
+        "servo_lag": (0.0 if vector[variance] < width else lag[0], lag[2]),
+    }
 
 
 def misfit(found: Identified) -> float:
