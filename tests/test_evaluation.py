@@ -552,12 +552,15 @@ def test_evaluator_equals_a_python_loop(networks):
             state = step(state, act(state.obs))
             physics = state.pipeline_state.physics
             sums["steps"] += 1
+            sums["hits"] += float(state.metrics["bounced"])
             sums["episode_return"] += float(state.reward)
             sums["n_bounces"] = max(sums["n_bounces"], float(state.metrics["n_bounces"]))
             if t >= 200:
                 sums["settled_steps"] += 1
                 sums["centred_steps"] += abs(physics.qpos[6] - TARGET_X) <= 0.05
                 if state.metrics["bounced"]:
+                    sums["apex_offset"] += float(state.metrics["apex_offset"])
+                    sums["apex_error^2"] += float(state.metrics["apex_error"]) ** 2
                     error = float(state.metrics["apex_error"])
                     sums["settled_bounces"] += 1
                     sums["accurate_bounces"] += error <= 0.1

@@ -593,7 +593,7 @@ def test_report_page_shows_the_picture(
         "bounce_mjx.reports.page.evaluation_figure", lambda *_: robustness_figure(report)
     )
     monkeypatch.setattr(
-        "bounce_mjx.reports.page.curves_figure", lambda _: robustness_figure(report)
+        "bounce_mjx.reports.page.curves_figure", lambda *_: robustness_figure(report)
     )
     monkeypatch.setattr(
         "bounce_mjx.reports.page.rewards_figure", lambda _: robustness_figure(report)
