@@ -120,9 +120,9 @@ def _html(
         picture = f'<div class="wide"><img alt="{title}" src="{source}"></div>'
         pictures += f"<h2>{title}</h2>\n{picture}\n"
     if (run / REPLAY_FILE).is_file():
-        # A page of its own, with the program that draws it.
-        frame = f'<iframe title="Replay" loading="lazy" src="{REPLAY_FILE}"></iframe>'
-        pictures += f'<h2><a href="{REPLAY_FILE}">Replay</a></h2>\n{frame}\n'
+        data = base64.b64encode((run / REPLAY_FILE).read_bytes()).decode()
+        frame = f'<iframe title="Replay" src="data:text/html;base64,{data}"></iframe>'
+        pictures += f"<h2>Replay</h2>\n{frame}\n"
     seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
