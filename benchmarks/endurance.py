@@ -26,7 +26,7 @@ from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
-from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, newest_run
@@ -69,7 +69,7 @@ def measure(command: Command) -> list[dict]:
 
     def advance(_, carry):
         states, statistics, step = carry
-        actions = act(networks, policy, states.obs.T)
+        actions = networks.act(policy, states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions.T)
         return states, accumulate(env, statistics, states, step), step + 1
 

@@ -19,6 +19,7 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
 from bounce_mjx.runs.config import (
@@ -83,7 +84,7 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
         evaluate_policy,
         policy,
         trained_with.env,
-        trained_with.ppo,
+        networks_of(trained_with.ppo),
         EvaluationOptions(nominal=True),
     )
     report = evaluation.report

@@ -185,7 +185,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     import jax
 
     from bounce_mjx import BounceBall
-    from bounce_mjx.learning.policy import act, make_networks
+    from bounce_mjx.learning.policy import make_networks
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
     from bounce_mjx.runs.reading import read_policy
@@ -203,7 +203,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
         truth = env.kinematics(state.pipeline_state)
         height = state.pipeline_state.command["target_height"]
         values = truth._asdict() | {"target_height": height[None]}
-        state = env.step(state, act(networks, policy, layout.pack(values)))
+        state = env.step(state, networks.act(policy, layout.pack(values)))
         return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
 
     run = jax.jit(lambda key: jax.lax.scan(step, env.reset(key), None, round(seconds / env.dt))[1])

@@ -2,6 +2,7 @@
 
 import email.message
 import importlib.metadata
+import os
 import re
 import subprocess
 import sys
@@ -28,6 +29,16 @@ def test_help_lists_the_commands(capsys) -> None:
     readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     (listed,) = re.findall(r"`bounce-mjx ((?:[a-z-]+\|)+[a-z-]+)`", readme)
     assert sorted(listed.split("|")) == sorted(console_script.COMMANDS)
+
+
+def test_an_output_that_nobody_reads_is_no_traceback() -> None:
+    """Such as that of `bounce-mjx play --help | head`."""
+    read, write = os.pipe()
+    os.close(read)
+    arguments = [sys.executable, "-m", "bounce_mjx", "doctor"]
+    done = subprocess.run(arguments, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from bounce_mjx.deploy.metadata import CommandRange, from_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import Normalizer
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
@@ -237,7 +237,7 @@ def network_of(config: TrainConfig, policy: Policy):
     def network(histories: dict[str, np.ndarray]) -> np.ndarray:
         parts = [np.asarray(histories[name]) for name in config.env.observation.seen()]
         flat = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-        return np.asarray(act(networks, policy, flat))
+        return np.asarray(networks.act(policy, flat))
 
     return network
 

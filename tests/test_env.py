@@ -384,7 +384,8 @@ def test_reward_is_the_sum_of_its_terms(episodes):
 
 
 def test_reset_and_step_report_the_same_metrics(episodes, reset):
-    task_metrics = {"bounced", "n_bounces", "ball_xy_error", "apex_error", "non_finite"}
+    task_metrics = {"bounced", "n_bounces", "ball_xy_error", "apex_error"}
+    task_metrics |= {"apex_offset", "non_finite"}
     names = {f"reward/{name}" for name in REFERENCE_WEIGHTS} | task_metrics
     assert set(reset(jax.random.key(0)).metrics) == names
     assert set(episodes[0][2].metrics) == names
@@ -552,6 +553,7 @@ def test_step_reports_the_bounce(apex, error, reset, finish):
     assert rising.metrics["bounced"] == 1
     assert rising.metrics["n_bounces"] == 5
     np.testing.assert_allclose(rising.metrics["apex_error"], error, atol=1e-6)
+    np.testing.assert_allclose(abs(rising.metrics["apex_offset"]), error, atol=1e-6)
     falling = finish(state, jnp.zeros(6), with_ball(physics, above_paddle, (0, 0, -2.0)))
     assert falling.metrics["bounced"] == 0
     assert falling.metrics["n_bounces"] == 4

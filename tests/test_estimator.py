@@ -13,7 +13,7 @@ from bounce_mjx import BounceBall
 from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.deploy.histories import Histories
 from bounce_mjx.gpu.scalars import as_scalars
-from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -68,7 +68,7 @@ def watched(env: BounceBall) -> Watched:
         pipeline = state.pipeline_state
         truth, picture = env.kinematics(pipeline), pipeline.memory.sensing.picture
         height = {"target_height": pipeline.command["target_height"][None]}
-        action = act(networks, policy, OBSERVATION.pack(truth._asdict() | height))
+        action = networks.act(policy, OBSERVATION.pack(truth._asdict() | height))
         kinematics = truth.ball_position, truth.ball_velocity, truth.joint_angles
         seen = Watched(*kinematics, picture.position, picture.age, state.obs)
         return env.step(state, action), (seen, state.done)

@@ -29,6 +29,7 @@ from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_stati
 from bounce_mjx.learning import policy
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
 from bounce_mjx.resources import resource_path
@@ -39,6 +40,7 @@ BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
 LAYOUT = EnvConfig().layout
 DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
+METRICS = "bounced", "n_bounces", "apex_error", "apex_offset"
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def states(rows) -> State:
     """A batch (batch axis last) from one dict of values per episode."""
     defaults = {
         "x": TARGET_X, "y": 0.0, "vz": 0.0, "reward": 0.0, "done": 0.0,
-        "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0,
+        "bounced": 0.0, "n_bounces": 0.0, "apex_error": 0.0, "apex_offset": 0.0,
     }  # fmt: skip
     columns = {
         name: jnp.array([row.get(name, default) for row in rows], jnp.float32)
@@ -65,7 +67,7 @@ def states(rows) -> State:
         qpos=physics.qpos.at[6].set(columns["x"]).at[7].set(columns["y"]),
         qvel=physics.qvel.at[8].set(columns["vz"]),
     )
-    metrics = {name: columns[name] for name in ("bounced", "n_bounces", "apex_error")}
+    metrics = {name: columns[name] for name in METRICS}
     return batch.replace(
         pipeline_state=batch.pipeline_state._replace(physics=physics),
         reward=columns["reward"],
@@ -542,7 +544,7 @@ def test_evaluator_equals_a_python_loop(networks):
     del actual["tally"]
 
     reset, step = jax.jit(env.reset), jax.jit(env.step)
-    act = jax.jit(lambda obs: policy.act(networks, holding, obs))
+    act = jax.jit(lambda obs: networks.act(holding, obs))
     expected = {name: np.zeros(episodes) for name in actual}
     for i, episode_key in enumerate(jax.random.split(key, episodes)):
         state, sums = reset(episode_key), dict.fromkeys(actual, 0.0)
@@ -550,12 +552,15 @@ def test_evaluator_equals_a_python_loop(networks):
             state = step(state, act(state.obs))
             physics = state.pipeline_state.physics
             sums["steps"] += 1
+            sums["hits"] += float(state.metrics["bounced"])
             sums["episode_return"] += float(state.reward)
             sums["n_bounces"] = max(sums["n_bounces"], float(state.metrics["n_bounces"]))
             if t >= 200:
                 sums["settled_steps"] += 1
                 sums["centred_steps"] += abs(physics.qpos[6] - TARGET_X) <= 0.05
                 if state.metrics["bounced"]:
+                    sums["apex_offset"] += float(state.metrics["apex_offset"])
+                    sums["apex_error^2"] += float(state.metrics["apex_error"]) ** 2
                     error = float(state.metrics["apex_error"])
                     sums["settled_bounces"] += 1
                     sums["accurate_bounces"] += error <= 0.1
@@ -644,7 +649,7 @@ def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
 
     monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
     for each in options:
-        reports.append(evaluate_policy(None, config, PPOConfig(), each).report)
+        reports.append(evaluate_policy(None, config, networks_of(PPOConfig()), each).report)
     return seen, reports
 
 
@@ -684,8 +689,8 @@ def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     mjcf = tmp_path / "one_iteration.xml"
     mjcf.write_text(text.replace(' iterations="4"', ' iterations="1"'), encoding="utf-8")
     env_config = EnvConfig(mjcf=mjcf, episode_seconds=0.05)
-    ppo_config = PPOConfig(hidden_layers=(16,))
-    evaluate = functools.partial(evaluate_policy, random_policy, env_config, ppo_config)
+    networks = networks_of(PPOConfig(hidden_layers=(16,)))
+    evaluate = functools.partial(evaluate_policy, random_policy, env_config, networks)
     on_c = evaluate(EvaluationOptions(2, physics="mujoco"))
     (warning,) = on_c.warnings
     assert on_c.engine == "mujoco" and 'iterations="1"' in warning
@@ -780,7 +785,7 @@ def test_the_evaluation_of_another_task_takes_its_commands(dribbling, monkeypatc
     )
     options = EvaluationOptions(2, commands={"apex": 0.07})
     for each in (options, EvaluationOptions(2)):
-        evaluate_policy(None, dribbling.config, PPOConfig(), each)
+        evaluate_policy(None, dribbling.config, networks_of(PPOConfig()), each)
     assert given == [{"apex": (0.07, 0.07)}, {"apex": (0.065, 0.085)}]
 
 

@@ -233,7 +233,7 @@ def test_page_shows_every_estimate(hidden) -> None:
     "args, sentence",
     [
         ([], "no log is given"),
-        (["nowhere.csv"], "the log nowhere.csv is no file"),
+        (["nowhere.csv"], "the log nowhere.csv is not a file"),
         (["x.csv", "--check", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )

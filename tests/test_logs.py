@@ -179,10 +179,10 @@ def test_a_huge_log_and_a_missing_one_are_refused_at_once(tmp_path: Path) -> Non
         file.truncate(2 * 2**30)
     with pytest.raises(UserError, match=r"has 2048 MiB, and at most 256 MiB are read"):
         read_csv(path, JOINTS)
-    with pytest.raises(UserError, match=r"is no file"):
+    with pytest.raises(UserError, match=r"is not a file"):
         read_csv(tmp_path / "none.csv", JOINTS)
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(UserError, match=r"is no file"):
+    with pytest.raises(UserError, match=r"is not a file"):
         read_csv(tmp_path / "pipe.csv", JOINTS)
 
 

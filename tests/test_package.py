@@ -302,7 +302,7 @@ def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
 import jax
 from rich.console import Console
 from bounce_mjx import BounceBall, load_policy as load_deployed
-from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
 from bounce_mjx.runs.reading import read_policy
@@ -311,7 +311,7 @@ config = load_run_config(checkpoint.run)
 env = BounceBall(config.env)
 state = env.reset(jax.random.PRNGKey(0))
 networks = make_networks(config.ppo, env.observation_size, env.action_size)
-action = act(networks, read_policy(checkpoint, config), state.obs)
+action = networks.act(read_policy(checkpoint, config), state.obs)
 print(checkpoint.run)
 print(*action.shape, bool((abs(action) > 0.0).any()))
 print(len(load_deployed("pretrained").needs))

@@ -360,8 +360,9 @@ def check_report(run: Path) -> str:
     """The text of a report, after checking that the page is complete and needs no other file."""
     page = (run / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
-    assert len(sources) == 3
-    for source in sources:
+    replays = [source for source in sources if source.startswith("data:text/html;base64,")]
+    assert len(sources) - len(replays) == 3
+    for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
         xml.etree.ElementTree.fromstring(base64.b64decode(data))
@@ -407,6 +408,12 @@ def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
     report_command.main([str(run)])
     check_report(run)
     assert other.read_text() == "mine"
+    page = (run / "report.html").read_text("utf-8")
+    replay = base64.b64encode((run / "replay.html").read_bytes()).decode()
+    assert page.count(replay) == 1 and len(replay) > 10_000
+    assert "Peitian AIR4-560" in page and "MuJoCo 3." in page
+    # On a phone, what is wide scrolls by itself.
+    assert page.count("<table>") + page.count("<img ") == page.count('<div class="wide"><')
     assert capsys.readouterr().out.endswith("run/report.html\n")
 
 

@@ -14,7 +14,7 @@ from brax.training.distribution import NormalDistribution
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.networks import orthogonal
-from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import (
     MAX_NORMALIZED,
     MIN_VARIANCE,
@@ -166,7 +166,7 @@ def test_drift_of_a_constant_input_does_not_change_the_policy(seen, normalizer):
     policy = Policy(normalizer, params)
     observation = jnp.asarray(seen[0])
     drifted = observation.at[CONSTANT].set(jnp.array([0.99, 0.1, -0.05, 0.02]))
-    action = act(networks, policy, observation)
-    np.testing.assert_array_equal(act(networks, policy, drifted), action)
-    moved = act(networks, policy, observation.at[0].add(1.0))
+    action = networks.act(policy, observation)
+    np.testing.assert_array_equal(networks.act(policy, drifted), action)
+    moved = networks.act(policy, observation.at[0].add(1.0))
     assert np.abs(moved - action).max() > 1e-4

@@ -18,7 +18,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import POLICIES, TASK_POLICIES, present_policies, resource_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import (
@@ -51,7 +51,10 @@ def measured() -> Report:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
     return evaluate_policy(
-        read_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(EPISODES)
+        read_policy(checkpoint, config),
+        config.env,
+        networks_of(config.ppo),
+        EvaluationOptions(EPISODES),
     ).report
 
 
@@ -72,7 +75,7 @@ def test_what_a_release_wrote_is_loaded(release: Path) -> None:
     env = BounceBall(config.env)
     observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    expected = act(networks, read_policy(best_checkpoint(release), config), observation)
+    expected = networks.act(read_policy(best_checkpoint(release), config), observation)
     deployed = load_policy(release / "policy.onnx")
     measured = {name: observation[env.layout[name]] for name in deployed.needs}
     np.testing.assert_allclose(deployed.step(measured), expected, atol=1e-5)
@@ -121,7 +124,7 @@ def test_the_policy_keeps_two_balls_up() -> None:
     checkpoint = pretrained_checkpoint("juggle")
     config = load_run_config(checkpoint.run)
     report = evaluate_policy(
-        read_policy(checkpoint, config), config.env, config.ppo, EvaluationOptions(64)
+        read_policy(checkpoint, config), config.env, networks_of(config.ppo), EvaluationOptions(64)
     ).report
     values = {result.name: result.value for result in report.results}
     assert values["kept"] > 95.0 and min(values["turns"], values["apart"], values["height"]) > 98.0
@@ -262,7 +265,7 @@ def test_an_arm_has_a_policy_by_its_name(
     config = ship._with_packaged_arm(run, load_run_config(run), "ur5e")
     policy = read_policy(checkpoint, config)
     options = EvaluationOptions(2, nominal=True)
-    evaluation = evaluate_policy(policy, config.env, config.ppo, options)
+    evaluation = evaluate_policy(policy, config.env, networks_of(config.ppo), options)
     ship.write_policy(checkpoint, config, evaluation, out, "ur5e")
     assert sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) < 300_000
     monkeypatch.chdir(tmp_path)

@@ -179,7 +179,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
         ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
         ({"drag": (0.0, 0.1)}, "unknown key drag; did you mean air_drag?"),
-        ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is no term"),
+        ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is not a term"),
     ],
 )
 def test_bad_range(values: dict, words: str) -> None:

@@ -11,7 +11,7 @@ from bounce_mjx.env.env import EnvState
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.task import Histogram, Hits, Kinematics, Recording
 from bounce_mjx.tasks.bounce import Bounce
@@ -49,7 +49,7 @@ def stepped(env: BounceBall, networks, policy: Policy):
     """States [T, ..., K] of the recorded episodes, computed by stepping the environment."""
     keys = jax.random.split(jax.random.PRNGKey(2), EPISODES)[:RECORDED]
     states = jax.jit(jax.vmap(env.reset))(keys)
-    step = jax.jit(lambda states: jax.vmap(env.step)(states, act(networks, policy, states.obs)))
+    step = jax.jit(lambda states: jax.vmap(env.step)(states, networks.act(policy, states.obs)))
     history = []
     for _ in range(env.config.episode_steps):
         states = step(states)

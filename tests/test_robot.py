@@ -29,7 +29,6 @@ from bounce_mjx.robot.model import find_addresses, fingerprint, joint_names, loa
 from bounce_mjx.runs.config import load_config, read_preset
 from bounce_mjx.task import Episodes, Result
 from bounce_mjx.tasks.bounce import HOME_HEIGHT, Bounce
-from bounce_mjx.viewers.controllers import make_scripted_controller
 from random_worlds import random_parameters
 from test_parameters import assert_same_step, c_steps, uncompiled_steps
 from test_physics import States
@@ -551,8 +550,6 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
     robot = env.config.robot
     speed = env.config.action_scale * np.divide(robot.servo_stiffness, robot.servo_damping)
     np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
-    with pytest.raises(UserError, match="the task has no scripted controller for this robot"):
-        make_scripted_controller(env)
 
 
 def test_changes_are_listed(tmp_path) -> None:

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -25,7 +27,7 @@ from bounce_mjx.evaluation.robustness import (
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range, read_suite
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.policy import Networks, Policy, networks_of
 from bounce_mjx.reports.figures import image
 from bounce_mjx.reports.page import write_report
 from bounce_mjx.reports.robustness import (
@@ -276,13 +278,13 @@ def test_a_suite_that_is_no_file(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def shipped() -> tuple[Policy, PPOConfig, EnvConfig]:
+def shipped() -> tuple[Policy, Callable[[Env], Networks], EnvConfig]:
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
     # Long enough for a settled bounce.
     return (
         read_policy(checkpoint, config),
-        config.ppo,
+        networks_of(config.ppo),
         config.env.model_copy(update={"episode_seconds": 3.0}),
     )
 
@@ -382,7 +384,7 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     monkeypatch.setattr(robustness, "_CPU_BATCH", 14)
     done = []
     options = EvaluationOptions(4)
-    outcomes = measure_conditions(None, PPOConfig(), conditions, options, done.append)
+    outcomes = measure_conditions(None, networks_of(PPOConfig()), conditions, options, done.append)
     assert [(o.perturbation, o.strength) for o in outcomes] == [
         *[("late", s) for s in (0, 5, 10, 15, 20)],
         ("camera", 60), ("camera", 120), ("target", 0.8), ("slow", 0.02), ("dry", 5),
@@ -591,7 +593,7 @@ def test_report_page_shows_the_picture(
         "bounce_mjx.reports.page.evaluation_figure", lambda *_: robustness_figure(report)
     )
     monkeypatch.setattr(
-        "bounce_mjx.reports.page.curves_figure", lambda _: robustness_figure(report)
+        "bounce_mjx.reports.page.curves_figure", lambda *_: robustness_figure(report)
     )
     monkeypatch.setattr(
         "bounce_mjx.reports.page.rewards_figure", lambda _: robustness_figure(report)
@@ -665,7 +667,7 @@ def test_another_task_is_measured_in_perturbed_worlds(tmp_path: Path, monkeypatc
         return evaluate
 
     monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
-    outcomes = measure_conditions(None, PPOConfig(), conditions, EvaluationOptions(2))
+    outcomes = measure_conditions(None, networks_of(PPOConfig()), conditions, EvaluationOptions(2))
     # 28 apexes in 10 s, all of them low, and 36 of which 28 are low.
     values = [[*outcome.values.values()] for outcome in outcomes]
     np.testing.assert_allclose(values, [[100.0, 2.8, 100.0], [2800 / 36, 3.6, 50.0]], rtol=1e-5)

@@ -38,13 +38,15 @@ PUBLIC = re.compile(
 # A row of the results of `REST`.
 RESULT = r"rests +episodes"
 
-# A ball that hits something in the physics of the world; a default or an example in a sentence for
-# users; and the keys of older files.
+# A baseline for bouncing; a ball that hits something in the physics of the world; a default or an
+# example in a sentence for users; and the keys of older files.
 ALLOWED = {
-    "__init__.py", "deploy/metadata.py", "commands/main.py", "commands/train.py",
+    "__init__.py", "baselines/mirror.py",
+    "deploy/metadata.py", "commands/main.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
-    "world/ball_filter.py", "world/observation.py", "identify/fit.py", "identify/stages.py",
+    "world/ball_filter.py", "world/observation.py", "world/randomization.py",
+    "identify/fit.py", "identify/stages.py",
     "identify/unknowns.py", "identify/windows.py", "identify/words.py", "identify/world.py",
 }  # fmt: skip
 
@@ -143,7 +145,8 @@ def test_a_task_without_events_goes_through_every_command(
     assert "rests" in command("robustness", *task, *flags)
     command("play", *task, "--html", "play.html", "--seconds", "0.1")
     command("view", *task, "--html", "view.html", "--seconds", "0.1", "--actions", "zero")
-    assert "script" in command("view", *task, "--html", "x.html", "--actions", "scripted", code=2)
+    flags = ("--html", "x.html", "--actions", "mirror")
+    assert "target_height" in command("view", *task, *flags, code=2)
     command("report", *task)
     command("plot", *task, "--formats", "svg")
     command("export", *task, "--onnx", "rest.onnx", "--jax", "rest.jax")

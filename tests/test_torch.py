@@ -37,7 +37,7 @@ from bounce_mjx.adapters.torch.trainer import make_learner, make_vector_env, sum
 from bounce_mjx.env import vector
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import act, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.statistics import init_statistics, normalize, update
 from bounce_mjx.tasks.bounce import Bounce
 
@@ -534,7 +534,7 @@ def test_policy_acts_like_the_network(learners, library):
             seen = learner.agent._observation_preprocessor(observation)
             mean = learner.agent.policy.act({"observations": seen})[1]["mean_actions"]
     expected = mean.clamp(-1.0, 1.0).numpy()
-    actions = act(make_networks(PPO, 29, 6), learner.policy(), observation.numpy())
+    actions = make_networks(PPO, 29, 6).act(learner.policy(), observation.numpy())
     assert np.abs(expected).max() > 0.01
     np.testing.assert_allclose(actions, expected, atol=1e-5)
 

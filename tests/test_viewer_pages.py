@@ -111,7 +111,7 @@ def test_replay_page_moves_and_makes_no_requests(
     watch, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    view.main("--actions scripted --num-envs 2 --seconds 3 --html replay[lr].html".split())
+    view.main("--actions mirror --num-envs 2 --seconds 3 --html replay[lr].html".split())
     assert "written: replay[lr].html\n" in capsys.readouterr().out
     assert os.listdir(tmp_path) == ["replay[lr].html"]
     own = (tmp_path / "replay[lr].html").as_uri()

@@ -30,6 +30,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig, task
+from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.commands import play, train, view
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -47,7 +48,6 @@ from bounce_mjx.viewers.browser import LivePage, reward_bars
 from bounce_mjx.viewers.controllers import (
     make_policy_controller,
     make_random_controller,
-    make_scripted_controller,
     make_zero_controller,
 )
 from bounce_mjx.viewers.controls import direction
@@ -101,14 +101,14 @@ def env() -> BounceBall:
 
 
 @pytest.fixture(scope="module")
-def scripted(env: BounceBall) -> Simulation:
-    return Simulation(env, make_scripted_controller(env), 2, seed=0)
+def mirrored(env: BounceBall) -> Simulation:
+    return Simulation(env, make_policy_controller(MirrorLaw(env), None), 2, seed=0)
 
 
 @pytest.fixture(scope="module")
-def recording(scripted: Simulation) -> EnvFrame:
+def recording(mirrored: Simulation) -> EnvFrame:
     """A recording that is one step longer than an episode."""
-    return scripted.record(SECONDS + scripted.env.dt)
+    return mirrored.record(SECONDS + mirrored.env.dt)
 
 
 # The simulation
@@ -155,7 +155,7 @@ def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording:
     held = Simulation(env, make_zero_controller(env), 2, seed=0).record(SECONDS)
     moved = np.abs(held.qpos[20, :, :6] - held.qpos[0, :, :6])
     assert np.all(moved < 0.01)
-    # The scripted actions keep both balls up from the same start.
+    # The mirror law keeps both balls up from the same start.
     np.testing.assert_array_equal(held.qpos[0], recording.qpos[0])
     assert np.all(held.over[:-1].any(axis=0))
     assert not recording.over[: len(held.over) - 1].any()
@@ -172,44 +172,44 @@ def test_random_actions_are_uniform(env: BounceBall) -> None:
     assert np.all(control(None, states, jax.random.PRNGKey(2)) != actions)
 
 
-def test_the_target_height_can_be_set_and_stays(scripted: Simulation) -> None:
-    scripted.reset()
-    drawn = target_of(scripted.frame)
-    scripted.command = at_height(0.77)
+def test_the_target_height_can_be_set_and_stays(mirrored: Simulation) -> None:
+    mirrored.reset()
+    drawn = target_of(mirrored.frame)
+    mirrored.command = at_height(0.77)
     assert np.all(drawn != np.float32(0.77))
-    np.testing.assert_allclose(target_of(scripted.step()), 0.77)
-    scripted.reset()
-    np.testing.assert_allclose(target_of(scripted.step()), 0.77)
-    scripted.command = {}
-    scripted.reset()
-    low, high = scripted.env.config.target_height_range
-    target = target_of(scripted.step())
+    np.testing.assert_allclose(target_of(mirrored.step()), 0.77)
+    mirrored.reset()
+    np.testing.assert_allclose(target_of(mirrored.step()), 0.77)
+    mirrored.command = {}
+    mirrored.reset()
+    low, high = mirrored.env.config.target_height_range
+    target = target_of(mirrored.step())
     assert np.all((target >= low) & (target <= high))
 
 
-def test_a_new_target_is_seen_before_the_next_step(scripted: Simulation) -> None:
+def test_a_new_target_is_seen_before_the_next_step(mirrored: Simulation) -> None:
     """While the page is paused, and after a reset."""
-    scripted.reset()
-    scripted.command = at_height(0.77)
-    np.testing.assert_allclose(target_of(scripted.frame), 0.77)
-    scripted.reset()
-    np.testing.assert_allclose(target_of(scripted.frame), 0.77)
-    scripted.command = {}
+    mirrored.reset()
+    mirrored.command = at_height(0.77)
+    np.testing.assert_allclose(target_of(mirrored.frame), 0.77)
+    mirrored.reset()
+    np.testing.assert_allclose(target_of(mirrored.frame), 0.77)
+    mirrored.command = {}
 
 
 def test_only_an_episode_that_was_not_timed_out_is_lost(
-    env: BounceBall, scripted: Simulation, recording: EnvFrame
+    env: BounceBall, mirrored: Simulation, recording: EnvFrame
 ) -> None:
     assert recording.over.any() and not recording.lost.any()
-    scripted.reset()
-    scripted.push((2.0, 0.0, 0.0))
-    frames = scripted.record(1.0)
+    mirrored.reset()
+    mirrored.push((2.0, 0.0, 0.0))
+    frames = mirrored.record(1.0)
     assert frames.lost.any(axis=0).all() and frames.over.any(axis=0).all()
-    scripted.reset()
+    mirrored.reset()
 
 
-def test_policies_side_by_side_are_shown_as_one(scripted: Simulation) -> None:
-    both = SideBySide([scripted, scripted])
+def test_policies_side_by_side_are_shown_as_one(mirrored: Simulation) -> None:
+    both = SideBySide([mirrored, mirrored])
     both.command = at_height(0.7)
     both.reset()
     frame = both.step()
@@ -256,18 +256,18 @@ def test_pushes_follow_the_camera(case) -> None:
     np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
 
 
-def test_a_push_adds_its_velocity_to_the_ball_once(scripted: Simulation) -> None:
+def test_a_push_adds_its_velocity_to_the_ball_once(mirrored: Simulation) -> None:
     steps, push = 5, np.array([0.2, -0.1, 0.3])
-    scripted.reset()
-    start = scripted.frame.ball
-    scripted.push(tuple(push))
+    mirrored.reset()
+    start = mirrored.frame.ball
+    mirrored.push(tuple(push))
     for _ in range(steps):
-        scripted.step()
-    flight = steps * scripted.env.dt
+        mirrored.step()
+    flight = steps * mirrored.env.dt
     # The sum of a semi-implicit integrator's steps, in place of g t^2 / 2.
-    fall = 0.5 * GRAVITY * flight * (flight + scripted.env.config.physics_dt)
+    fall = 0.5 * GRAVITY * flight * (flight + mirrored.env.config.physics_dt)
     expected = start + push * flight - np.array([0.0, 0.0, fall])
-    np.testing.assert_allclose(scripted.frame.ball, expected, atol=1e-5)
+    np.testing.assert_allclose(mirrored.frame.ball, expected, atol=1e-5)
 
 
 # Resampling
@@ -440,11 +440,11 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
 # The clock
 
 
-def test_steps_become_due_with_the_clock(scripted: Simulation, monkeypatch) -> None:
+def test_steps_become_due_with_the_clock(mirrored: Simulation, monkeypatch) -> None:
     now, speed = 0.0, 0.5
     monkeypatch.setattr(pace.time, "monotonic", lambda: now)
     monkeypatch.setattr(pace.time, "sleep", lambda _: None)
-    clock = pace.in_real_time(scripted, 0.65, lambda: speed)
+    clock = pace.in_real_time(mirrored, 0.65, lambda: speed)
     assert not next(clock)
     steps = []
     for _ in range(60):
@@ -590,7 +590,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
 
 @pytest.fixture
-def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
+def page(mirrored: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
     """A client of a served simulation of two environments, and a record of the page's actions: the
     numbers of environments shown, the speeds, the target heights and the pushes."""
     did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
@@ -600,7 +600,7 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
         (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
     ):
         watch(monkeypatch, owner, method, record)
-    scripted.command = {}
+    mirrored.command = {}
     make_clock = browser.in_real_time
 
     def clock(simulation, seconds, speed):
@@ -611,9 +611,9 @@ def page(scripted: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
         return make_clock(simulation, seconds, watched)
 
     monkeypatch.setattr(browser, "in_real_time", clock)
-    with served(scripted, monkeypatch) as client:
+    with served(mirrored, monkeypatch) as client:
         yield client, did
-    scripted.command = {}
+    mirrored.command = {}
 
 
 def wait_until(holds: Callable[[], bool]) -> None:
@@ -820,11 +820,11 @@ def test_keys_act_as_in_the_window(page) -> None:
 
 
 def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
-    page, scripted: Simulation
+    page, mirrored: Simulation
 ) -> None:
     client, did = page
     up = np.array([0.0, 0.0, 1.0])
-    position, gaze = camera_pose(np.zeros((1, 3)), np.array(scripted.env.task.focus()))
+    position, gaze = camera_pose(np.zeros((1, 3)), np.array(mirrored.env.task.focus()))
     for forward in (gaze - position, np.array([-1.0, 0.0, 0.0])):
         pushes = len(did["push"])
         client.set(client.control("towards"), "left")
@@ -837,7 +837,7 @@ def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
 
     def has_arrived() -> bool:
         client.receive()
-        return np.allclose(client.camera.get("look_at"), scripted.frame.ball[0], atol=1e-3)
+        return np.allclose(client.camera.get("look_at"), mirrored.frame.ball[0], atol=1e-3)
 
     wait_until(has_arrived)
     forward = np.subtract(client.camera["look_at"], client.camera["position"])
@@ -846,7 +846,7 @@ def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
 
 
 def test_the_last_seconds_are_saved_as_they_were_seen(
-    page, scripted: Simulation, monkeypatch
+    page, mirrored: Simulation, monkeypatch
 ) -> None:
     client, did = page
     saved = []
@@ -865,7 +865,7 @@ def test_the_last_seconds_are_saved_as_they_were_seen(
     assert client.download == b"<html>"
     (recording,) = saved
     assert len(recording.ball) == len(did["target"]) and recording.ball.shape[1:] == (1, 3)
-    np.testing.assert_array_equal(recording.ball[-1, 0], scripted.frame.ball[0])
+    np.testing.assert_array_equal(recording.ball[-1, 0], mirrored.frame.ball[0])
     client.press("pause")
 
 
@@ -1118,9 +1118,9 @@ def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
     assert still.command == {} and "T" not in keys.split("\n")
 
 
-def test_a_label_without_readings_is_not_shown(still: Simulation, scripted: Simulation) -> None:
+def test_a_label_without_readings_is_not_shown(still: Simulation, mirrored: Simulation) -> None:
     """It would be a white stroke."""
-    for simulation, is_shown in ((still, False), (scripted, True)):
+    for simulation, is_shown in ((still, False), (mirrored, True)):
         with open_server("127.0.0.1", 0) as server:
             scene = Scene(server, simulation.env, 1)
             scene.update([simulation.frame])
@@ -1177,10 +1177,10 @@ def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...])
 
 
 def test_policies_of_different_worlds_are_shown_as_one(
-    scripted: Simulation, played: Simulation
+    mirrored: Simulation, played: Simulation
 ) -> None:
     """They have other metrics, such as those of the world's terms."""
-    both = SideBySide([scripted, played])
+    both = SideBySide([mirrored, played])
     both.reset()
     start = both.frame
     both.push((0.0, 0.0, 0.5))
@@ -1337,7 +1337,7 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
 
 VIDEOS = {
     "mp4 by EGL": ("egl", "a.mp4", "play", 60),
-    "gif by OSMesa": ("osmesa", "a.gif", "view --actions scripted", 25),
+    "gif by OSMesa": ("osmesa", "a.gif", "view --actions mirror", 25),
 }
 
 
@@ -1491,10 +1491,10 @@ def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
     assert "shows one policy" in sentence and "--viewer browser" in sentence
 
 
-def test_the_windows_own_toggles_of_the_used_keys_are_undone(scripted: Simulation) -> None:
+def test_the_windows_own_toggles_of_the_used_keys_are_undone(mirrored: Simulation) -> None:
     keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
     keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
-    (*_, (_, _, names, _)) = native.Window(scripted, 1.0)._texts()
+    (*_, (_, _, names, _)) = native.Window(mirrored, 1.0)._texts()
     used = {*names.split("\n")} - {"space"}
     assert keys == used == set(native._KEYS)
 
@@ -1508,13 +1508,6 @@ def test_mistakes_give_one_sentence(fails, main, case: tuple, monkeypatch) -> No
     flags, *words = case
     sentence = fails(main, flags.split())
     assert not [word for word in words if word not in sentence], sentence
-
-
-def test_a_task_without_a_script_is_named(fails, monkeypatch) -> None:
-    monkeypatch.setattr(Simulation, "__init__", None)
-    dribble = f"{Path(__file__).parent.parent / 'examples/dribble_task.py'}:Dribble"
-    sentence = fails(view.main, ["--task", dribble, *"--actions scripted --html a.html".split()])
-    assert "no scripted controller" in sentence and "--actions random or zero" in sentence
 
 
 def test_without_opengl_the_package_is_named(fails, monkeypatch) -> None:

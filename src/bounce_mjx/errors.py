@@ -11,6 +11,9 @@ from typing import NoReturn
 
 from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
 
+# Status of a process that SIGPIPE ends.
+_BROKEN_PIPE = 128 + 13
+
 
 class UserError(Exception):
     """A mistake that the user can correct. Its text is one sentence with the given value, the
@@ -76,7 +79,7 @@ def install_command(*words: str) -> str:
 def exit_on_user_error() -> Iterator[None]:
     """Reports a `UserError`, or a `JAX_PLATFORMS` that JAX refuses, as one sentence on stderr and
     exits with status 2; Ctrl-C exits with status 130. Neither prints a traceback, and nor does an
-    output that cannot encode a path."""
+    output that cannot encode a path, or whose reader has ended, such as head."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -92,6 +95,19 @@ def exit_on_user_error() -> Iterator[None]:
         leave()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        sys.exit(_BROKEN_PIPE)
+    finally:
+        _flush()
+
+
+def _flush() -> None:
+    """Writes what is printed. Python would do it at its end, and print a traceback if nobody reads
+    it."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _exit_with(sentence: str) -> NoReturn:

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import PolicyCommand, WorldCommand, parse_with_commands
+from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -28,9 +28,16 @@ from bounce_mjx.interrupt import interruptible
 _SILENT_SECONDS = 10.0
 
 
-class EvalCommand(WorldCommand, PolicyCommand):
+class EvalCommand(WorldCommand):
     """Measures the results of a trained policy."""
 
+    checkpoint: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
+    ] = None
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
+    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
+    the package if there is no run."""
     episodes: Count = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = DEFAULT_SEED
@@ -61,16 +68,15 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.evaluation.recording import RECORDED_EPISODES
         from bounce_mjx.reports.tables import details_line, results_table
         from bounce_mjx.runs.files import check_output, to_json, writable, write_output
-        from bounce_mjx.runs.folders import choose_checkpoint
-        from bounce_mjx.runs.reading import read_policy
+        from bounce_mjx.runs.reading import read_actor
         from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
     console = Console()
-    checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
+    checkpoint = command.choose(command.checkpoint, console)
     if command.nominal and command.world is not None:
         raise UserError("--nominal and --world exclude each other; leave one out")
-    config = command.config(checkpoint.run)
+    config = command.config_of(checkpoint)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError(
             "the arm of this policy has no limits of its commands (env.robot.limits); leave "
@@ -78,7 +84,7 @@ def main(args: Sequence[str]) -> None:
         )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
-    policy = read_policy(checkpoint, config)
+    policy, actor = read_actor(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
     options = EvaluationOptions(
         command.episodes, command.seed, command.physics, command.nominal, commands
@@ -88,7 +94,7 @@ def main(args: Sequence[str]) -> None:
         report, engine, warnings = evaluate_policy(
             policy,
             config.env,
-            config.ppo,
+            actor,
             options,
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
             progress=progress,
@@ -99,7 +105,7 @@ def main(args: Sequence[str]) -> None:
     console.print(details_line(report), highlight=False, soft_wrap=True)
     found = {}
     if command.contacts or command.limits:
-        recording = recorded_episodes(policy, config.env, config.ppo, options)
+        recording = recorded_episodes(policy, config.env, actor, options)
         for name, wanted, measure, describe in (
             ("contacts", command.contacts, arm_contacts, describe_contacts),
             ("limits", command.limits, limit_shares, describe_limits),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
+from bounce_mjx.commands.run_options import MIRROR, WorldCommand, parse_with_commands
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
@@ -34,7 +34,10 @@ class PlayCommand(WorldCommand):
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained, robust, or the name of a task or an arm. Several
     are shown side by side. The default is the newest run, or the task's policy in the package if
-    there is no run."""
+    there is no run. mirror stands for the mirror law, a model-based baseline."""
+    actions: Literal["policy", "mirror"] = "policy"
+    """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
+    mirror."""
     physics: Literal["config", "fused", "mjx"] = "config"
     """Physics engine; config is the engine of the training."""
     randomization: RandomizationConfig = RandomizationConfig()
@@ -50,19 +53,22 @@ def main(args: Sequence[str]) -> None:
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     with no_garbage_collection():
-        from bounce_mjx.runs.folders import choose_checkpoint
         from bounce_mjx.training.setup import set_up_jax
         from bounce_mjx.viewers.show import show
 
     console = Console()
-    chosen = [
-        choose_checkpoint(path, command.folder, console) for path in command.checkpoints or (None,)
-    ]
+    default = None if command.actions == "policy" else Path(MIRROR)
+    if default and command.checkpoints:
+        raise UserError(
+            "--actions mirror and checkpoints exclude each other; to show the mirror law beside a "
+            "policy, give mirror as a checkpoint"
+        )
+    chosen = [command.choose(path, console) for path in command.checkpoints or (default,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     (commands, *_) = [given_commands(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
     show(
-        [_load(*shown, console) for shown in zip(chosen, configs, strict=True)],
+        [load_shown(*shown, console) for shown in zip(chosen, configs, strict=True)],
         command.viewing,
         commands=commands,
         console=console,
@@ -71,7 +77,7 @@ def main(args: Sequence[str]) -> None:
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the engine and the world that are to be shown."""
-    config = command.config(checkpoint.run)
+    config = command.config_of(checkpoint)
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization
@@ -79,19 +85,20 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     return config.model_copy(update={"env": env})
 
 
-def _load(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
+def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
-    from bounce_mjx.learning.policy import make_networks
-    from bounce_mjx.runs.reading import read_policy
+    from bounce_mjx.runs.folders import MIRROR_LAW
+    from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
 
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-    policy = read_policy(checkpoint, config)
+    policy, actor = read_actor(checkpoint, config)
 
     def make_controller(env: "Env") -> "Controller":
-        networks = make_networks(config.ppo, env.observation_size, env.action_size)
-        return make_policy_controller(networks, policy)
+        return make_policy_controller(actor(env), policy)
 
-    title = f"{checkpoint.run.name}, {checkpoint.steps / 1e6:.1f} M steps"
+    title = checkpoint.run.name
+    if checkpoint is not MIRROR_LAW:
+        title += f", {checkpoint.steps / 1e6:.1f} M steps"
     return Shown(config.env, make_controller, title)

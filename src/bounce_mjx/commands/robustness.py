@@ -3,11 +3,13 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import PolicyCommand
+from bounce_mjx.commands.run_options import ActorCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -23,9 +25,16 @@ from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import POLICIES, resource_path
 
 
-class RobustnessCommand(PolicyCommand):
+class RobustnessCommand(ActorCommand):
     """Measures the results of a trained policy in perturbed worlds."""
 
+    checkpoint: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
+    ] = None
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
+    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
+    the package if there is no run."""
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
@@ -43,7 +52,7 @@ class RobustnessCommand(PolicyCommand):
     """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
-    for a policy that comes with the package."""
+    for a policy that comes with the package and for the mirror law."""
 
 
 @interruptible
@@ -64,15 +73,15 @@ def main(args: Sequence[str]) -> None:
         )
         from bounce_mjx.runs.config import in_world, named_file
         from bounce_mjx.runs.files import to_json, writable, write_output
-        from bounce_mjx.runs.folders import choose_checkpoint
-        from bounce_mjx.runs.reading import read_policy
+        from bounce_mjx.runs.folders import MIRROR_LAW
+        from bounce_mjx.runs.reading import read_actor
         from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:
         raise UserError("--assumed is about a named world; give one with --world, or leave it out")
     console = Console()
-    checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
-    config = command.config(checkpoint.run)
+    checkpoint = command.choose(command.checkpoint, console)
+    config = command.config_of(checkpoint)
     suite = resource_path("configs/robustness.yaml")
     if command.suite is not None:
         suite = named_file(command.suite, "configs")
@@ -86,9 +95,9 @@ def main(args: Sequence[str]) -> None:
         conditions, version = conditions[: 1 + len(assumed)], ""
         suite = f"twice what {command.world} assumes"
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
-    policy = read_policy(checkpoint, config)
-    shipped = checkpoint.run in map(resource_path, POLICIES.values())
-    out = command.out or (Path("robustness") if shipped else checkpoint.run)
+    policy, actor = read_actor(checkpoint, config)
+    no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    out = command.out or (Path("robustness") if no_run else checkpoint.run)
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -97,7 +106,7 @@ def main(args: Sequence[str]) -> None:
         task = bar.add_task("conditions", total=len(conditions))
         outcomes = measure_conditions(
             policy,
-            config.ppo,
+            actor,
             conditions,
             options,
             progress=lambda done: bar.update(task, completed=done),

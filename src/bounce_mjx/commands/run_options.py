@@ -1,18 +1,32 @@
 """Shared by the commands about a run: whose run it is, and the commands of its task as flags."""
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
+from rich.console import Console
 
 from bounce_mjx.config.command_line import flag_of, flags_of, parse, unknown_argument
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig, in_world, load_run_config, runs_folder
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    in_world,
+    load_run_config,
+    read_preset,
+    runs_folder,
+)
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
 from bounce_mjx.training.command import early_flag
 from bounce_mjx.world.config import WorldConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.runs.folders import Checkpoint
+
+MIRROR = "mirror"
+"""Name of the mirror law in place of a checkpoint."""
 
 CommandT = TypeVar("CommandT", bound=StrictModel)
 
@@ -39,20 +53,58 @@ class RunCommand(StrictModel):
         return load_run_config(run, self.task)
 
 
-class WorldCommand(RunCommand):
-    """A command line that simulates a run's policy, in its world or in another one."""
+class ActorCommand(RunCommand):
+    """A command line that simulates a policy or the mirror law."""
+
+    robot: Path | None = None
+    """Robot of the mirror law; a policy has that of its training."""
+
+    def choose(self, path: Path | None, console: Console) -> "Checkpoint":
+        """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
+
+        Raises:
+          UserError: there is none, or a robot is given for a policy.
+        """
+        from bounce_mjx.runs.folders import MIRROR_LAW, choose_checkpoint
+
+        if str(path) == MIRROR and not os.path.isdir(path):
+            return MIRROR_LAW
+        if self.robot is not None:
+            raise UserError(
+                "--robot is of the mirror law, and a policy has the robot of its training; leave "
+                "it out, or give mirror in place of a checkpoint"
+            )
+        return choose_checkpoint(path, self.folder, console)
+
+    def config_of(self, checkpoint: "Checkpoint") -> TrainConfig:
+        """The config of a checkpoint's run, or that of the mirror law: the task's preset.
+
+        Raises:
+          UserError: as `load_run_config` and `read_preset`.
+        """
+        from bounce_mjx.baselines.mirror import observing
+        from bounce_mjx.runs.folders import MIRROR_LAW
+
+        if checkpoint is not MIRROR_LAW:
+            return self.config(checkpoint.run)
+        config = read_preset(Path("default"), self.robot, self.task)
+        return config.model_copy(update={"env": observing(config.env)})
+
+
+class WorldCommand(ActorCommand):
+    """A command line that simulates in the world of the training or in another one."""
 
     world: Path | None = None
     """World in place of that of the training: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo)."""
 
-    def config(self, run: Path) -> TrainConfig:
-        """The config of a run in the given world.
+    def config_of(self, checkpoint: "Checkpoint") -> TrainConfig:
+        """The config of a checkpoint's run in the given world.
 
         Raises:
-          UserError: as `load_run_config` and `in_world`.
+          UserError: as `ActorCommand.config_of` and `in_world`.
         """
-        config = super().config(run)
+        config = super().config_of(checkpoint)
         return config if self.world is None else in_world(config, self.world)[0]
 
 

@@ -21,10 +21,11 @@ from bounce_mjx.world.config import WorldConfig
 
 
 class ViewCommand(StrictModel):
-    """Shows the environment under random, zero or scripted actions."""
+    """Shows the environment under random or zero actions, or the mirror law."""
 
-    actions: Literal["random", "zero", "scripted"] = "random"
-    """random: uniform; zero: the servos hold their angles; scripted: the task's own controller."""
+    actions: Literal["random", "zero", "mirror"] = "random"
+    """random: uniform; zero: the servos hold their angles; mirror: the mirror law, a model-based
+    controller."""
     task: str = DEFAULT
     """Name of the task, or FILE.py:CLASS for one of your own."""
     robot: Path | None = None
@@ -48,6 +49,7 @@ def main(args: Sequence[str]) -> None:
         default=command_class(env=env, robot=robot),
     )
     with no_garbage_collection():
+        from bounce_mjx.baselines.mirror import MirrorLaw, observing
         from bounce_mjx.training.setup import set_up_jax
         from bounce_mjx.viewers import controllers
         from bounce_mjx.viewers.show import Shown, show
@@ -55,8 +57,9 @@ def main(args: Sequence[str]) -> None:
     make_controller = {
         "random": controllers.make_random_controller,
         "zero": controllers.make_zero_controller,
-        "scripted": controllers.make_scripted_controller,
+        "mirror": lambda env: controllers.make_policy_controller(MirrorLaw(env), None),
     }
-    set_up_jax(command.env)
-    shown = Shown(command.env, make_controller[command.actions], f"{command.actions} actions")
+    env = observing(command.env) if command.actions == "mirror" else command.env
+    set_up_jax(env)
+    shown = Shown(env, make_controller[command.actions], f"{command.actions} actions")
     show([shown], command.viewing, commands={}, console=Console())

@@ -26,7 +26,7 @@ from bounce_mjx.deploy.metadata import (
     to_entries,
 )
 from bounce_mjx.errors import UserError, needed
-from bounce_mjx.learning.policy import Policy, act, make_networks
+from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -228,8 +228,8 @@ def _network(config: TrainConfig, policy: Policy) -> Callable[[dict[str, jax.Arr
     """Histories [history, size] by the inputs' names -> action [J]."""
     names = [part.name for part in _inputs(config.env)]
     networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
-    return lambda histories: act(
-        networks, policy, jnp.concatenate([histories[name].ravel() for name in names])
+    return lambda histories: networks.act(
+        policy, jnp.concatenate([histories[name].ravel() for name in names])
     )
 
 

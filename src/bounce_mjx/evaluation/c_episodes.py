@@ -12,7 +12,7 @@ from mujoco import rollout
 from bounce_mjx.env.env import Env, world_model
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import (
     PhysicsParameters,
     PhysicsState,
@@ -30,7 +30,7 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 def make_mujoco_evaluator(
     env: Env,
-    networks: Networks,
+    actor: Actor,
     episodes: int,
     progress: Callable[[float], None] | None = None,
 ) -> Callable[..., Statistics]:
@@ -49,7 +49,7 @@ def make_mujoco_evaluator(
 
     @jax.jit
     def decide(policy, states):
-        actions = act(networks, policy, states.obs.T).T
+        actions = actor.act(policy, states.obs.T).T
         states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
         targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
         memory = states.pipeline_state.memory

@@ -11,7 +11,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
 from bounce_mjx.evaluation.recording import empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
-from bounce_mjx.learning.policy import Networks, Policy, act
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
@@ -28,7 +28,7 @@ class _UnderWay(NamedTuple):
 
 def make_evaluator(
     env: Env,
-    networks: Networks,
+    actor: Actor,
     episodes: int,
     progress: Callable[[float], None] | None = None,
 ) -> Callable[..., Statistics]:
@@ -41,7 +41,7 @@ def make_evaluator(
         simulated; without it, the function is one jitted program.
     """
     if progress is None:
-        measure = make_recording_evaluator(env, networks, episodes, recorded=0)
+        measure = make_recording_evaluator(env, actor, episodes, recorded=0)
         return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
 
     @jax.jit
@@ -50,7 +50,7 @@ def make_evaluator(
 
     @jax.jit
     def go_on(policy: Policy, now: _UnderWay, last_step: jax.Array) -> _UnderWay:
-        return _run_until(env, networks, policy, now, last_step)
+        return _run_until(env, actor, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         now, limit = start(key, ranges), env.config.episode_steps
@@ -66,7 +66,7 @@ def make_evaluator(
 
 
 def make_recording_evaluator(
-    env: Env, networks: Networks, episodes: int, recorded: int
+    env: Env, actor: Actor, episodes: int, recorded: int
 ) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `make_evaluator`, but also returns a recording of the first `recorded` episodes."""
 
@@ -74,13 +74,13 @@ def make_recording_evaluator(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None
     ) -> tuple[Statistics, Recording]:
         states = reset_episodes(env, key, episodes, ranges)
-        return run_episodes(env, networks, policy, states, recorded)
+        return run_episodes(env, actor, policy, states, recorded)
 
     return jax.jit(evaluate)
 
 
 def run_episodes(
-    env: Env, networks: Networks, policy: Policy, states: State, recorded: int
+    env: Env, actor: Actor, policy: Policy, states: State, recorded: int
 ) -> tuple[Statistics, Recording]:
     """Runs one deterministic episode from each of E initial states (batch last), until all have
     ended or their time limit is reached.
@@ -88,7 +88,7 @@ def run_episodes(
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
     begun = _begin(env, states, recorded)
-    ended = _run_until(env, networks, policy, begun, env.config.episode_steps)
+    ended = _run_until(env, actor, policy, begun, env.config.episode_steps)
     return ended.statistics, ended.recording
 
 
@@ -103,7 +103,7 @@ def _begin(env: Env, states: State, recorded: int) -> _UnderWay:
 
 def _run_until(
     env: Env,
-    networks: Networks,
+    actor: Actor,
     policy: Policy,
     progress: _UnderWay,
     last_step: int | jax.Array,
@@ -114,7 +114,7 @@ def _run_until(
         return jnp.any(now.statistics.running) & (now.step < last_step)
 
     def advance(now: _UnderWay) -> _UnderWay:
-        actions = act(networks, policy, now.states.obs.T)
+        actions = actor.act(policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
         return _UnderWay(
             states=states,

@@ -13,8 +13,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evalua
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
-from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -31,9 +30,9 @@ class PolicyEvaluation(NamedTuple):
 
 
 def evaluate_policy(
-    policy: Policy,
+    policy: Policy | None,
     env_config: WorldConfig,
-    ppo_config: PPOConfig,
+    actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
     started: Callable[[str], None] = lambda engine: None,
     progress: Callable[[float], None] | None = None,
@@ -42,7 +41,7 @@ def evaluate_policy(
 
     Args:
       env_config: the world and the task of the policy's training.
-      ppo_config: the algorithm's settings in the policy's training, which define the networks.
+      actor: what acts with the policy, such as the networks of its training (`networks_of`).
       started: called with the engine's name before anything is compiled.
       progress: called now and then with the share of the work that is done, from 0 to 1.
 
@@ -51,12 +50,11 @@ def evaluate_policy(
     """
     env = Env(_with_options(env_config, options))
     commands = _commands(env_config, options)
-    networks = make_networks(ppo_config, env.observation_size, env.action_size)
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
-    evaluate = make(env, networks, options.episodes, progress)
+    evaluate = make(env, actor(env), options.episodes, progress)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
     key = jax.random.PRNGKey(options.seed)
     statistics = evaluate(policy, key, ranges if commands else None)
@@ -70,17 +68,16 @@ def evaluate_policy(
 
 
 def recorded_episodes(
-    policy: Policy,
+    policy: Policy | None,
     env_config: WorldConfig,
-    ppo_config: PPOConfig,
+    actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
 ) -> Recording:
     """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`. In
     place of MuJoCo's C engine, the config's simulates."""
     env = Env(_with_options(env_config, options))
     commands = _commands(env_config, options)
-    networks = make_networks(ppo_config, env.observation_size, env.action_size)
-    evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
+    evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
     key = jax.random.PRNGKey(options.seed)
     _, recording = evaluate(policy, key, ranges if commands else None)

@@ -84,13 +84,7 @@ def judge(
       commands: ranges of commands in these episodes, where they are not the config's.
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
-    episodes = Episodes(
-        sums=s.tally.sums,
-        maxima=s.tally.maxima,
-        lasted=s.running,
-        commands={name: (c.low, c.high) for name, c in env.config.commands.items()}
-        | (commands or {}),
-    )
+    episodes = episodes_of(env, s, commands or {})
     details = {
         "episodes": float(len(s.running)),
         **env.task.details(episodes),
@@ -98,3 +92,15 @@ def judge(
         "mean_length_s": float(s.steps.mean() * env.dt),
     }
     return Report(env.task.results(episodes), details)
+
+
+def episodes_of(
+    env: Env, statistics: Statistics, commands: dict[str, tuple[float, float]]
+) -> Episodes:
+    """What a task judges, from statistics of E episodes as NumPy arrays."""
+    return Episodes(
+        sums=statistics.tally.sums,
+        maxima=statistics.tally.maxima,
+        lasted=statistics.running,
+        commands={name: (c.low, c.high) for name, c in env.config.commands.items()} | commands,
+    )

@@ -19,8 +19,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition
-from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
@@ -114,8 +113,8 @@ class RobustnessReport(pydantic.BaseModel):
 
 
 def measure_conditions(
-    policy: Policy,
-    ppo_config: PPOConfig,
+    policy: Policy | None,
+    actor: Callable[[Env], Actor],
     conditions: Sequence[Condition],
     options: EvaluationOptions,
     progress: Callable[[int], None] = lambda done: None,
@@ -127,7 +126,7 @@ def measure_conditions(
     which refuses dry friction, MuJoCo's C engine simulates it.
 
     Args:
-      ppo_config: config of the policy's training; it defines the networks.
+      actor: what acts with the policy, such as the networks of its training (`networks_of`).
       options: the number of episodes in each condition, their seed and the engine; a condition has
         its own world and commands.
       progress: callback for the number of finished conditions.
@@ -148,10 +147,9 @@ def measure_conditions(
         on_c = options.physics == "mujoco" or dry_in_mjx
         engine = "mujoco" if on_c else env.engine.name
         names = _given_names(env, members)
-        networks = make_networks(ppo_config, env.observation_size, env.action_size)
         size = _batch_size(len(members), options.episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator
-        evaluate = make(env, networks, size * options.episodes)
+        evaluate = make(env, actor(env), size * options.episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
             # Padding the last call with a repeated condition avoids compiling another shape.

@@ -106,7 +106,7 @@ def _joints(
         values = np.array(message.data, float)
     else:
         raise UserError(
-            f"message {number + 1} of {topic} in {path} is no JointState and no array of "
+            f"message {number + 1} of {topic} in {path} is neither a JointState nor an array of "
             f"{len(joint_names)} numbers; name another topic"
         )
     return _finite(values, path, topic, number)

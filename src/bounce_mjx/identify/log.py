@@ -234,7 +234,7 @@ def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     """Header, cells, and line number of each row of a CSV file."""
     try:
         if not os.path.isfile(path):
-            raise UserError(f"the log {path} is no file; give a CSV file or a ROS bag")
+            raise UserError(f"the log {path} is not a file; give a CSV file or a ROS bag")
         if (size := os.path.getsize(path)) > MAX_BYTES:
             raise UserError(
                 f"the log {path} has {size / 2**20:.0f} MiB, and at most {MAX_BYTES // 2**20} MiB "

@@ -1,11 +1,12 @@
 """The networks of a config, and the policy that acts with them."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.networks import MLP, PolicyNetwork
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
@@ -36,6 +37,18 @@ class Networks(NamedTuple):
     """Its inputs are observations, its output is a `Gaussian` over actions [..., A]."""
     value_network: NetworkFunctions
     """Its inputs are the observation and the critic metrics, its output the values [...]."""
+
+    def act(self, policy: Policy, observation: jax.Array) -> jax.Array:
+        """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1]."""
+        inputs = normalize(observation, policy.normalizer)
+        return jnp.clip(self.policy_network.apply(policy.params, inputs).mean, -1.0, 1.0)
+
+
+class Actor(Protocol):
+    """What acts: the networks of a training, or a law without parameters."""
+
+    def act(self, policy: Any, observation: jax.Array) -> jax.Array:
+        """Actions [..., A] in [-1, 1] for observations [..., N]."""
 
 
 def make_networks(
@@ -68,12 +81,11 @@ def make_networks(
     )
 
 
+def networks_of(config: PPOConfig) -> Callable[[Env], Networks]:
+    """`make_networks` of a config, as a function of the environment."""
+    return lambda env: make_networks(config, env.observation_size, env.action_size)
+
+
 def untrained_policy(networks: Networks, observation_size: int, key: jax.Array) -> Policy:
     """A policy before the first update; consumes the key."""
     return Policy(init_normalizer(observation_size), networks.policy_network.init(key))
-
-
-def act(networks: Networks, policy: Policy, observation: jax.Array) -> jax.Array:
-    """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1]."""
-    inputs = normalize(observation, policy.normalizer)
-    return jnp.clip(networks.policy_network.apply(policy.params, inputs).mean, -1.0, 1.0)

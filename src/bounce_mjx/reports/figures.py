@@ -5,7 +5,7 @@ They do not use pyplot, so they need no display and can be drawn in several thre
 
 import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import matplotlib
@@ -23,6 +23,8 @@ from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
 
+RETURN = "episode/return"
+"""Tag of the return in a training's log."""
 _REWARD = "reward/"
 # Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -44,17 +46,23 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 
 
 @style()
-def curves_figure(groups: Sequence[Group]) -> Figure:
-    """The return and the curves of the task over the training."""
-    shown = [Curve("episode/return", "", title="return of an episode")]
+def curves_figure(groups: Sequence[Group], reference: Mapping[str, float] = {}) -> Figure:
+    """The return and the curves of the task over the training.
+
+    Args:
+      reference: values of the policy that comes with the package, by the curve's tag.
+    """
+    shown = [Curve(RETURN, "", title="return of an episode")]
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
     figure, panels = _panels(len(shown), columns=3, height=2.4)
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
+        if curve.tag in reference:
+            axes.axhline(reference[curve.tag], color=_GREY, linestyle="--", linewidth=1.0)
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    _add_legend(figure, groups)
+    _add_legend(figure, groups, bool(reference))
     return figure
 
 
@@ -157,13 +165,15 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def _add_legend(figure: Figure, groups: Sequence[Group]) -> None:
+def _add_legend(figure: Figure, groups: Sequence[Group], has_reference: bool = False) -> None:
     handles = [
         Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
         for group, colour in _coloured(groups)
     ]
     if any(run.solved_steps is not None for group in groups for run in group.runs):
         handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))
+    if has_reference:
+        handles.append(Line2D([], [], color=_GREY, linestyle="--", label="policy of the package"))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)))
 
 

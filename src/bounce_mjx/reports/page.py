@@ -5,10 +5,12 @@ A training writes it after its results; `bounce-mjx report [RUN]` writes it agai
 
 import base64
 import html
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jax
+import mujoco
 from matplotlib.figure import Figure
 
 from bounce_mjx.config.files import dump_config
@@ -17,19 +19,29 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.figures import curves_figure, evaluation_figure, image, rewards_figure
+from bounce_mjx.reports.figures import (
+    RETURN,
+    curves_figure,
+    evaluation_figure,
+    image,
+    rewards_figure,
+)
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
-from bounce_mjx.reports.tables import details_line, figure_text, result_cells
+from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
+from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task.shown import Recording
+from bounce_mjx.tasks.registry import DEFAULT
 
 REPORT_FILE = "report.html"
+REPLAY_FILE = "replay.html"
+"""A replay of the best checkpoint, which `bounce-mjx report` records."""
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
@@ -37,7 +49,7 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     config = load_run_config(checkpoint.run)
     policy = read_policy(checkpoint, config)
     env = Env(config.env)
-    networks = make_networks(config.ppo, env.observation_size, env.action_size)
+    networks = networks_of(config.ppo)(env)
     evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
     return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
 
@@ -60,17 +72,18 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
         raise UserError(f"{run} has no results yet; wait for the end of its training")
     config = load_run_config(run)
     groups = group_runs([run])
-    evaluation = evaluation_figure(Env(config.env), recording)
+    env = Env(config.env)
+    evaluation = evaluation_figure(env, recording)
     robustness = load_robustness(run)
     figures = {
-        "Learning curves": curves_figure(groups),
+        "Learning curves": curves_figure(groups, _reference(config)),
         "The best checkpoint": evaluation,
         **({} if robustness is None else {"Perturbed worlds": robustness_figure(robustness)}),
         "Reward terms": rewards_figure(groups),
     }
     page = run / REPORT_FILE
     try:
-        write_atomically(page, _html(run, config, results, figures))
+        write_atomically(page, _html(run, config, env.engine.name, results, figures))
     except OSError as error:
         raise UserError(
             f"{page} cannot be written ({error.strerror}); make the folder writable"
@@ -78,13 +91,38 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     return page, evaluation
 
 
-def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, Figure]):
+def _reference(config: TrainConfig) -> dict[str, float]:
+    """Figures of the policy that comes with the package for a training's task on the project's own
+    arm, by the tag of the curve of the same quantity."""
+    name = {DEFAULT: PRETRAINED, **dict(zip(TASK_POLICIES, TASK_POLICIES, strict=True))}.get(
+        config.task
+    )
+    if name is None or config.env.mjcf is not None:
+        return {}
+    path = resource_path(f"{POLICIES[name]}/results.json")
+    details = json.loads(path.read_text(encoding="utf-8"))["details"]
+    found = {RETURN: details["mean_return"]}
+    for curve in config.env.task.curves:
+        value = details.get(f"mean_{curve.metric}_m")
+        if value is not None:
+            found[curve.tag] = curve.scale * value
+    return found
+
+
+def _html(
+    run: Path, config: TrainConfig, engine: str, results: Results, figures: dict[str, Figure]
+) -> str:
     report = results.best
     pictures = ""
     for title, figure in figures.items():
         data = base64.b64encode(image(figure, "svg")).decode()
         source = f"data:image/svg+xml;base64,{data}"
-        pictures += f'<h2>{title}</h2>\n<img alt="{title}" src="{source}">\n'
+        picture = f'<div class="wide"><img alt="{title}" src="{source}"></div>'
+        pictures += f"<h2>{title}</h2>\n{picture}\n"
+    if (run / REPLAY_FILE).is_file():
+        data = base64.b64encode((run / REPLAY_FILE).read_bytes()).decode()
+        frame = f'<iframe title="Replay" src="data:text/html;base64,{data}"></iframe>'
+        pictures += f"<h2>Replay</h2>\n{frame}\n"
     seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
@@ -103,10 +141,12 @@ def _html(run: Path, config: TrainConfig, results: Results, figures: dict[str, F
 </head>
 <body>
 <h1>{report.summary}</h1>
-<p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, on
-{html.escape(results.device)}. The best of {len(evaluations)} evaluations, after
+<p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
+the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
+<p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
+{engine} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 {pictures}
 <h2>Where the time went</h2>
@@ -137,16 +177,20 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         return f"<tr>{inner}</tr>\n"
 
     body = "".join(row("td", cells) for cells in rows)
-    return f"<table>\n{row('th', header)}{body}</table>"
+    return f'<div class="wide"><table>\n{row("th", header)}{body}</table></div>'
 
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; background: #fff; }
 h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
-img { width: 100%; }
+.wide { overflow-x: auto; }
+img { width: 100%; min-width: 44rem; }
+iframe { width: 100%; height: 30rem; border: 1px solid #ddd; }
 table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
 .pass { color: #00704f; font-weight: bold; } .fail { color: #b00020; font-weight: bold; }
-code, pre { font-size: 13px; } summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
+code, pre { font-size: 13px; overflow-wrap: anywhere; white-space: pre-wrap; }
+summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
+@media (max-width: 30rem) { th, td { padding-right: 0.4rem; font-size: 13px; } }
 """

@@ -8,6 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.world.config import WorldConfig
 
 # Ends of the names of figures, the units that are shown, and the factors to them.
 _UNITS = {
@@ -29,6 +30,11 @@ class _Detail(NamedTuple):
     value: float | None
     """In the unit."""
     is_mean: bool
+
+
+def robot_name(env: WorldConfig) -> str:
+    """The robot of a config: the name of its MJCF file, or the project's own arm."""
+    return "Peitian AIR4-560" if env.mjcf is None else env.mjcf.stem
 
 
 def figure_text(value: float | None, spec: str = ".2f") -> str:

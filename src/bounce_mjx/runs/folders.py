@@ -69,6 +69,10 @@ class Checkpoint(NamedTuple):
     """Environment steps trained."""
 
 
+MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
+"""In place of a checkpoint, the baseline `baselines.mirror`."""
+
+
 def create_run(config: TrainConfig) -> Path:
     """Creates a new run's folder, named after the current time, with the config in it.
 
@@ -165,13 +169,13 @@ def find_run(path: Path) -> Path:
 def newest_run(log_dir: Path) -> Path:
     """Folder of the newest run with a checkpoint, by the time stamps in the runs' names; a run
     without one counts from the last start of its training."""
-    found = [run for run in _runs(log_dir) if _has_checkpoint(run)]
+    found = runs_in(log_dir)
     if not found:
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with bounce-mjx train, or "
             "give a run's folder"
         )
-    return max(found, key=_started)
+    return found[-1]
 
 
 def named_run(path: Path | None, log_dir: Path) -> Path:
@@ -179,6 +183,11 @@ def named_run(path: Path | None, log_dir: Path) -> Path:
     folder with that name) stand for the newest run in `log_dir`."""
     is_name = path is None or (str(path) == LATEST and not os.path.isdir(path))
     return newest_run(log_dir) if is_name else path
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """Runs with a checkpoint in a folder, such as those of several seeds, the oldest first."""
+    return sorted(filter(_has_checkpoint, _runs(folder)), key=_started)
 
 
 def find_checkpoint(path: Path) -> Checkpoint:

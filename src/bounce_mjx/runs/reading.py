@@ -6,6 +6,7 @@ run's.
 """
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,21 @@ import numpy as np
 import pydantic
 import tensorstore
 
+from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
+from bounce_mjx.learning.policy import (
+    Actor,
+    Policy,
+    make_networks,
+    networks_of,
+    untrained_policy,
+)
 from bounce_mjx.learning.ppo import TrainingState
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
-from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint
 from bounce_mjx.tasks.registry import is_file
 
 RECORD_FILE = "run.json"
@@ -55,6 +64,15 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
                 f"finite, in {name}; give another checkpoint"
             )
     return policy
+
+
+def read_actor(
+    checkpoint: Checkpoint, config: TrainConfig
+) -> tuple[Policy | None, Callable[[Env], Actor]]:
+    """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy."""
+    if checkpoint is MIRROR_LAW:
+        return None, MirrorLaw
+    return read_policy(checkpoint, config), networks_of(config.ppo)
 
 
 def policy_shapes(config: TrainConfig) -> Policy:

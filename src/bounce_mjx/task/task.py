@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from bounce_mjx.lazy import jax
@@ -98,6 +98,9 @@ class Task:
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset draws for the task."""
+    hits: ClassVar[str] = ""
+    """The sum of `tally` that counts hits; the benchmark then measures episodes without a time
+    limit, up to a number of hits."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
     """Metrics that the value network sees by default, because the reward depends on them and the
     observation does not contain them."""
@@ -180,6 +183,11 @@ class Task:
         """Further figures by name; a unit is the end of the name, such as `mean_error_m`."""
         return {}
 
+    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
+        """Further figures for the benchmark, which rank policies that meet all results; a unit
+        follows a comma."""
+        return {}
+
     def recorded(self, moment: Moment) -> Values:
         """Numbers [] of a control step that `plots` needs, beside the coordinates."""
         return {}
@@ -206,11 +214,6 @@ class Task:
         """What a viewer writes over an environment, by name; the first stands for all where there
         is little room."""
         return {}
-
-    def script(self) -> Callable[[Kinematics, Values], jax.Array] | None:
-        """A hand-written controller to compare a policy with: (truth, command) -> action [n];
-        None if there is none for this robot."""
-        return None
 
     def focus(self) -> tuple[float, float, float]:
         """Point at which a viewer looks, m: the paddle below the ball at a reset."""

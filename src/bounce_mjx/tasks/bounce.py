@@ -6,7 +6,6 @@ It is the task of the original specification: its settings, bounces, reward, end
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import pydantic
@@ -21,7 +20,6 @@ from bounce_mjx.task import (
     Histogram,
     History,
     Hits,
-    Kinematics,
     Marker,
     Moment,
     ObservationConfig,
@@ -70,18 +68,6 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 
 HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
-
-
-# Gains of the scripted controller, found by a scan: it keeps 64 of 64 balls up for 10 s, with
-# a mean apex error of 8 cm.
-_LIFT = 0.03
-_LIFT_PER_METRE = 0.2
-_TILT_PER_METRE = 0.3
-_TILT_PER_SPEED = 0.15
-_MAX_TILT = 0.15
-_STRIKE_DISTANCE = 0.03
-_STRIKE_WIDTH = 0.08
-_FALLING_WIDTH = 0.2
 
 
 class BounceObservation(ObservationConfig):
@@ -214,6 +200,7 @@ class Bounce(Task):
         Curve("task/n_bounces", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)
+    hits = "hits"
 
     def reset(self, start: Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
@@ -247,6 +234,7 @@ class Bounce(Task):
                 "n_bounces": after.n_bounces,
                 "ball_xy_error": inputs.err_xy,
                 "apex_error": jnp.where(bounced, jnp.abs(state.apex - target), 0.0),
+                "apex_offset": jnp.where(bounced, state.apex - target, 0.0),
             },
         )
 
@@ -351,6 +339,9 @@ class Bounce(Task):
                 "settled_bounces": judged,
                 "accurate_bounces": judged & accurate,
                 "apex_error": jnp.where(judged, metrics["apex_error"], 0.0),
+                "apex_error^2": jnp.where(judged, jnp.square(metrics["apex_error"]), 0.0),
+                "apex_offset": jnp.where(judged, metrics["apex_offset"], 0.0),
+                "hits": bounced,
                 "rising_steps": vz > 0.0,
                 "rising_speed": jnp.maximum(vz, 0.0),
             },
@@ -409,6 +400,16 @@ class Bounce(Task):
             "mean_apex_error_m": error,
         }
 
+    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
+        """The root mean square and the mean of apex minus target height."""
+        sums = {name: float(each.sum()) for name, each in episodes.sums.items()}
+        if not (count := sums["settled_bounces"]):
+            return {"apex RMS, cm": None, "apex bias, cm": None}
+        return {
+            "apex RMS, cm": 100.0 * math.sqrt(sums["apex_error^2"] / count),
+            "apex bias, cm": 100.0 * sums["apex_offset"] / count,
+        }
+
     def recorded(self, moment: Moment) -> dict[str, jax.Array]:
         """Bounces, and the apex so far."""
         return {"bounced": moment.metrics["bounced"], "apex": moment.state.apex}
@@ -457,37 +458,6 @@ class Bounce(Task):
             "bounces": f"{metrics['n_bounces']:.0f}",
             "target": f"{command['target_height']:.2f} m",
         }
-
-    def script(self) -> Callable[[Kinematics, dict[str, jax.Array]], jax.Array] | None:
-        """A juggler for the project's own arm.
-
-        The arm holds the configured posture. As the ball comes down, Joint3 lifts the paddle while
-        Joint5 keeps it level; the lift grows with the target height's distance above the apex that
-        the ball's energy allows. Joint5 and Joint6 tilt the paddle against the ball's horizontal
-        error and velocity.
-        """
-        config, reward = self.config, self.config.reward
-        if config.robot.site is not None:
-            return None
-
-        def act(truth: Kinematics, command: dict[str, jax.Array]) -> jax.Array:
-            x, y, z = truth.ball_position
-            vx, vy, vz = truth.ball_velocity
-            apex = z + vz**2 / (2.0 * reward.gravity)
-            height = z - truth.paddle_position[2]
-            near = jnp.exp(-(((height - _STRIKE_DISTANCE) / _STRIKE_WIDTH) ** 2))
-            falling = jax.nn.sigmoid(-vz / _FALLING_WIDTH)
-            lift = _LIFT + _LIFT_PER_METRE * (command["target_height"] - apex)
-            lift = near * falling * lift
-            pitch = _TILT_PER_METRE * (x - reward.target_x) + _TILT_PER_SPEED * vx
-            roll = _TILT_PER_METRE * (y - reward.target_y) + _TILT_PER_SPEED * vy
-            pitch, roll = (jnp.clip(tilt, -_MAX_TILT, _MAX_TILT) for tilt in (pitch, roll))
-            zero = jnp.zeros_like(lift)
-            posture = jnp.array(config.default_joint_angles)
-            posture = posture + jnp.stack([zero, zero, -lift, zero, lift - pitch, roll])
-            return jnp.clip((posture - truth.joint_angles) / config.action_scale, -1.0, 1.0)
-
-        return act
 
     def focus(self) -> tuple[float, float, float]:
         """The paddle's home."""

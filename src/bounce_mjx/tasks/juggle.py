@@ -1,4 +1,4 @@
-"""Juggling: balls bounce in turns at the commanded height on one paddle, each in a column."""
+"""Juggling: balls bounce alternately at the commanded height on one paddle, each in a column."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ class Config(task.WorldConfig):
 
 
 class Juggle(task.Task):
-    """Balls bounce in turns at the commanded height on one paddle, each in a column."""
+    """Balls bounce alternately at the commanded height on one paddle, each in a column."""
 
     Config = Config
     num_balls = (2, 3)
     curves = (
-        task.Curve("task/turns", "in_turn", "hits", "hits in turns, %", 100.0),
+        task.Curve("task/turns", "in_turn", "hits", "alternating hits, %", 100.0),
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
@@ -95,7 +95,7 @@ class Juggle(task.Task):
         return jnp.stack(columns), 2.0 * fall
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
-        """The balls are in their columns and land in turns, the first one first."""
+        """The balls are in their columns and land alternately, the first one first."""
         columns, period = self._columns(command["target_height"])
         turns = jnp.arange(self.config.num_balls)[::-1, None] / self.config.num_balls
         rise = (0.5 - FLOWN - turns) * period * jnp.array([0.0, 0.0, 1.0])
@@ -168,7 +168,7 @@ class Juggle(task.Task):
         sums, apart = episodes.sums, episodes.maxima["touched"] == 0.0
         return (
             task.share_of_episodes("kept", "episodes that keep all balls", episodes.lasted, 0.99),
-            task.share_of_events("turns", "hits in turns", sums["in_turn"], sums["hits"], 0.99),
+            task.share_of_events("turns", "alternating hits", sums["in_turn"], sums["hits"], 0.99),
             task.share_of_episodes("apart", "episodes without touching balls", apart, 0.99),
             task.share_of_events(
                 "height", "apexes within 0.1 m", sums["high"], sums["apexes"], 0.95

@@ -190,6 +190,10 @@ class Track(task.Task):
             task.share_of_episodes("stable", f"episodes that last {length}", episodes.lasted, 0.99),
         )
 
+    def ranking(self, episodes: task.Episodes) -> dict[str, task.Figure]:
+        (fast,) = (r.value for r in self.results(episodes) if r.name == "fast error")
+        return {"moving point, cm": fast}
+
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         return paths.markers(command, self.config.path_size)
 

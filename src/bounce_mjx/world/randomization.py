@@ -192,7 +192,7 @@ class RandomizationConfig(StrictModel):
     def _check_ranges(self):
         for name in (self.shares or {}).keys() - TERMS.keys():
             raise ValueError(
-                f"shares has a probability for {shorten(name)}, which is no term; remove it"
+                f"shares has a probability for {shorten(name)}, which is not a term; remove it"
             )
         if self.restitution_slope is not None and self.restitution is None:
             raise ValueError("restitution_slope is given without restitution; give both")

@@ -1,0 +1,1 @@
+"""Controllers without a training, with which a policy is compared."""
