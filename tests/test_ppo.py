@@ -387,7 +387,7 @@ def test_policy_sees_only_the_observation(tiny, after_two):
     np.testing.assert_array_equal(acting.normalizer.mean, state.statistics.mean[:29])
     networks = policy.make_networks(tiny, 29, 6)
     observation = state.statistics.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
-    actions = policy.act(networks, acting, observation)
+    actions = networks.act(acting, observation)
     assert actions.shape == (3, 6)
     assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
 
