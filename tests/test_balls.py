@@ -98,6 +98,7 @@ def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
     return np.array(pressed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("num_balls", "cone", "friction"),
     [
@@ -329,6 +330,7 @@ def test_noise_and_pushes_differ_between_the_balls():
     assert np.ptp(pushes[pushed[:, 0]][:, 0] - pushes[pushed[:, 0]][:, 1]) > 0.5
 
 
+@pytest.mark.slow
 def test_c_moves_several_balls_as_the_engine_does():
     """With a push, and with the forces of the air in each physics step."""
     drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}

@@ -83,6 +83,7 @@ def test_neighbours_and_the_start_pose_are_no_contacts(angle: float) -> None:
     assert arm_contacts(config, recording((HOME + angle)[None])) == []
 
 
+@pytest.mark.slow
 def test_eval_counts_them(capsys: pytest.CaptureFixture, tmp_path) -> None:
     file = tmp_path / "results.json"
     with pytest.raises(SystemExit):

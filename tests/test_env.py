@@ -670,6 +670,7 @@ def test_fault_leaves_the_rest_of_the_batch_alone(env):
 # Derivative
 
 
+@pytest.mark.slow
 def test_gradient_through_steps_with_a_contact_equals_finite_differences():
     """The derivative of the summed rewards of five steps, in which the ball hits the paddle, along
     a direction of the actions, against central differences of the fourth order."""

@@ -67,6 +67,7 @@ with SummaryWriter(logdir=str(run)) as log:
 """
 
 
+@pytest.mark.slow
 def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeypatch):
     """Every cell, with a short video: the video, a table of the two runs' results, curves."""
     nbformat, nbclient = need("nbformat"), need("nbclient")

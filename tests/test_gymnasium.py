@@ -421,6 +421,7 @@ def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
         env.reset()
 
 
+@pytest.mark.slow
 def test_async_environments_run_after_jax_ran_in_the_parent(tmp_path):
     """Gymnasium's processes start from a server by default; a fork would hang. The compiled
     programs are cached where the commands cache them."""

@@ -81,6 +81,7 @@ def test_gymnax_own_wrapper_logs_episodes(need, monkeypatch):
     np.testing.assert_allclose(info["returned_episode_returns"], sum(rewards), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_example_of_purejaxrl_trains():
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "purejaxrl.py"))["main"]
     rewards = np.array(main(num_envs=8, rollout=4, updates=5))

@@ -85,6 +85,7 @@ SLOPED = {
 WORLDS, STEPS = 3, 60
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
     """Each engine runs freely; here the damping of each control step is set in the C model."""

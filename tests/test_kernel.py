@@ -115,6 +115,7 @@ def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     dynamics._substeps.cache_clear()
 
 
+@pytest.mark.slow
 def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     """The kernel takes more inputs than coordinates and targets: all physics parameters of each
     environment."""
@@ -127,6 +128,7 @@ def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     assert np.all(np.abs(after.qvel - by_xla.qvel).max(axis=0) > 1e-3)
 
 
+@pytest.mark.slow
 def test_several_batches_and_shared_targets(env, in_kernel):
     """Batches of batches, as with several seeds, and an argument that all environments share."""
     physics, ctrl = moving(env, BATCH)
@@ -170,6 +172,7 @@ for program, args, axes in (
 """
 
 
+@pytest.mark.slow
 def test_devices_keep_their_shard(monkeypatch):
     """Eight devices that share the batch of one seed or of two exchange nothing."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")

@@ -232,6 +232,7 @@ def test_shares_of_the_limits(smooth: bool, rate: int) -> None:
     assert limit_shares(config, recorded(late), rate)[0].share == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_eval_shows_the_shares(tmp_path, capsys: pytest.CaptureFixture) -> None:
     """A random policy wishes more than the limits allow, and stays within them."""
     limited = {"robot": {"limits": LIMITS}, "action": {"base": "target"}, "action_scale": 0.1}

@@ -176,6 +176,7 @@ def test_private_names_of_other_libraries_are_listed() -> None:
     assert all(name.rpartition(".")[2] in sources for name in listed)
 
 
+@pytest.mark.slow
 def test_a_new_reward_term_is_one_entry_in_one_file(tmp_path: Path) -> None:
     """In a copy of the package, one more term is added to those of bouncing. The config, the
     metrics, the reward, the viewer's bars and the report's figure then have it."""
@@ -341,6 +342,7 @@ def test_example_of_a_page_runs(page, number, printed, needs, request, capsys):
     assert capsys.readouterr().out.startswith(printed)
 
 
+@pytest.mark.slow
 def test_imports_beside_a_compilation_leave_the_environment_alone() -> None:
     """A new environment variable moves the environment in memory, and on a GPU a compilation
     starts processes with it at any moment."""

@@ -218,6 +218,7 @@ def num_operations(jaxpr) -> int:
     return len(jaxpr.eqns) + sum(num_operations(getattr(x, "jaxpr", x)) for x in inner)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", ("fused", pytest.param("mjx", marks=pytest.mark.separate_loops)))
 @pytest.mark.usefixtures("float64")
 def test_paddle_position_follows_its_parameter(mj_model, choice):
@@ -229,6 +230,7 @@ def test_paddle_position_follows_its_parameter(mj_model, choice):
     np.testing.assert_allclose(position, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_mjx_carries_activations_and_worlds(record_property):
@@ -343,6 +345,7 @@ def untrained(networks):
     return policies.Policy(init_normalizer(BounceBall().observation_size), params)
 
 
+@pytest.mark.slow
 def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
     """C agrees with the fused engine, also on the drag of a bouncing ball, and not all worlds equal
     the model's."""

@@ -271,6 +271,7 @@ def test_ten_substeps_are_ten_steps(mj_model, fused_step):
     assert max(difference(together, singly)) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
 def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):

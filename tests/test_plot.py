@@ -316,6 +316,7 @@ def test_images_have_the_format_of_their_suffix(runs: list[Path]) -> None:
     assert first == second
 
 
+@pytest.mark.slow
 def test_plot_of_one_run(trained: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "a/plots"
     plot_command.main([str(trained), "--out", str(out)])
@@ -400,6 +401,7 @@ def test_training_leaves_a_report(trained: Path) -> None:
     assert f"<h1>{met} of 5 results met</h1>" in page
 
 
+@pytest.mark.slow
 def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     other.write_text("mine")

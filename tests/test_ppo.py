@@ -454,6 +454,7 @@ def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
         assert [e.outvars[0].aval.dtype for e in products] == [jnp.bfloat16, jnp.float32]
 
 
+@pytest.mark.slow
 def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
     keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
     many_states = jax.jit(jax.vmap(trainer.init))(keys)
@@ -519,6 +520,7 @@ class FaultyBall(BounceBall):
         self.engine = self.engine._replace(step=step)
 
 
+@pytest.mark.slow
 def test_faults_do_not_harm_the_training(tiny):
     env = FaultyBall()
     trainer = ppo.make_trainer(tiny, env, env.config.episode_steps)

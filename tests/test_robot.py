@@ -606,6 +606,7 @@ def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     assert own.action_scale != 0.5
 
 
+@pytest.mark.slow
 def test_a_short_training_of_the_ur5e_rises(written) -> None:
     env = BounceBall(
         load_config(written["ur5e"]).env.model_copy(

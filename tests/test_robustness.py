@@ -299,6 +299,7 @@ def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
     return load_suite(path, env)
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
     policy, ppo, env = shipped
     conditions = three_conditions(tmp_path, env)

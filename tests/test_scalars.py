@@ -244,6 +244,7 @@ SPIN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", ({}, SPIN), ids=("plain", "spin"))
 def test_the_control_step_is_one_kernel(monkeypatch, terms):
     """Physics, task, reward, terminations, time-outs and resets, against the program without a

@@ -98,6 +98,7 @@ def run(source: Path, folder: Path, *args: str, code: int = 0) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_all_modules_import_without_bouncing(without_bouncing: Path, tmp_path: Path) -> None:
     script = """
 import importlib, pkgutil, bounce_mjx

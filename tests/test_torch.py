@@ -480,6 +480,7 @@ def test_gymnasium_records_the_statistics_of_the_vector_env(env):
     np.testing.assert_allclose(envs.length_queue, [length for _, length in expected])
 
 
+@pytest.mark.slow
 def test_the_ranges_of_the_randomisation_grow_over_the_warm_up():
     """Episodes of five steps, a warm-up of ten: the drag of the third episodes is drawn from the
     whole range."""

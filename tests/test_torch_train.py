@@ -120,6 +120,7 @@ def test_rsl_rls_runner_opens_the_model(run, library):
     np.testing.assert_array_equal(actor.mlp[0].weight.detach().numpy().T, kernel)
 
 
+@pytest.mark.slow
 def test_run_is_evaluated_without_torch(run, tmp_path):
     """The same command prints the same table, and the best checkpoint gives the same results
     again."""
@@ -209,6 +210,7 @@ def test_stopped_run_has_the_model_of_its_checkpoint(tmp_path, monkeypatch):
     assert [path.name for path in other.iterdir()] == ["config.yaml"]
 
 
+@pytest.mark.slow
 def test_a_seed_trains_as_if_alone_and_stays_diverged(run, library, tmp_path, monkeypatch, capfd):
     run_block = TorchTrainer.run
 

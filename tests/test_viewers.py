@@ -669,6 +669,7 @@ FOREIGN = (
 )
 
 
+@pytest.mark.slow
 def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
     """Every value that a control does not offer is refused before it is stored, so that the page
     sends it to no other client, and nothing is printed."""
@@ -939,6 +940,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     training.wait()
 
 
+@pytest.mark.slow
 def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
     """The last line of a training names the command that shows its policy."""
     told, shown = [], []
