@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
+from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -28,16 +28,9 @@ from bounce_mjx.interrupt import interruptible
 _SILENT_SECONDS = 10.0
 
 
-class EvalCommand(WorldCommand):
+class EvalCommand(WorldCommand, OneActorCommand):
     """Measures the results of a trained policy."""
 
-    checkpoint: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
-    ] = None
-    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
-    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
-    the package if there is no run."""
     episodes: Count = DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = DEFAULT_SEED

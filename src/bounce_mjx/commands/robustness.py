@@ -3,13 +3,11 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import ActorCommand
+from bounce_mjx.commands.run_options import OneActorCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -25,16 +23,9 @@ from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import POLICIES, resource_path
 
 
-class RobustnessCommand(ActorCommand):
+class RobustnessCommand(OneActorCommand):
     """Measures the results of a trained policy in perturbed worlds."""
 
-    checkpoint: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
-    ] = None
-    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
-    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
-    the package if there is no run."""
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed

@@ -91,6 +91,18 @@ class ActorCommand(RunCommand):
         return config.model_copy(update={"env": observing(config.env)})
 
 
+class OneActorCommand(ActorCommand):
+    """A command line about one policy or the mirror law."""
+
+    checkpoint: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
+    ] = None
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
+    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
+    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
+    the package if there is no run."""
+
+
 class WorldCommand(ActorCommand):
     """A command line that simulates in the world of the training or in another one."""
 
