@@ -245,7 +245,7 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     ]
     used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
     few = np.zeros_like(search.training)
-    few[used[:: max(len(used) // _FEW, 1)]] = 1.0
+    few[_some(used)] = 1.0
     for kept in (4, 1):
         found = [search.run(["flight", "bounce"], t, 1.0, 2, ball_state, few) for t in tried]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
@@ -307,12 +307,16 @@ def _flown(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
     return fit._replace(vector=vector, starts=starts)
 
 
+def _some(windows: np.ndarray) -> np.ndarray:
+    """About `_FEW` of the windows, evenly over the log."""
+    return windows[:: max(len(windows) // _FEW, 1)]
+
+
 def _costs(
     problem: Problem, vectors: np.ndarray, starts: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Half the sum of squared residuals [C, K] of candidates in some of the windows that count."""
-    counts = np.flatnonzero(np.any(weights > 0.0, axis=1))
-    counts = counts[:: max(len(counts) // _FEW, 1)]
+    counts = _some(np.flatnonzero(np.any(weights > 0.0, axis=1)))
     used = np.zeros((len(vectors), len(weights)), bool)
     used[:, counts] = True
     residuals = problem.residuals(problem.simulate(vectors, starts, used))

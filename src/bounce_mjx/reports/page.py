@@ -30,14 +30,13 @@ from bounce_mjx.reports.figures import (
 )
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
-from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
+from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_atomically
-from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.folders import POLICY_OF_TASK, Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task.shown import Recording
-from bounce_mjx.tasks.registry import DEFAULT
 
 REPORT_FILE = "report.html"
 REPLAY_FILE = "replay.html"
@@ -94,9 +93,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
 def _reference(config: TrainConfig) -> dict[str, float]:
     """Figures of the policy that comes with the package for a training's task on the project's own
     arm, by the tag of the curve of the same quantity."""
-    name = {DEFAULT: PRETRAINED, **dict(zip(TASK_POLICIES, TASK_POLICIES, strict=True))}.get(
-        config.task
-    )
+    name = POLICY_OF_TASK.get(config.task)
     if name is None or config.env.mjcf is not None:
         return {}
     path = resource_path(f"{POLICIES[name]}/results.json")

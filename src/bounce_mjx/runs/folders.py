@@ -49,6 +49,8 @@ from bounce_mjx.runs.task import copy_task
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 CheckpointName = Literal["latest", "best"]
+POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
+"""The policy that comes with the package for a task."""
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
@@ -241,8 +243,7 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
     try:
         run = named_run(path, log_dir)
     except UserError:
-        policies = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
-        folders = {runs_folder(find_task(task)): policy for task, policy in policies.items()}
+        folders = {runs_folder(find_task(t)): policy for t, policy in POLICY_OF_TASK.items()}
         if path is not None or log_dir not in folders:
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
