@@ -5,11 +5,13 @@
 
 Each program trains the same environments per seed on all its devices together, so that the global
 batch is equal. The programs take turns: a turn is one compiled block of each, and the table has the
-median of the blocks and of each turn's ratio to the first program. `--profile` also says, from one
-more block of each program, how long a device computes, exchanges, and waits.
+median of the blocks and of each turn's ratio to the first program with the same environments.
+`--profile` also says, from one more block of each program, how long a device computes, exchanges,
+and waits.
 """
 
 import concurrent.futures
+import functools
 import itertools
 import statistics
 import sys
@@ -50,8 +52,8 @@ class Command(StrictModel):
     """Numbers of environments of one seed, on all devices together. The default is the preset's."""
     num_minibatches: Count | None = None
     """Minibatches in an epoch. The default is the preset's."""
-    iterations: Count = 8
-    """Iterations in one measured block."""
+    iterations: Count | None = None
+    """Iterations in one measured block. The default is a block of the training."""
     turns: Count = 12
     """Turns."""
     profile: bool = False
@@ -69,28 +71,27 @@ def configs(command: Command) -> list[TrainConfig]:
     ):
         minibatches = command.num_minibatches or preset.ppo.num_minibatches
         ppo = preset.ppo.model_copy(update={"num_envs": num_envs, "num_minibatches": minibatches})
-        update = {
-            "ppo": ppo,
-            "num_seeds": num_seeds,
-            "num_devices": num_devices,
-            "block_steps": command.iterations * ppo.batch_steps,
-        }
+        update = {"ppo": ppo, "num_seeds": num_seeds, "num_devices": num_devices}
+        if command.iterations is not None:
+            update["block_steps"] = command.iterations * ppo.batch_steps
         made.append(preset.model_copy(update=update))
     return made
 
 
-def program(config: TrainConfig) -> Callable[[], None]:
-    """Compiles a training and runs its first block; the function runs one more block."""
-    trainer = PPOTrainer(config, Env(config.env))
+def programs(configs: list[TrainConfig]) -> list[Callable[[], None]]:
+    """Compiles trainings and runs the first block of each; each function runs one more block."""
+    trainers = [PPOTrainer(config, Env(config.env)) for config in configs]
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        trainer.compile(pool)
-    trainer.start()
+        for trainer in trainers:
+            trainer.compile(pool)
 
-    def block() -> None:
+    def block(config: TrainConfig, trainer: PPOTrainer) -> None:
         trainer.run(iterations_per_block(config), lambda: False)
 
-    block()
-    return block
+    for config, trainer in zip(configs, trainers, strict=True):
+        trainer.start()
+        block(config, trainer)
+    return [functools.partial(block, *pair) for pair in zip(configs, trainers, strict=True)]
 
 
 def seconds_of(block: Callable[[], None]) -> float:
@@ -136,20 +137,23 @@ def covered(intervals: Iterable[tuple[float, float]]) -> float:
 def measure(command: Command) -> list[dict]:
     """The blocks of every program, in turns."""
     measured = configs(command)
-    blocks = [program(config) for config in measured]
+    blocks = programs(measured)
     turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]
-    records = []
-    for config, block, seconds in zip(measured, blocks, zip(*turns, strict=True), strict=True):
-        steps = config.num_seeds * config.block_steps
-        first = measured[0].num_seeds * measured[0].block_steps
-        ratios = [(steps / s) / (first / turn[0]) for s, turn in zip(seconds, turns, strict=True)]
+    speeds = [
+        [steps_of(config) / seconds for seconds in column]
+        for config, column in zip(measured, zip(*turns, strict=True), strict=True)
+    ]
+    records, first = [], {}
+    for config, block, speed in zip(measured, blocks, speeds, strict=True):
+        reference = first.setdefault(config.ppo.num_envs, speed)
+        ratios = [own / other for own, other in zip(speed, reference, strict=True)]
         records.append(
             {
                 "num_seeds": config.num_seeds,
                 "num_devices": config.num_devices,
                 "num_envs": config.ppo.num_envs,
-                "seconds": seconds,
-                "steps_per_second": steps / statistics.median(seconds),
+                "seconds": statistics.median(steps_of(config) / own for own in speed),
+                "steps_per_second": statistics.median(speed),
                 "ratio": statistics.median(ratios),
                 "ratios": ratios,
             }
@@ -158,8 +162,13 @@ def measure(command: Command) -> list[dict]:
     return records
 
 
+def steps_of(config: TrainConfig) -> int:
+    """Steps of all seeds in one block."""
+    return config.num_seeds * iterations_per_block(config) * config.ppo.batch_steps
+
+
 def table(records: list[dict]) -> str:
-    """Milliseconds per block and steps per second, absolute and relative to the first row."""
+    """Milliseconds per block, and steps per second with their ratio to the first program's."""
     header = [
         "seeds",
         "devices",
@@ -175,7 +184,7 @@ def table(records: list[dict]) -> str:
             str(r["num_seeds"]),
             str(r["num_devices"]),
             f"{r['num_envs']:,}",
-            f"{1e3 * statistics.median(r['seconds']):.1f}",
+            f"{1e3 * r['seconds']:.1f}",
             f"{r['steps_per_second'] / 1e6:.3g}",
             f"{r['ratio']:.2f}",
             f"{min(r['ratios']):.2f} to {max(r['ratios']):.2f}",
