@@ -164,9 +164,15 @@ class MirrorLaw:
 
     def _joints(self, paddle: jax.Array) -> jax.Array:
         """Inverse kinematics: the joint angles [n] nearest to the home pose, rad."""
-        angles = jnp.asarray(self._home, paddle.dtype)
-        for _ in range(_ITERATIONS):
-            # A sum, as XLA aborts on a small product with its option of `join_loops`.
-            step = self._inverse * (paddle - self._pose(angles))
-            angles = angles + jnp.sum(step, axis=1)
-        return angles
+        home = tuple(jnp.asarray(angle, paddle.dtype) for angle in self._home)
+
+        def improve(_: int, angles: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            missing = paddle - self._pose(jnp.stack(angles))
+            return tuple(
+                angle + sum(float(share) * missing[k] for k, share in enumerate(row))
+                for angle, row in zip(angles, self._inverse, strict=True)
+            )
+
+        # One scalar per joint, and a loop that stays one: on a CPU, XLA would compute the whole
+        # pose again for each entry of a sum over an axis, in each of the steps before it.
+        return jnp.stack(jax.lax.fori_loop(0, _ITERATIONS, improve, home))
