@@ -78,29 +78,30 @@ def configs(command: Command) -> list[TrainConfig]:
     return made
 
 
-def programs(configs: list[TrainConfig]) -> list[Callable[[], None]]:
+def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
     """Compiles trainings and runs the first block of each; each function runs one more block."""
     trainers = [PPOTrainer(config, Env(config.env)) for config in configs]
     with concurrent.futures.ThreadPoolExecutor() as pool:
         for trainer in trainers:
             trainer.compile(pool)
 
-    def block(config: TrainConfig, trainer: PPOTrainer) -> None:
-        trainer.run(iterations_per_block(config), lambda: False)
-
-    for config, trainer in zip(configs, trainers, strict=True):
+    blocks = [
+        functools.partial(trainer.run, iterations_per_block(config), lambda: False)
+        for config, trainer in zip(configs, trainers, strict=True)
+    ]
+    for trainer, block in zip(trainers, blocks, strict=True):
         trainer.start()
-        block(config, trainer)
-    return [functools.partial(block, *pair) for pair in zip(configs, trainers, strict=True)]
+        block()
+    return blocks
 
 
-def seconds_of(block: Callable[[], None]) -> float:
+def seconds_of(block: Callable[[], object]) -> float:
     started = time.perf_counter()
     block()
     return time.perf_counter() - started
 
 
-def profile(block: Callable[[], None]) -> dict[str, float]:
+def profile(block: Callable[[], object]) -> dict[str, float]:
     """Milliseconds of a block in which the first device computes, only exchanges, and does neither
     (it waits for the processor or for the other devices' start)."""
     with tempfile.TemporaryDirectory() as folder:
@@ -139,21 +140,18 @@ def measure(command: Command) -> list[dict]:
     measured = configs(command)
     blocks = programs(measured)
     turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]
-    speeds = [
-        [steps_of(config) / seconds for seconds in column]
-        for config, column in zip(measured, zip(*turns, strict=True), strict=True)
-    ]
     records, first = [], {}
-    for config, block, speed in zip(measured, blocks, speeds, strict=True):
-        reference = first.setdefault(config.ppo.num_envs, speed)
-        ratios = [own / other for own, other in zip(speed, reference, strict=True)]
+    for config, block, seconds in zip(measured, blocks, zip(*turns, strict=True), strict=True):
+        speeds = [steps_of(config) / s for s in seconds]
+        reference = first.setdefault(config.ppo.num_envs, speeds)
+        ratios = [own / other for own, other in zip(speeds, reference, strict=True)]
         records.append(
             {
                 "num_seeds": config.num_seeds,
                 "num_devices": config.num_devices,
                 "num_envs": config.ppo.num_envs,
-                "seconds": statistics.median(steps_of(config) / own for own in speed),
-                "steps_per_second": statistics.median(speed),
+                "seconds": seconds,
+                "steps_per_second": statistics.median(speeds),
                 "ratio": statistics.median(ratios),
                 "ratios": ratios,
             }
@@ -184,7 +182,7 @@ def table(records: list[dict]) -> str:
             str(r["num_seeds"]),
             str(r["num_devices"]),
             f"{r['num_envs']:,}",
-            f"{1e3 * r['seconds']:.1f}",
+            f"{1e3 * statistics.median(r['seconds']):.1f}",
             f"{r['steps_per_second'] / 1e6:.3g}",
             f"{r['ratio']:.2f}",
             f"{min(r['ratios']):.2f} to {max(r['ratios']):.2f}",

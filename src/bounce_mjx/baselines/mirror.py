@@ -174,5 +174,6 @@ class MirrorLaw:
             )
 
         # One scalar per joint, and a loop that stays one: on a CPU, XLA would compute the whole
-        # pose again for each entry of a sum over an axis, in each of the steps before it.
+        # pose again for each entry of a sum over an axis, in each of the steps before it. XLA
+        # aborts on a small product of matrices with its option of `join_loops`.
         return jnp.stack(jax.lax.fori_loop(0, _ITERATIONS, improve, home))
