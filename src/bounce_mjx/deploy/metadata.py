@@ -135,7 +135,7 @@ class Metadata(NamedTuple):
     default_joint_angles: tuple[float, ...]
     """Joint angles at the start of an episode, rad."""
     commands: dict[str, CommandRange]
-    """What is wished of the policy, by name."""
+    """The commands of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
     documents their units; missing terms were not randomised."""

@@ -255,7 +255,7 @@ class WorldConfig(StrictModel):
 
     @property
     def commands(self) -> dict[str, Command]:
-        """What is wished of the policy, by name; a task's config has its own."""
+        """The commands of the policy, by name; a task's config has its own."""
         return {}
 
     @property
