@@ -18,7 +18,7 @@ class Inputs(NamedTuple):
     reach: jax.Array
     """Height over the paddle that the ball's energy allows [], m."""
     target: jax.Array
-    """Wished height [], m."""
+    """Commanded height [], m."""
     distance: jax.Array
     """Horizontal distance of the ball from its start [], m."""
 
