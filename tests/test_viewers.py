@@ -935,7 +935,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     # A page that fails leaves the training alone.
     stop.set()
     wait_until(
-        lambda: "the page is not served (the end); the training continues" in printed.getvalue()
+        lambda: "the page is not served (the end); training continues" in printed.getvalue()
     )
     training.wait()
 

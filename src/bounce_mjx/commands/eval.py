@@ -68,12 +68,12 @@ def main(args: Sequence[str]) -> None:
     console = Console()
     checkpoint = command.choose(command.checkpoint, console)
     if command.nominal and command.world is not None:
-        raise UserError("--nominal and --world exclude each other; leave one out")
+        raise UserError("--nominal and --world cannot be combined; omit one")
     config = command.config_of(checkpoint)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError(
-            "the arm of this policy has no limits of its commands (env.robot.limits); leave "
-            "--limits out, or give a run with an arm that has them, such as --robot ur5e"
+            "the arm of this policy has no command limits (env.robot.limits); omit --limits, or "
+            "give a run with an arm that has them, such as --robot ur5e"
         )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))

@@ -60,7 +60,7 @@ def main(args: Sequence[str]) -> None:
     default = None if command.actions == "policy" else Path(MIRROR)
     if default and command.checkpoints:
         raise UserError(
-            "--actions mirror and checkpoints exclude each other; to show the mirror law beside a "
+            "--actions mirror and checkpoints cannot be combined; to show the mirror law next to a "
             "policy, give mirror as a checkpoint"
         )
     chosen = [command.choose(path, console) for path in command.checkpoints or (default,)]

@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:
-        raise UserError("--assumed is about a named world; give one with --world, or leave it out")
+        raise UserError("--assumed needs a named world; give one with --world, or leave it out")
     console = Console()
     checkpoint = command.choose(command.checkpoint, console)
     config = command.config_of(checkpoint)

@@ -189,7 +189,7 @@ def load_config(
     if named is not None and named.robot is not None:
         if robot is not None:
             raise UserError(
-                f"the world {world} is of the robot {named.robot}, and a robot is given too; leave "
+                f"the world {world} is for the robot {named.robot}, and a robot is given too; leave "
                 "--robot out"
             )
         robot = _robot_of(named, world)
@@ -221,7 +221,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
         files = {(arm.mjcf or Path()).name for arm in (own, env)}
         if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
             raise UserError(
-                f"the world {world} is of the robot {named.robot}, and the policy was trained with "
+                f"the world {world} is for the robot {named.robot}, and the policy was trained with "
                 "another arm or start pose; give a world without a robot, such as fast_servo"
             )
         values["robot"] = merged(values["robot"], own.robot.model_dump(exclude_unset=True))

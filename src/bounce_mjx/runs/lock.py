@@ -37,7 +37,7 @@ def lock_run(run: Path) -> Iterator[None]:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise UserError(
-                    f"{run} is in use by another training; wait for its end, or stop it with "
+                    f"{run} is in use by another training process; wait until it ends, or stop it with "
                     "Ctrl-C or SIGTERM, and resume"
                 ) from error
         yield
