@@ -36,7 +36,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Whether the worlds are the model's own; else each episode draws one, as in the training."""
+    """Whether the worlds are the model's own; else each episode draws one, as in training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
     episodes."""
@@ -44,7 +44,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
     1 kHz use, in 32 episodes."""
     physics: Physics = "config"
-    """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
 

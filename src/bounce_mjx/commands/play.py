@@ -39,7 +39,7 @@ class PlayCommand(WorldCommand):
     """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
     mirror."""
     physics: Literal["config", "fused", "mjx"] = "config"
-    """Physics engine; config is the engine of the training."""
+    """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
