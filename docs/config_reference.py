@@ -14,9 +14,9 @@ from bounce_mjx.tasks.registry import DEFAULT, find_task
 _HEAD = """# Config reference
 
 Every setting of a training run for the task bounce; [other tasks](write-a-task.md) have other
-keys in `env`. In a YAML file (`--config FILE`, see [training](training.md)) the keys are nested groups.
-A preset overrides the defaults, a robot (`--robot`) the preset, and a command-line flag all of them.
-Unknown keys and values out of range are refused.
+keys in `env`. In a YAML file (`--config FILE`, see [training](training.md)) the keys are nested
+groups. A preset overrides the defaults, a robot (`--robot`) the preset, and a command-line flag all
+of them. Unknown keys and values out of range are refused.
 
 Each section lists the keys of one group. A key's flag is its full name without `env.` or `ppo.`
 and with hyphens: `--num-envs` for `ppo.num_envs`, and `--reward.height.weight` for
@@ -35,8 +35,8 @@ These rules apply across keys:
 
 - `env.control_dt` is a multiple of `env.physics_dt`, and `env.episode_seconds` is at least as long;
 - `env.target_height_range` is 0 < low ≤ high;
-- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as long
-  as an episode;
+- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as
+  long as an episode;
 - `ppo.min_learning_rate` is at most the two upper limits;
 - `ppo.critic_metrics` names metrics of the environment.
 """

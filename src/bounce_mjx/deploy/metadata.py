@@ -211,7 +211,9 @@ def _check(metadata: Metadata) -> None:
             raise ValueError(f"its {name} do not have one entry for each of the {count} joints")
     for name, values in (metadata.limits or CommandLimits((), (), None))._asdict().items():
         if values and len(values) != count:
-            raise ValueError(f"its {name} limits do not have one entry for each of the {count} joints")
+            raise ValueError(
+                f"its {name} limits do not have one entry for each of the {count} joints"
+            )
     if metadata.limits is not None and metadata.max_lead is None:
         raise ValueError("its limits have no max_lead")
     if taken := metadata.commands.keys() & UNITS.keys():

@@ -63,8 +63,8 @@ class TrainConfig(StrictModel):
     seed: NonNegativeInt = 0
     """Seed of the run."""
     num_seeds: Count = 1
-    """Independent training runs in one program, with the seeds `seed`, `seed` + 1, ... and a folder for
-    each."""
+    """Independent training runs in one program, with the seeds `seed`, `seed` + 1, ... and a folder
+    for each."""
     num_devices: Count | None = None
     """Devices that share the environments (with several seeds: the seeds). The default is one, or
     all on several hosts. It affects results only by rounding."""
@@ -189,8 +189,8 @@ def load_config(
     if named is not None and named.robot is not None:
         if robot is not None:
             raise UserError(
-                f"the world {world} is for the robot {named.robot}, and a robot is given too; leave "
-                "--robot out"
+                f"the world {world} is for the robot {named.robot}, and a robot is given too; "
+                "leave --robot out"
             )
         robot = _robot_of(named, world)
     if robot is not None:
@@ -221,8 +221,8 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
         files = {(arm.mjcf or Path()).name for arm in (own, env)}
         if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
             raise UserError(
-                f"the world {world} is for the robot {named.robot}, and the policy was trained with "
-                "another arm or start pose; give a world without a robot, such as fast_servo"
+                f"the world {world} is for the robot {named.robot}, and the policy was trained "
+                "with another arm or start pose; give a world without a robot, such as fast_servo"
             )
         values["robot"] = merged(values["robot"], own.robot.model_dump(exclude_unset=True))
     changed = validate(type(env), named.applied(values), f"the world {path}")

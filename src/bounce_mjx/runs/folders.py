@@ -319,6 +319,6 @@ def _checkpoint_in(run: Path, named: Path, *folders: Path) -> Checkpoint:
         if stored := stored_checkpoints(folder.absolute()):
             return Checkpoint(run, stored[max(stored)], max(stored))
     raise UserError(
-        f"{named} has no checkpoint, because the first one follows the first evaluation; train longer "
-        "or give another run's folder"
+        f"{named} has no checkpoint, because the first one follows the first evaluation; train "
+        "longer or give another run's folder"
     )

@@ -75,8 +75,8 @@ class ObservationConfig(StrictModel):
     """Source of ball_position: the last camera image, or the estimate of the Kalman filter
     (env.estimator)."""
     velocity: Literal["measured", "differences", "filter"] = "measured"
-    """Source of ball_velocity: a sensor, the differences between camera images, or the estimate of the
-    Kalman filter (env.estimator)."""
+    """Source of ball_velocity: a sensor, the differences between camera images, or the estimate of
+    the Kalman filter (env.estimator)."""
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
