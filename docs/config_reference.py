@@ -13,12 +13,12 @@ from bounce_mjx.tasks.registry import DEFAULT, find_task
 
 _HEAD = """# Config reference
 
-Every setting of a training run of the task bounce; [another task](write-a-task.md) has other
-keys in `env`. A YAML file (`--config FILE`, see [training](training.md)) holds
-the keys as nested groups. A preset overrides the defaults, a robot (`--robot`) the preset, and a
-flag of the command line all of them. Unknown keys and values out of range are refused.
+Every setting of a training run for the task bounce; [other tasks](write-a-task.md) have other
+keys in `env`. In a YAML file (`--config FILE`, see [training](training.md)) the keys are nested
+groups. A preset overrides the defaults, a robot (`--robot`) the preset, and a command-line flag all
+of them. Unknown keys and values out of range are refused.
 
-Each section has the keys of one group. The flag of a key is its full name without `env.` or `ppo.`
+Each section lists the keys of one group. A key's flag is its full name without `env.` or `ppo.`
 and with hyphens: `--num-envs` for `ppo.num_envs`, and `--reward.height.weight` for
 `env.reward.height.weight`.
 
@@ -31,13 +31,13 @@ This page is generated from the types of the settings (`TrainConfig` in
 
     python docs/config_reference.py > docs/config.md
 
-These rules concern several keys:
+These rules apply across keys:
 
 - `env.control_dt` is a multiple of `env.physics_dt`, and `env.episode_seconds` is at least as long;
 - `env.target_height_range` is 0 < low ≤ high;
-- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is no longer
-  than an episode;
-- `ppo.min_learning_rate` is no higher than the two upper limits;
+- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as
+  long as an episode;
+- `ppo.min_learning_rate` is at most the two upper limits;
 - `ppo.critic_metrics` names metrics of the environment.
 """
 
@@ -75,7 +75,7 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         text = " ".join((field.description or "").split())
         units = _UNIT.findall(text)
         kind = "" if "enum" in plain else _type(plain)
-        value = " ".join(part for part in (kind, _range(plain)) if part)
+        value = " ".join(part for part in (kind, _range(plain)) if part).replace(" ,", ",")
         value += f" ({units[-1]})" if units else ""
         cells = f"`{name}`", value, _default(plain.get("default")), text
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
@@ -97,8 +97,9 @@ def _type(plain: dict[str, Any]) -> str:
         return "path"
     if plain["type"] == "array":
         items = plain.get("prefixItems")
-        one = _type(items[0] if items else plain["items"])
-        return f"{len(items)} of {one}" if items else f"list of {one}"
+        first, *rest = _type(items[0] if items else plain["items"]).split(" or ")
+        each = " or ".join((f"{first}s", *rest))
+        return f"{len(items)} {each}" if items else f"list of {each}"
     names = {"integer": "whole number", "string": "word", "boolean": "switch", "null": "nothing"}
     return names.get(plain["type"], plain["type"])
 
@@ -130,7 +131,7 @@ def _range(plain: dict[str, Any]) -> str:
         items = plain.get("prefixItems")
         each = _range(items[0] if items else plain["items"])
         least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
-        return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
+        return "".join(f", {text}" for text in (least, f"each {each}" if each else "") if text)
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
     return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")

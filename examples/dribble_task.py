@@ -18,13 +18,13 @@ class Inputs(NamedTuple):
     reach: jax.Array
     """Height over the paddle that the ball's energy allows [], m."""
     target: jax.Array
-    """Wished height [], m."""
+    """Commanded height [], m."""
     distance: jax.Array
     """Horizontal distance of the ball from its start [], m."""
 
 
 class ApexReward(task.RewardTerm):
-    """Apex: the ball's energy is that of a bounce to the wished height."""
+    """Apex: the ball's energy is that of a bounce to the commanded height."""
 
     weight: float = 4.0
     """Weight of the term."""
@@ -55,10 +55,10 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """The world's quantities, and the wished apex."""
+    """The world's quantities, and the commanded apex."""
 
     apex: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
-    """Wished height of the apexes over the paddle."""
+    """Commanded height of the apexes above the paddle."""
 
 
 class Config(task.WorldConfig):
@@ -67,7 +67,7 @@ class Config(task.WorldConfig):
     ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.25)
     """Ball position at a reset, before noise, m."""
     apex_range: tuple[float, float] = (0.065, 0.085)
-    """Range of the wished height of the apexes over the paddle, m."""
+    """Range of the commanded apex height above the paddle, m."""
     observation: Observation = Observation()
     """The quantities that the policy sees."""
     reward: Rewards = Rewards()

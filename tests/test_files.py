@@ -72,7 +72,7 @@ def test_a_private_folder_is_for_its_user_alone(tmp_path: Path, monkeypatch) -> 
         with pytest.raises(OSError, match="it is a link or a file"):
             private_folder(path)
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
-    with pytest.raises(OSError, match="it is another user's"):
+    with pytest.raises(OSError, match="it belongs to another user"):
         private_folder(folder)
     assert folder.stat().st_mode & 0o777 == 0o755
 

@@ -246,4 +246,4 @@ def test_eval_shows_the_shares(tmp_path, capsys: pytest.CaptureFixture) -> None:
     assert max(shares.values()) == pytest.approx(1.0, abs=1e-4)
     with pytest.raises(SystemExit):
         main(["eval", "pretrained", "--limits"])
-    assert "has no limits of its commands" in " ".join(capsys.readouterr().err.split())
+    assert "has no command limits" in " ".join(capsys.readouterr().err.split())

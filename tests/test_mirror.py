@@ -81,7 +81,7 @@ def test_the_law_keeps_the_ball_up(env: Env) -> None:
         (eval_command.main, "pretrained --robot ur5e", "give mirror"),
         (eval_command.main, "mirror --task catch", "target_height"),
         (eval_command.main, "mirror --robot nope", "no robot is named nope"),
-        (play.main, "robust --actions mirror --html a.html", "exclude each other"),
+        (play.main, "robust --actions mirror --html a.html", "cannot be combined"),
     ],
 )
 def test_a_mistake_is_one_sentence(main, flags: str, word: str, capsys) -> None:

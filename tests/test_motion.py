@@ -86,7 +86,7 @@ def test_the_file_holds_the_limits() -> None:
     entries = to_entries(metadata)
     assert from_entries(entries) == metadata
     assert from_entries({k: v for k, v in entries.items() if k != "limits"}).limits is None
-    with pytest.raises(ValueError, match="limits of the velocity are not of 6 joints"):
+    with pytest.raises(ValueError, match="velocity limits do not have one entry for each of the 6"):
         wrong = metadata._replace(limits=CommandLimits((1.0,) * 5, (1.0,) * 6, None))
         from_entries(to_entries(wrong))
 
@@ -173,7 +173,7 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
     arm.until("ready", 20)
     arm.supervisor.start()
     arm.until("stopped", 50)
-    assert "outside of the box" in arm.supervisor.reason
+    assert "outside the box" in arm.supervisor.reason
     with pytest.raises(UserError, match="the box is"):
         policy.supervise(1000, box=(high, low))
 

@@ -431,7 +431,7 @@ def test_a_run_in_use_is_not_resumed(run: Path, capfd) -> None:
         resume(run, "--total-steps", str(STEPS))
     assert exit_info.value.code == 2
     assert re.fullmatch(
-        rf"error: {run} is in use by another training; .+\n", capfd.readouterr().err
+        rf"error: {run} is in use by another training process; .+\n", capfd.readouterr().err
     )
     assert contents(run) == before
 
@@ -767,11 +767,11 @@ def tmpfs(folder: Path) -> Iterator[None]:
 
 
 def finish_once_there_is_room(training: Job, make_room: Callable[[], None], reason: str) -> None:
-    training.wait_until_said("the training continues")
+    training.wait_until_said("training continues")
     training.wait_until_said("it stays in memory")
     make_room()
     assert training.wait() == 0, training.said
-    for sentence in ("the training continues", "it stays in memory", "the state is saved again"):
+    for sentence in ("training continues", "it stays in memory", "the state is saved again"):
         assert training.said.count(sentence) == 1
     assert f"cannot be written ({reason})" in training.said
     assert "Traceback" not in training.said

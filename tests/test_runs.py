@@ -129,7 +129,7 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     assert capsys.readouterr().out.splitlines() == [
         f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)",
         f"an older run met all its results: {runs}/2026-01-01",
-        f"a newer run holds no checkpoint yet: {runs}/2026-01-03",
+        f"a newer run has no checkpoint yet: {runs}/2026-01-03",
     ]
 
 
@@ -160,7 +160,7 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
 
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
     for find in (latest_checkpoint, best_checkpoint, find_checkpoint):
-        with pytest.raises(UserError, match="2026-01-03 holds no checkpoint, as the first one"):
+        with pytest.raises(UserError, match="2026-01-03 has no checkpoint, because the first"):
             find(runs / "2026-01-03")
 
 

@@ -934,9 +934,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     assert [line for line in client.lines if line in titles] == list(titles)
     # A page that fails leaves the training alone.
     stop.set()
-    wait_until(
-        lambda: "the page is not served (the end); the training continues" in printed.getvalue()
-    )
+    wait_until(lambda: "the page is not served (the end); training continues" in printed.getvalue())
     training.wait()
 
 

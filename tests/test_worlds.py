@@ -124,7 +124,7 @@ def test_robustness_measures_twice_the_assumed_alone(tmp_path, capsys) -> None:
     run = make_run(tmp_path / "run", {"episode_seconds": 0.05})
     with pytest.raises(SystemExit):
         main(["robustness", str(run), "--assumed"])
-    assert "--assumed is about a named world" in capsys.readouterr().err
+    assert "--assumed needs a named world" in capsys.readouterr().err
     world = ["--world", str(written(tmp_path)), "--assumed", "--episodes", "2"]
     with pytest.raises(SystemExit):
         main(["robustness", str(run), *world, "--out", str(tmp_path / "out")])
@@ -168,4 +168,4 @@ def test_nominal_and_a_world_exclude_each_other(capsys: pytest.CaptureFixture) -
     with pytest.raises(SystemExit) as left:
         main(["eval", "pretrained", "--nominal", "--world", "fast_servo"])
     assert left.value.code == 2
-    assert "exclude each other" in capsys.readouterr().err
+    assert "cannot be combined" in capsys.readouterr().err

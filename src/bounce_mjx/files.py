@@ -64,6 +64,6 @@ def private_folder(path: Path) -> Path:
         raise NotADirectoryError(errno.ENOTDIR, "it is a link or a file", str(path))
     # Windows has no such numbers; there, only the user can open a folder under the home.
     if hasattr(os, "getuid") and status.st_uid != os.getuid():
-        raise PermissionError(errno.EPERM, "it is another user's", str(path))
+        raise PermissionError(errno.EPERM, "it belongs to another user", str(path))
     path.chmod(0o700)
     return path

@@ -34,7 +34,7 @@ class BenchmarkCommand(ActorCommand):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     physics: Physics = "config"
-    """Physics engine of the conditions; config is the engine of the training."""
+    """Physics engine of the conditions; config is the engine used in training."""
     out: Path = Path("benchmark")
     """Folder for benchmark.json, benchmark.md and benchmark.html."""
 

@@ -36,7 +36,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Whether the worlds are the model's own; else each episode draws one, as in the training."""
+    """Whether the worlds are the model's own; else each episode draws one, as in training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
     episodes."""
@@ -44,7 +44,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
     1 kHz use, in 32 episodes."""
     physics: Physics = "config"
-    """Physics engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """File to write the results to."""
 
@@ -68,12 +68,12 @@ def main(args: Sequence[str]) -> None:
     console = Console()
     checkpoint = command.choose(command.checkpoint, console)
     if command.nominal and command.world is not None:
-        raise UserError("--nominal and --world exclude each other; leave one out")
+        raise UserError("--nominal and --world cannot be combined; omit one")
     config = command.config_of(checkpoint)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError(
-            "the arm of this policy has no limits of its commands (env.robot.limits); leave "
-            "--limits out, or give a run with an arm that has them, such as --robot ur5e"
+            "the arm of this policy has no command limits (env.robot.limits); omit --limits, or "
+            "give a run with an arm that has them, such as --robot ur5e"
         )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))

@@ -39,7 +39,7 @@ class PlayCommand(WorldCommand):
     """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
     mirror."""
     physics: Literal["config", "fused", "mjx"] = "config"
-    """Physics engine; config is the engine of the training."""
+    """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
@@ -60,7 +60,7 @@ def main(args: Sequence[str]) -> None:
     default = None if command.actions == "policy" else Path(MIRROR)
     if default and command.checkpoints:
         raise UserError(
-            "--actions mirror and checkpoints exclude each other; to show the mirror law beside a "
+            "--actions mirror and checkpoints cannot be combined; to show the mirror law next to a "
             "policy, give mirror as a checkpoint"
         )
     chosen = [command.choose(path, console) for path in command.checkpoints or (default,)]

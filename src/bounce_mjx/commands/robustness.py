@@ -40,7 +40,7 @@ class RobustnessCommand(OneActorCommand):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     physics: Physics = "config"
-    """Engine: mujoco is MuJoCo's C engine; config is the engine of the training."""
+    """Engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
     for a policy that comes with the package and for the mirror law."""
@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:
-        raise UserError("--assumed is about a named world; give one with --world, or leave it out")
+        raise UserError("--assumed needs a named world; give one with --world, or leave it out")
     console = Console()
     checkpoint = command.choose(command.checkpoint, console)
     config = command.config_of(checkpoint)

@@ -71,8 +71,8 @@ class ActorCommand(RunCommand):
             return MIRROR_LAW
         if self.robot is not None:
             raise UserError(
-                "--robot is of the mirror law, and a policy has the robot of its training; leave "
-                "it out, or give mirror in place of a checkpoint"
+                "--robot is for the mirror law, and a policy has the robot that it was trained "
+                "with; omit it, or give mirror instead of a checkpoint"
             )
         return choose_checkpoint(path, self.folder, console)
 

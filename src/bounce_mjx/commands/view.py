@@ -27,7 +27,7 @@ class ViewCommand(StrictModel):
     """random: uniform; zero: the servos hold their angles; mirror: the mirror law, a model-based
     controller."""
     task: str = DEFAULT
-    """Name of the task, or FILE.py:CLASS for one of your own."""
+    """Name of the task, or FILE.py:CLASS for your own."""
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""

@@ -135,7 +135,7 @@ class Metadata(NamedTuple):
     default_joint_angles: tuple[float, ...]
     """Joint angles at the start of an episode, rad."""
     commands: dict[str, CommandRange]
-    """What is wished of the policy, by name."""
+    """The commands of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
     documents their units; missing terms were not randomised."""
@@ -208,10 +208,12 @@ def _check(metadata: Metadata) -> None:
         "default_joint_angles",
     ):
         if len(getattr(metadata, name)) != count:
-            raise ValueError(f"its {name} are not of {count} joints")
+            raise ValueError(f"its {name} do not have one entry for each of the {count} joints")
     for name, values in (metadata.limits or CommandLimits((), (), None))._asdict().items():
         if values and len(values) != count:
-            raise ValueError(f"its limits of the {name} are not of {count} joints")
+            raise ValueError(
+                f"its {name} limits do not have one entry for each of the {count} joints"
+            )
     if metadata.limits is not None and metadata.max_lead is None:
         raise ValueError("its limits have no max_lead")
     if taken := metadata.commands.keys() & UNITS.keys():
@@ -219,12 +221,12 @@ def _check(metadata: Metadata) -> None:
     if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):
         raise ValueError("one of its joint_ranges ends below its start")
     if not metadata.chain or any(link.joint >= count for link in metadata.chain):
-        raise ValueError(f"its chain is not of {count} joints")
+        raise ValueError(f"its chain does not have {count} joints")
     units = [metadata.paddle_normal]
     units += [unit for link in metadata.chain for unit in (link.axis, link.quaternion)]
     if not all(math.isclose(math.hypot(*unit), 1.0, abs_tol=1e-3) for unit in units):
         raise ValueError(
-            "its chain or its paddle_normal holds a direction of another length than 1"
+            "its chain or its paddle_normal contains a direction whose length is not 1"
         )
     if metadata.max_lead is None and any(
         part.name == "servo_lead" for part in metadata.observation
@@ -233,4 +235,4 @@ def _check(metadata: Metadata) -> None:
     sources = {"ball_position": metadata.position, "ball_velocity": metadata.velocity}
     is_filtered = any(sources.get(part.name) == "filter" for part in metadata.observation)
     if is_filtered != (metadata.estimator is not None):
-        raise ValueError("its estimator does not fit to the sources of its observation")
+        raise ValueError("its estimator does not match the sources of its observation")

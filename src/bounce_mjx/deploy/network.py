@@ -83,7 +83,7 @@ class OnnxNetwork:
         is_kept = all(memory[name].shape == past.shape for name, past in self.memory.items())
         if not (is_kept and np.all(np.isfinite(action))):
             raise UserError(
-                "the network gives an action that is not finite, or a memory of another shape; "
+                "the network returned an action that is not finite, or memory of the wrong shape; "
                 "stop the robot"
             )
         self._is_first, self.memory = False, memory

@@ -61,7 +61,7 @@ class Recorder:
             raise UserError(f"the log {path} exists; choose another name") from error
         except OSError as error:
             raise UserError(
-                f"the log {path} cannot be made ({error.strerror}); choose another folder"
+                f"the log {path} cannot be created ({error.strerror}); choose another folder"
             ) from error
         self._file.write(",".join(columns(self._joints, self._commands)) + "\n")
         self._last: tuple[float, np.ndarray] | None = None

@@ -182,5 +182,5 @@ class Supervisor:
         paddle, _ = self._chain.paddle(self._policy.targets)
         if np.any(paddle < self._box[0]) or np.any(paddle > self._box[1]):
             place = ", ".join(f"{x:.3f}" for x in paddle)
-            return f"the command would bring the paddle to ({place}) m, outside of the box"
+            return f"the command would bring the paddle to ({place}) m, outside the box"
         return None

@@ -23,7 +23,7 @@ class PPOConfig(StrictModel):
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
     training_episode_seconds: Positive | None = None
-    """Time limit of the training's episodes, s; null for the environment's limit. With a shorter
+    """Time limit of training episodes, s; null for the environment's limit. With a shorter
     limit the training sees more resets and more drawn worlds; a time-out is bootstrapped and does
     not count as a termination."""
     num_epochs: Count = 4
@@ -35,7 +35,7 @@ class PPOConfig(StrictModel):
     min_learning_rate: Positive = 1e-5
     """Lower limit of the learning rate."""
     max_learning_rate: Positive = 3e-3
-    """Upper limit of the learning rate at the start of the training."""
+    """Upper limit of the learning rate at the start of training."""
     final_max_learning_rate: Positive = 1e-4
     """Upper limit of the learning rate from decay_steps on."""
     decay_steps: Steps = 20_000_000

@@ -55,19 +55,19 @@ class TrainConfig(StrictModel):
     """A training run: the task, the trainer, the length and the evaluations."""
 
     task: str = DEFAULT
-    """Name of the task, or FILE.py:CLASS for one of your own."""
+    """Name of the task, or FILE.py:CLASS for your own."""
     env: pydantic.SerializeAsAny[WorldConfig]
     """The world and the task."""
     ppo: PPOConfig = PPOConfig()
     """The trainer."""
     seed: NonNegativeInt = 0
-    """Seed of the whole training."""
+    """Seed of the run."""
     num_seeds: Count = 1
-    """Independent trainings in one program, with the seeds `seed`, `seed` + 1, ... and a folder for
-    each."""
+    """Independent training runs in one program, with the seeds `seed`, `seed` + 1, ... and a folder
+    for each."""
     num_devices: Count | None = None
     """Devices that share the environments (with several seeds: the seeds). The default is one, or
-    all on several hosts. It does not affect the training's result."""
+    all on several hosts. It affects results only by rounding."""
     total_steps: Steps = 50_000_000
     """Environment steps to train for, rounded to whole blocks, at least one."""
     block_steps: Steps = 1_000_000
@@ -79,14 +79,14 @@ class TrainConfig(StrictModel):
     screening_episodes: NonNegativeInt = 0
     """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
     eval_seed: NonNegativeInt = 10_000
-    """Seed of the evaluations during the training."""
+    """Seed of the evaluations during training."""
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin, so that 64 other episodes should meet
     them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
     with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
     steps of the first evaluation that meets all."""
     log_dir: PlainPath
-    """Folder in which the run makes its own, named by the time."""
+    """Folder in which the run creates its own, named by the time."""
 
     def __eq__(self, other: object) -> bool:
         """Equal settings are equal, whichever class of `train_config` has them."""
@@ -189,8 +189,8 @@ def load_config(
     if named is not None and named.robot is not None:
         if robot is not None:
             raise UserError(
-                f"the world {world} is of the robot {named.robot}, and a robot is given too; leave "
-                "--robot out"
+                f"the world {world} is for the robot {named.robot}, and a robot is given too; "
+                "leave --robot out"
             )
         robot = _robot_of(named, world)
     if robot is not None:
@@ -221,8 +221,8 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
         files = {(arm.mjcf or Path()).name for arm in (own, env)}
         if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
             raise UserError(
-                f"the world {world} is of the robot {named.robot}, and the policy was trained with "
-                "another arm or start pose; give a world without a robot, such as fast_servo"
+                f"the world {world} is for the robot {named.robot}, and the policy was trained "
+                "with another arm or start pose; give a world without a robot, such as fast_servo"
             )
         values["robot"] = merged(values["robot"], own.robot.model_dump(exclude_unset=True))
     changed = validate(type(env), named.applied(values), f"the world {path}")

@@ -268,7 +268,7 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
                     break
     newest = max(_runs(log_dir), key=_started)
     if newest != run:
-        yield f"a newer run holds no checkpoint yet: {newest}"
+        yield f"a newer run has no checkpoint yet: {newest}"
 
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
@@ -319,6 +319,6 @@ def _checkpoint_in(run: Path, named: Path, *folders: Path) -> Checkpoint:
         if stored := stored_checkpoints(folder.absolute()):
             return Checkpoint(run, stored[max(stored)], max(stored))
     raise UserError(
-        f"{named} holds no checkpoint, as the first one follows the first evaluation; train longer "
-        "or give another run's folder"
+        f"{named} has no checkpoint, because the first one follows the first evaluation; train "
+        "longer or give another run's folder"
     )

@@ -37,8 +37,8 @@ def lock_run(run: Path) -> Iterator[None]:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise UserError(
-                    f"{run} is in use by another training; wait for its end, or stop it with "
-                    "Ctrl-C or SIGTERM, and resume"
+                    f"{run} is in use by another training process; wait until it ends, or stop it "
+                    "with Ctrl-C or SIGTERM, and resume"
                 ) from error
         yield
     finally:

@@ -117,7 +117,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     differing = differing_keys(run_config, config) - RESUMABLE_KEYS - {_MJCF_KEY}
     if differing:
         raise UserError(
-            f"the checkpoint {checkpoint.folder} is of another config than "
+            f"the checkpoint {checkpoint.folder} has a different config from "
             f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
             "restore that file or give another checkpoint"
         )

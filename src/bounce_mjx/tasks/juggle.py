@@ -73,7 +73,7 @@ class Config(task.WorldConfig):
         return {"target_height": task.Command(low, high, "m", least=self.home[2] + 0.1)}
 
     def columns(self, height: Any) -> list[tuple[Any, Any, Any]]:
-        """The wished apex of each ball, m."""
+        """The commanded apex of each ball, m."""
         (x, y, _), middle = self.home, 0.5 * (self.num_balls - 1)
         return [(x, y + self.spacing * (i - middle), height) for i in range(self.num_balls)]
 
@@ -89,7 +89,7 @@ class Juggle(task.Task):
     )
 
     def _columns(self, height: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The wished apexes [B, 3] (m) and the time of a whole flight to them [] (s)."""
+        """The commanded apexes [B, 3] (m) and the time of a whole flight to them [] (s)."""
         fall = task.safe_sqrt(2.0 * (height - self.config.home[2] - REST) / task.GRAVITY)
         columns = [jnp.stack([*map(jnp.asarray, top)]) for top in self.config.columns(height)]
         return jnp.stack(columns), 2.0 * fall

@@ -73,7 +73,7 @@ def read_training(
     task = early_flag(args, "--task")
     for given, flag in ((config_path, "--config"), (robot, "--robot"), (world, "--world")):
         if given and resume:
-            raise UserError(f"{flag} and --resume exclude each other; a resumed run has its config")
+            raise UserError(f"{flag} and --resume cannot be combined; a resumed run has its config")
     if resume:
         from bounce_mjx.runs.folders import find_run, named_run
         from bounce_mjx.runs.reading import RESUMABLE_KEYS

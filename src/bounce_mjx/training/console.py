@@ -111,7 +111,7 @@ class Reporter:
     def saving_problem(
         self,
         problem: str | None,
-        meanwhile: str = "the training continues, and saves at its next evaluation",
+        meanwhile: str = "training continues, and saves at its next evaluation",
     ) -> None:
         """Prints once why saving fails, and once when it works again."""
         sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"

@@ -475,7 +475,7 @@ class _Job:
         if latest is not None:
             kept = f"the last good checkpoint is {latest.folder}"
         raise UserError(
-            f"the training was stopped as it diverged: {self.members[-1].progress.fault}; {kept}; "
+            f"training stopped because it diverged: {self.members[-1].progress.fault}; {kept}; "
             "start a new run with a lower learning rate or other rewards"
         )
 

@@ -68,7 +68,7 @@ def _viewer(options: ViewerOptions, several: bool) -> str:
     is_recorded = options.video is not None or options.html is not None
     if is_recorded and options.viewer != "auto":
         raise UserError(
-            f"--viewer {options.viewer} and --video or --html exclude each other; give only one"
+            f"--viewer {options.viewer} and --video or --html cannot be combined; give only one"
         )
     if several and (options.viewer == "native" or options.video is not None):
         raise UserError("a window or a video shows one policy; show several with --viewer browser")

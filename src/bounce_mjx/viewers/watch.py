@@ -93,7 +93,7 @@ class TrainingPage:
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)
-            self._say(f"the page is not served ({reason}); the training continues without it")
+            self._say(f"the page is not served ({reason}); training continues without it")
 
     def _simulate(self) -> Simulation:
         config = self._config
@@ -155,8 +155,8 @@ class _Panel:
         self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
 
     def end(self) -> None:
-        """Says that the training has ended."""
-        self._progress.content = _text("<b>the training has ended</b>")
+        """Says that training has ended."""
+        self._progress.content = _text("<b>Training has ended</b>")
 
     def add_evaluation(self, steps: int, report: Report) -> None:
         """Shows the results of an evaluation."""

@@ -29,7 +29,7 @@ NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le
 
 
 class Command(NamedTuple):
-    """A number that is wished of the policy: drawn at a reset and after each interval
+    """A number that the policy has to follow: drawn at a reset and after each interval
     (`randomization.command_interval`), or set by a user."""
 
     low: float
@@ -255,7 +255,7 @@ class WorldConfig(StrictModel):
 
     @property
     def commands(self) -> dict[str, Command]:
-        """What is wished of the policy, by name; a task's config has its own."""
+        """The commands of the policy, by name; a task's config has its own."""
         return {}
 
     @property

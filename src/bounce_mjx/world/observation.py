@@ -70,13 +70,13 @@ class ObservationConfig(StrictModel):
     """Distances of the last servo targets from the measured joint angles, for the action's base
     target."""
     ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
-    """Time since the picture of the ball was taken."""
+    """Time since the camera image of the ball was taken."""
     position: Literal["measured", "filter"] = "measured"
-    """Source of ball_position: the last picture, or the estimate of the Kalman filter
+    """Source of ball_position: the last camera image, or the estimate of the Kalman filter
     (env.estimator)."""
     velocity: Literal["measured", "differences", "filter"] = "measured"
-    """Source of ball_velocity: a sensor, the differences between pictures, or the estimate of the
-    Kalman filter (env.estimator)."""
+    """Source of ball_velocity: a sensor, the differences between camera images, or the estimate of
+    the Kalman filter (env.estimator)."""
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
@@ -153,8 +153,8 @@ class EstimatorConfig(StrictModel):
     air_drag: NonNegative = 0.0
     """Deceleration of the ball by the air divided by its squared speed, 1/m."""
     latency: NonNegative | None = None
-    """Expected time from a picture to its arrival, s, if the camera does not stamp its pictures;
-    null for pictures with the time at which they were taken."""
+    """Expected time from a camera image to its arrival, s, if the camera does not stamp its images;
+    null for images with the time at which they were taken."""
 
 
 @dataclasses.dataclass(frozen=True)

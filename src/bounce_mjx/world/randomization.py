@@ -143,12 +143,12 @@ class RandomizationConfig(StrictModel):
     action_latency: Range | None = None
     """Time from an action to its servo targets, s."""
     ball_latency: Range | None = None
-    """Time from a picture of the ball to its use, s."""
+    """Time from a camera image of the ball to its use, s."""
     camera_rate: Range | None = None
-    """Pictures of the ball per second, Hz; each picture is used until the next one arrives. Without
-    a rate there is a picture at every control step."""
+    """Camera images of the ball per second, Hz; each is used until the next one arrives. Without a
+    rate there is an image at every control step."""
     frame_drop: Range | None = None
-    """Probability that a picture is lost."""
+    """Probability that a camera image is lost."""
     ball_position_noise: Range | None = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
     ball_position_bias: Range | None = None
@@ -182,7 +182,7 @@ class RandomizationConfig(StrictModel):
     shares: dict[str, UnitInterval] | None = None
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
-    """Environment steps of the training over which the ranges grow from the nominal values."""
+    """Environment steps over which the ranges grow from the nominal values."""
 
     def __hash__(self) -> int:
         """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
