@@ -10,6 +10,7 @@ import pytest
 from bounce_mjx import EnvConfig
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.commands import benchmark as command
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import benchmark
 from bounce_mjx.evaluation.benchmark import Figures, largest_stable, measure_nominal
 from bounce_mjx.evaluation.robustness import ConditionOutcome
@@ -67,11 +68,26 @@ def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, c
     stored = json.loads((tmp_path / "found/benchmark.json").read_text())
     assert [len(row["figures"]) for row in stored["rows"]] == [2, 1]
     table = (tmp_path / "found/benchmark.md").read_text()
-    assert table in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert table in printed
+    assert "robust: seeds 1; suite met 7 of 9; latency, ms 20; push, m/s 0.10; hits 30\n" in printed
     first, second = table.splitlines()[2:4]
     assert first.startswith("| seeds | 2 | 7 of 9 | 20 | 0.10 | 15 (10 to 20) |")
     assert second.startswith("| robust | 1 | 7 of 9 | 20 | 0.10 | 30 |")
     assert '<td class="">robust</td>' in (tmp_path / "found/benchmark.html").read_text()
+
+
+def test_an_interrupted_benchmark_leaves_the_rows_so_far(tmp_path: Path, monkeypatch) -> None:
+    def measure(policy, *_) -> Figures:
+        if policy is None:
+            raise UserError("interrupted")
+        return Figures(suite_met=7, suite_conditions=9, latency_ms=20, push_m_s=0.1)
+
+    monkeypatch.setattr(benchmark, "measure", measure)
+    with pytest.raises(SystemExit):
+        command.main(["pretrained", "mirror", "--out", str(tmp_path)])
+    stored = json.loads((tmp_path / "benchmark.json").read_text())
+    assert [row["name"] for row in stored["rows"]] == ["pretrained"]
 
 
 def test_no_policy_is_a_mistake(capsys) -> None:

@@ -69,7 +69,16 @@ def main(args: Sequence[str]) -> None:
     with writable(command.out, "choose another folder with --out"):
         command.out.mkdir(parents=True, exist_ok=True)
     options = EvaluationOptions(command.episodes, command.seed, command.physics)
+    engine = "mujoco" if command.physics == "mujoco" else Env(configs[0][0].env).engine.name
     rows, done = [], 0
+    benchmark = reports.Benchmark(
+        version=bounce_mjx.__version__,
+        device=jax.devices()[0].device_kind,
+        physics=engine,
+        episodes=command.episodes,
+        seed=command.seed,
+        rows=rows,
+    )
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("policies", total=sum(map(len, members)))
 
@@ -84,25 +93,15 @@ def main(args: Sequence[str]) -> None:
                 done += 1
             task_and_robot = of_row[0].task, robot_name(of_row[0].env)
             rows.append(reports.Row(str(path), *task_and_robot, figures))
-            console.out(
-                "  ".join(reports.cells(rows[-1], list(figures[-1].ranking))), highlight=False
-            )
-    engine = "mujoco" if command.physics == "mujoco" else Env(configs[0][0].env).engine.name
-    benchmark = reports.Benchmark(
-        version=bounce_mjx.__version__,
-        device=jax.devices()[0].device_kind,
-        physics=engine,
-        episodes=command.episodes,
-        seed=command.seed,
-        rows=rows,
-    )
-    files = {
-        reports.BENCHMARK_FILE: to_json(benchmark),
-        "benchmark.md": reports.markdown(benchmark),
-        "benchmark.html": reports.page(benchmark),
-    }
-    for name, content in files.items():
-        with writable(command.out, "choose another folder with --out"):
-            write_output(command.out / name, content)
+            console.out(reports.line(rows[-1]), highlight=False)
+            # Each row takes minutes, so the files have those so far.
+            files = {
+                reports.BENCHMARK_FILE: to_json(benchmark),
+                "benchmark.md": reports.markdown(benchmark),
+                "benchmark.html": reports.page(benchmark),
+            }
+            for name, content in files.items():
+                with writable(command.out, "choose another folder with --out"):
+                    write_output(command.out / name, content)
     print(files["benchmark.md"])
     print(*(command.out / name for name in files), sep="\n")
