@@ -231,16 +231,16 @@ def errors(found: Identified, hidden: Hidden, model: mujoco.MjModel, home) -> di
     return result
 
 
-def covered(found: Identified, hidden: Hidden) -> tuple[int, int]:
-    """Number of the shown unknowns whose 95% interval holds the truth, and of all shown ones."""
+def covered(found: Identified, hidden: Hidden) -> dict[str, bool]:
+    """Whether the 95% interval of each shown unknown holds the truth."""
     zero = ("servo_lag", "air_drag", "contact_friction", "joint_frictionloss")
     nominal = dict.fromkeys(zero, 0.0) | hidden.world
     known = {name: nominal[name] for name in found.layout.unknowns if name in nominal}
     world = found.layout.world(found.layout.vector(known))
     truth = np.concatenate([np.ravel(world[name]) for name in found.layout.unknowns])
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
-    inside = [e.low <= x <= e.high for e, x in zip(listed, truth, strict=True) if e.seen]
-    return int(sum(inside)), len(inside)
+    shown = [(e, x) for e, x in zip(listed, truth, strict=True) if e.seen]
+    return {e.label: bool(e.low <= x <= e.high) for e, x in shown}
 
 
 def widths(found: Identified) -> dict[str, float]:
@@ -287,7 +287,7 @@ def main() -> None:
         found = identify(config, read_csv(path, names))
         seconds = time.perf_counter() - begin
         processor = time.process_time() - begin_processor
-        inside, shown = covered(found, hidden)
+        inside = covered(found, hidden)
         rows.append(
             {
                 "seed": seed,
@@ -296,8 +296,9 @@ def main() -> None:
                 "processor seconds": processor,
                 "errors": errors(found, hidden, model, home),
                 "held out": found.held_out,
-                "covered": inside,
-                "shown": shown,
+                "covered": sum(inside.values()),
+                "shown": len(inside),
+                "outside": [label for label, holds in inside.items() if not holds],
                 "widths": widths(found),
                 "dropped": found.dropped,
             }

@@ -1,4 +1,4 @@
-"""Gymnasium: one environment, a policy, and an own target height.
+"""Gymnasium: one environment, a policy, and your own target height.
 
 `python examples/gymnasium_policy.py [pretrained | robust | RUN]` needs the extras `gymnasium` and
 `deploy`.

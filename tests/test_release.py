@@ -48,7 +48,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     [("wheel", HERE), ("sdist", HERE), *(("wheel", v) for v in ("3.12", "3.13") if v != HERE)],
 )
 def test_an_installed_release_trains_evaluates_exports_and_acts(
-    kind: str, version: str, built: dict[str, Path], tmp_path: Path
+    kind: str, version: str, built: dict[str, Path], tmp_path: Path, opengl: None
 ) -> None:
     found = subprocess.run(
         ["uv", "python", "find", "--no-project", "--no-python-downloads", version],
@@ -59,7 +59,7 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     call("uv", "venv", "--quiet", "--python", version, tmp_path / "env", folder=tmp_path)
     bin_folder = next(p for p in (tmp_path / "env/bin", tmp_path / "env/Scripts") if p.exists())
     python, command = bin_folder / "python", bin_folder / "bounce-mjx"
-    file = f"bounce_mjx[deploy,export] @ {built[kind].as_uri()}"
+    file = f"bounce_mjx[deploy,export,video] @ {built[kind].as_uri()}"
     call("uv", "pip", "install", "--quiet", "--python", python, file, folder=tmp_path)
 
     work, other = tmp_path / "work", tmp_path / "other"
@@ -72,8 +72,10 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     # An untrained policy misses results, which is status 1.
     said = call(command, "eval", run, "--episodes", 4, folder=other, status=1)
     assert "FAIL" in said
-    call(command, "play", run, "--html", "replay.html", "--seconds", 1, folder=other)
-    assert (other / "replay.html").is_file()
+    call(command, "report", run, folder=other)
+    assert "<iframe" in (run / "report.html").read_text(encoding="utf-8")
+    call(command, "play", run, "--video", "a.gif", "--seconds", 1, folder=other)
+    assert (other / "a.gif").read_bytes().startswith(b"GIF")
     call(command, "export", run, "--onnx", other / "policy.onnx", folder=work)
     acts = (
         "import numpy, bounce_mjx; p = bounce_mjx.load_policy('policy.onnx')\n"

@@ -78,7 +78,8 @@ def main(args: Sequence[str]) -> None:
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
     policy, actor = read_actor(checkpoint, config)
-    console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
+    steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
+    console.out(f"checkpoint: {checkpoint.folder}{steps}", highlight=False)
     options = EvaluationOptions(
         command.episodes, command.seed, command.physics, command.nominal, commands
     )

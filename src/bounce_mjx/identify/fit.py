@@ -186,6 +186,27 @@ def minimise(
     return Fit(vector, starts, whole, predicted, weights, now)
 
 
+def covariance(problem: Problem, fit: Fit) -> np.ndarray:
+    """Covariance [P, P] of the unknowns at a minimum.
+
+    Each deviation is the larger of two: that of independent residuals of the sensors' noise, and
+    that of the jackknife over windows, which knows that residuals of one window are correlated
+    (the estimator CR3 of MacKinnon, Nielsen and Webb 2023, "Cluster-robust inference").
+    """
+    layout, (deviations, _, searched) = problem.layout, _per_state(problem.windows)
+    place, of_state = np.arange(len(fit.vector)), np.flatnonzero(searched)
+    line = _linearised(problem, fit.vector, fit.starts, place, of_state, fit.weights)
+    scale, reach = layout.deviation, deviations[of_state]
+    at_guess = (fit.starts - problem.windows.starts)[:, of_state] / reach
+    reduced = _eliminate(line.residuals, line.by_unknown * scale, line.by_state * reach, at_guess)
+    hessian = reduced.information + np.eye(len(scale))
+    inverse = np.linalg.inv(hessian)
+    left_out = np.linalg.solve(hessian - reduced.informations, reduced.gradients[:, :, None])
+    jackknife = np.einsum("sfx,sgx->fg", left_out, left_out) + inverse @ inverse
+    wider = np.sqrt(np.maximum(np.diag(jackknife) / np.diag(inverse), 1.0)) * scale
+    return inverse * np.outer(wider, wider)
+
+
 class _Linearised(NamedTuple):
     """The residuals at a point, and their derivatives by differences."""
 
@@ -294,12 +315,24 @@ def _linearised(
 class _Reduced(NamedTuple):
     """The linearised problem after the starts are eliminated."""
 
-    information: np.ndarray
-    gradient: np.ndarray
+    informations: np.ndarray
+    """Of each window [S, F, F]."""
+    gradients: np.ndarray
+    """Of each window [S, F]."""
     residuals: np.ndarray
     by_unknown: np.ndarray
     q: np.ndarray
     r: np.ndarray
+
+    @property
+    def information(self) -> np.ndarray:
+        """Of all windows [F, F]."""
+        return np.sum(self.informations, axis=0)
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """Of all windows [F]."""
+        return np.sum(self.gradients, axis=0)
 
     def states(self, change: np.ndarray) -> np.ndarray:
         """Change [S, D] of the starts for a change [F] of the unknowns."""
@@ -323,11 +356,10 @@ def _eliminate(
     nothing = np.zeros((num_windows, num_states, by_unknown.shape[2]))
     a = np.concatenate([by_unknown, nothing], axis=1)
     b = np.concatenate([residuals, at_guess], axis=1)
-    qa, qb = np.swapaxes(q, 1, 2) @ a, np.einsum("smd,sm->sd", q, b)
-    flat, ends = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in (a, qa))
-    information = flat.T @ flat - ends.T @ ends
-    gradient = flat.T @ b.ravel() - ends.T @ qb.ravel()
-    return _Reduced(information, gradient, b, a, q, r)
+    # Orthogonal to the starts.
+    rest = a - q @ (np.swapaxes(q, 1, 2) @ a)
+    across = np.swapaxes(rest, 1, 2)
+    return _Reduced(across @ rest, (across @ b[:, :, None])[:, :, 0], b, a, q, r)
 
 
 def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

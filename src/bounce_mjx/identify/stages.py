@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.fit import Fit, Noise, Problem, minimise, picture_weights
+from bounce_mjx.identify.fit import Fit, Noise, Problem, covariance, minimise, picture_weights
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
 from bounce_mjx.identify.unknowns import Layout, make_layout
@@ -268,7 +268,7 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
         windows,
         problem.noise,
         fit,
-        np.linalg.inv(fit.information + np.diag(layout.deviation**-2.0)),
+        covariance(problem, fit),
         _errors(problem, before),
         _errors(problem, fit),
         held_out,

@@ -19,6 +19,9 @@ _SHORTEST = 0.16
 _PADDING = 8
 _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
+# Time after the begin of a log, or a gap, until the arm has forgotten the targets before it, which
+# nobody knows: the longest latency and a few of the longest lags, s.
+_SETTLING = 0.3
 # Speed that the ball must have before and after a bounce, m/s.
 _BOUNCING = 0.5
 # Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
@@ -158,8 +161,8 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
     gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1]) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + MAX_DELAY
+    taken += [(log.times[i], log.times[i + 1] + _SETTLING + MAX_DELAY) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + _SETTLING + MAX_DELAY
     pieces, begin = [], first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
