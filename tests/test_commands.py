@@ -301,7 +301,9 @@ def test_checkpoint_of_another_network(fails: Fails, run: Path, layers: str) -> 
     text = re.sub(r"hidden_layers:\n(  - \d+\n)+", f"hidden_layers: {layers}\n", config.read_text())
     config.write_text(text)
     assert load_config(config).ppo.hidden_layers == tuple(json.loads(layers))
-    assert_says(fails(eval_command.main, ["run"]), ("a different config", "run/config.yaml", "restore"))
+    assert_says(
+        fails(eval_command.main, ["run"]), ("different config", "run/config.yaml", "restore")
+    )
 
 
 def test_damaged_config_of_a_run(fails: Fails, run: Path) -> None:
