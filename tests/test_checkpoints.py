@@ -260,7 +260,7 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
     writer = CheckpointWriter(run, config)
     writer.save(["latest"], 64, policy_of(state, OBSERVATION.size), state, {})
     writer.close()
-    assert_refused(run, state, "another config", "differs in seed;", "restore that file")
+    assert_refused(run, state, "a different config", "differs in seed;", "restore that file")
 
 
 # Malicious checkpoints

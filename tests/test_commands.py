@@ -132,7 +132,7 @@ BAD_FLAGS = {
     "no layers": ("--hidden-layers", "--hidden-layers is ()", "at least 1 item"),
     "empty layer": ("--hidden-layers 16 0", "--hidden-layers is 0", "equal to 1"),
     "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
-    "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "exclude"),
+    "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     "no such preset": ("--config nope", "no preset is named nope", "cpu, default, robust"),
     "no such robot": ("--robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
@@ -301,7 +301,9 @@ def test_checkpoint_of_another_network(fails: Fails, run: Path, layers: str) -> 
     text = re.sub(r"hidden_layers:\n(  - \d+\n)+", f"hidden_layers: {layers}\n", config.read_text())
     config.write_text(text)
     assert load_config(config).ppo.hidden_layers == tuple(json.loads(layers))
-    assert_says(fails(eval_command.main, ["run"]), ("another config", "run/config.yaml", "restore"))
+    assert_says(
+        fails(eval_command.main, ["run"]), ("different config", "run/config.yaml", "restore")
+    )
 
 
 def test_damaged_config_of_a_run(fails: Fails, run: Path) -> None:

@@ -89,7 +89,7 @@ def test_a_world_brings_its_robot() -> None:
     assert command.env.mjcf.name == "ur5e.xml"
     assert command.env.robot.site == "attachment_site"
     assert command.env.robot.servo_stiffness[0] > 1e4
-    with pytest.raises(UserError, match="is of the robot ur5e, and a robot is given too"):
+    with pytest.raises(UserError, match="is for the robot ur5e, and a robot is given too"):
         read_command(["--world", "ur5e_rtde", "--robot", "panda"])
 
 
