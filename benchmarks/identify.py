@@ -39,6 +39,9 @@ _FIXED = (
 ).split()
 _CAMERA_RATE, _LOST, _BALL_NOISE = 120.0, 0.05, 0.002
 _ANGLE_NOISE, _VELOCITY_NOISE, _JITTER = 1e-3, 0.02, 3e-4
+# Target heights, m, and control steps of each: bounces at several speeds tell the ball's latency
+# from the camera's height.
+_HEIGHTS, _HEIGHT_STEPS = (0.3, 0.8), 300
 _BACKLASH = np.deg2rad(0.1)
 _ASYMMETRY = 0.3
 
@@ -166,23 +169,25 @@ class _Robot:
 
 
 def record(config: WorldConfig, seed: int, path: Path, excited=20.0, played=40.0) -> Hidden:
-    """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, which
-    is dropped again after each loss."""
+    """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, at
+    several heights; the ball is dropped again after each loss."""
     hidden = hidden_robot(seed)
     robot, policy = _Robot(config, hidden, seed), load_policy("robust")
     motion = excite(config, excited, 1.5)
     steps = round(config.control_dt / config.physics_dt)
     random = np.random.default_rng([seed, 1])
-    drop_at, playing = excited + 1.0, False
+    drop_at, playing, height = excited + 1.0, False, 0.5
     with Recorder(path, policy.metadata.joint_names, {"target_height": "m"}) as recorder:
         last, before = None, 0.0
         for k in range(round((excited + played) / config.control_dt)):
             now = robot.data.time
+            if k % _HEIGHT_STEPS == 0:
+                height = float(random.uniform(*_HEIGHTS))
             stamp = now + _JITTER * float(np.clip(random.standard_normal(), -3.0, 3.0))
             measured = {
                 "joint_angles": robot.angles(),
                 "joint_velocities": robot.velocities(),
-                "target_height": 0.5,
+                "target_height": height,
                 "time": stamp,
             }
             arrived = [p for p in robot.pictures if p[0] <= now]

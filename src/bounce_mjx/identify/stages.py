@@ -20,7 +20,7 @@ _HELD_OUT = 5
 # Latencies and lags of the first candidates, s, and frictions of the ball.
 _LATENCIES = (0.002, 0.01, 0.02, 0.03, 0.04, 0.055)
 _BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
-_FRICTIONS = (0.0, 0.03, 0.3)
+_FRICTIONS = (0.01, 0.2)
 # Windows in which the first candidates are compared.
 _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
@@ -246,12 +246,11 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
     few = np.zeros_like(search.training)
     few[_some(used)] = 1.0
-    for kept, counted, iterations in ((4, few, 2), (2, few, 2), (1, search.training, 5)):
-        found = [
-            search.run(["flight", "bounce"], t, 1.0, iterations, ball_state, counted) for t in tried
-        ]
+    for kept in (4, 1):
+        found = [search.run(["flight", "bounce"], t, 1.0, 2, ball_state, few) for t in tried]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
     (fit,) = tried
+    fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
     tested = search.tested(fit, 1.0, ball_state)
     pictures = picture_weights(search.problem, search.problem.at(tested.vector, tested.starts))
     return search.run(["flight", "bounce"], tested, pictures, 6, ball_state), pictures

@@ -32,7 +32,7 @@ _MOTIONS = {
     "joint_frictionloss": "slow motions there and back show it (bounce-mjx excite)",
     "contact_friction": "a ball that slips shows it: one with spin, or thrown from the side",
     "air_drag": "higher flights show it",
-    "ball_latency": "bounces under a fast paddle show it",
+    "ball_latency": "bounces at several target heights show it",
     "restitution": "more bounces show it",
 }
 
