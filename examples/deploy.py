@@ -42,8 +42,7 @@ class Camera:
 def simulate(
     policy, camera: Camera, seconds: float, heights: list[float], recorder: Recorder | None = None
 ) -> list[tuple[int, float]]:
-    """Bounces and length (s) of each episode; after a loss of the ball, the arm starts again. Every
-    3 s, the next of the target heights (m) begins."""
+    """Bounces and length (s) of each episode, each from a new start; a target height lasts 3 s."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]

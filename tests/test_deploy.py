@@ -1076,8 +1076,9 @@ def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
 
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     """On plain MuJoCo; the defaults of the example."""
+    simulate, camera = EXAMPLE["simulate"], EXAMPLE["Camera"]
     (bounces, survived), (lost_bounces, lost_at) = (
-        EXAMPLE["simulate"](load_policy(name), EXAMPLE["Camera"](120.0, 0.002, 0.020), 8.0, [0.5])[0]
+        simulate(load_policy(name), camera(120.0, 0.002, 0.020), 8.0, [0.5])[0]
         for name in ("robust", "pretrained")
     )
     assert bounces >= 10 and survived == pytest.approx(8.0)
