@@ -1,19 +1,25 @@
 """Shows a trained policy: `bounce-mjx play [CHECKPOINT]`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import MIRROR, WorldCommand, parse_with_commands
+from bounce_mjx.commands.run_options import (
+    MIRROR,
+    TopicsConfig,
+    WorldCommand,
+    parse_with_commands,
+)
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
+from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
@@ -42,6 +48,12 @@ class PlayCommand(WorldCommand):
     """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
+    log: Path | None = None
+    """Log of a robot's run, as for bounce-mjx identify; writes a page (--html, by default the log's
+    name with .html) with the measured run beside its simulation in --world. --robot is the robot's
+    config."""
+    topics: TopicsConfig = TopicsConfig()
+    """Topics of a log that is a bag."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
@@ -50,6 +62,9 @@ class PlayCommand(WorldCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
+    if command.log is not None:
+        _replay_log(command, given_commands)
+        return
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     with no_garbage_collection():
@@ -77,12 +92,61 @@ def main(args: Sequence[str]) -> None:
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the engine and the world that are to be shown."""
-    config = command.config_of(checkpoint)
+    return _changed(command.config_of(checkpoint), command)
+
+
+def _changed(config: TrainConfig, command: PlayCommand) -> TrainConfig:
+    """A config with the engine and the randomisation that the command line gives."""
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization
     env = validate(type(config.env), dict(config.env) | changes, "play")
     return config.model_copy(update={"env": env})
+
+
+def _replay_log(
+    command: PlayCommand, given_commands: Callable[[WorldConfig], dict[str, float]]
+) -> None:
+    """Writes the page of a log."""
+    viewing = command.viewing
+    others = {
+        "a checkpoint": command.checkpoints,
+        "--actions": command.actions != "policy",
+        "--task": command.task,
+        "--viewer": viewing.viewer != "auto",
+        "--video": viewing.video,
+        "--num-envs": viewing.num_envs > 1,
+    }
+    if refused := [name for name, given in others.items() if given]:
+        raise UserError(
+            f"--log writes a page of the recorded run, and {' and '.join(refused)} cannot be "
+            "combined with it; omit one of the two"
+        )
+    page = viewing.html or Path(f"{command.log.stem}.html")
+    with no_garbage_collection():
+        from bounce_mjx.identify.bags import Topics
+        from bounce_mjx.identify.reading import read_log
+        from bounce_mjx.identify.replay import replay_log
+        from bounce_mjx.robot.model import load_model
+        from bounce_mjx.runs.files import check_output, writable, write_output
+        from bounce_mjx.training.setup import set_up_jax
+        from bounce_mjx.viewers.comparison import comparison_page
+        from bounce_mjx.viewers.page import DEFAULT_FPS, SUFFIXES
+
+    check_output(page, "--html", SUFFIXES)
+    preset = read_preset(Path("default"), command.robot, world=command.world)
+    config = _changed(preset, command).env
+    commands, console = given_commands(config), Console(soft_wrap=True, highlight=False)
+    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    topics = Topics(**command.topics.model_dump())
+    log = read_log(command.log, model, topics, lambda x: console.out(f"warning: {x}"))
+    set_up_jax(config)
+    with console.status("simulating"):
+        found = replay_log(config, log, viewing.seconds)
+        text = comparison_page(config, found, viewing.fps or DEFAULT_FPS, commands)
+    with writable(page, "give another file with --html"):
+        write_output(page, text)
+    console.out(f"written: {page}")
 
 
 def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":

@@ -30,7 +30,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     places, listed = found.layout.slices(), estimates(found, joint_names)
     for name, place in places.items():
         by_term[name] = listed[place]
-    late = _least_age(log)
+    late = least_age(log)
     ranges: dict[str, list[float]] = {}
     sources: dict[str, str] = {}
     assumed = []
@@ -74,7 +74,7 @@ def compare(
     """Terms of a world that a log contradicts, a sentence each; none if the robot is still the
     same."""
     given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
-    late, changed = _least_age(log), []
+    late, changed = least_age(log), []
     for name, place in found.layout.slices().items():
         if name not in given:
             continue
@@ -108,7 +108,7 @@ def _clipped(name: str, low: float, high: float) -> list[float]:
     return [float(f"{x:.4g}") for x in ends]
 
 
-def _least_age(log: Log) -> float:
+def least_age(log: Log) -> float:
     """Time from a picture's stamp to its arrival, s: 0 if the stamp is that of the arrival. Of the
     youngest pictures, as the others wait for the next control step."""
     if not len(log.arrivals):

@@ -10,7 +10,7 @@ from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at, resample
 
 SUFFIXES = (".html",)
-_DEFAULT_FPS = 30
+DEFAULT_FPS = 30
 _VISER_TITLE = "<title>Viser</title>"
 
 
@@ -29,13 +29,13 @@ def write_page(
     Raises:
       UserError: the file cannot be written.
     """
-    text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
+    text = replay(simulation.env, recording, fps or DEFAULT_FPS, names)
     with writable(path, "give another file with --html"):
         write_output(path, text)
 
 
 def replay(
-    env: Env, recording: EnvFrame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
+    env: Env, recording: EnvFrame, fps: int = DEFAULT_FPS, names: Sequence[str] | None = None
 ) -> str:
     """A page (HTML) that replays a recording [T, N, ...]."""
     frames = resample(recording, env.dt, fps)
