@@ -32,7 +32,7 @@ def world_file(folder: Path, **changes: float) -> Path:
 
 @pytest.fixture(scope="module")
 def log_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of a robot in WORLD on MuJoCo's C engine: 10 s of the arm alone, 8 s with the ball."""
+    """The log of a robot in WORLD on MuJoCo's C engine: 10 s of the arm, 8 s with the ball."""
     path = tmp_path_factory.mktemp("log") / "run.csv"
     benchmark = runpy.run_path(str(BENCHMARK))
     world = {name: np.float32(x) for name, x in WORLD.items()}
@@ -108,7 +108,7 @@ def test_a_log_without_pictures_shows_the_arm_alone() -> None:
     # The servos of the simulation follow their targets 10 ms later, at up to 0.04 rad/s.
     assert 1e-5 < np.max(np.abs(found.angles[50:, 0] - found.angles[50:, 1])) < 5e-3
     short = log._replace(times=times[:40], joint_angles=sway[:40])
-    with pytest.raises(UserError, match="stretches of unbroken .*; record at least 5 s"):
+    with pytest.raises(UserError, match="no stretch of unbroken .*; record at least 5 s"):
         replay_log(read_preset(Path("default")).env, short)
 
 

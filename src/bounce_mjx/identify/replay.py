@@ -44,7 +44,7 @@ def replay_log(config: WorldConfig, log: Log, seconds: float | None = None) -> R
       seconds: length of the replay, s; by default, that of the log.
 
     Raises:
-      UserError: the log has too few windows.
+      UserError: the log has no window.
     """
     windows = cut(log, config.physics_dt, NO_BALL, max_windows=len(log.times))
     layout, vector = _known(config, log)

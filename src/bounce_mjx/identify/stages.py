@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, covariance, minimise, picture_weights
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
@@ -140,6 +141,11 @@ def identify(
       UserError: the log has no window.
     """
     windows = cut(log, config.physics_dt, NO_BALL)
+    if len(windows.first) < 5:
+        raise UserError(
+            f"{log.source} has {len(windows.first)} stretches of unbroken joint angles and servo "
+            "targets; record at least 5 s"
+        )
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")

@@ -18,7 +18,6 @@ _REACH = 0.3
 _SECONDS = MAX_DELAY + 2.0 * _REACH + 0.03
 _SHORTEST = 0.16
 _PADDING = 8
-_FEWEST = 5
 _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
 # Time after the begin of a log, or a gap, until the arm has forgotten the targets before it, which
@@ -72,14 +71,14 @@ def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240
       max_windows: the largest number; of more, every k-th is kept.
 
     Raises:
-      UserError: there are fewer than five.
+      UserError: there is none.
     """
     spans = [(b - before, b + after, b) for b, before, after in _bounces(log)]
     spans += [(start, end, np.nan) for start, end in _rest(log, spans)]
-    if len(spans) < _FEWEST:
+    if not spans:
         raise UserError(
-            f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
-            "record at least 5 s"
+            f"{log.source} has no stretch of unbroken joint angles and servo targets; record at "
+            "least 5 s"
         )
     spans.sort()
     if len(spans) > max_windows:
