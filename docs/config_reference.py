@@ -75,7 +75,8 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         text = " ".join((field.description or "").split())
         units = _UNIT.findall(text)
         kind = "" if "enum" in plain else _type(plain)
-        value = " ".join(part for part in (kind, _range(plain)) if part).replace(" ,", ",")
+        is_list = "array" in {option.get("type") for option in plain.get("anyOf", [plain])}
+        value = (", " if is_list else " ").join(part for part in (kind, _range(plain)) if part)
         value += f" ({units[-1]})" if units else ""
         cells = f"`{name}`", value, _default(plain.get("default")), text
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
@@ -131,7 +132,7 @@ def _range(plain: dict[str, Any]) -> str:
         items = plain.get("prefixItems")
         each = _range(items[0] if items else plain["items"])
         least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
-        return "".join(f", {text}" for text in (least, f"each {each}" if each else "") if text)
+        return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
     return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")

@@ -7,7 +7,7 @@ PRETRAINED = "pretrained"
 TASK_POLICIES = ("balance", "catch", "juggle", "track")
 """Tasks with a policy of their name, beside that of the default task, `PRETRAINED`."""
 ARM_POLICIES = ("ur5e", "panda", "iiwa")
-"""Arms of configs/robots/ that may have a policy of their name."""
+"""Arms of configs/robots/ with a policy of their name."""
 POLICIES = {PRETRAINED: PRETRAINED} | {
     name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES, *ARM_POLICIES)
 }

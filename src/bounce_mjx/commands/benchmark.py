@@ -70,14 +70,14 @@ def main(args: Sequence[str]) -> None:
         command.out.mkdir(parents=True, exist_ok=True)
     options = EvaluationOptions(command.episodes, command.seed, command.physics)
     engine = "mujoco" if command.physics == "mujoco" else Env(configs[0][0].env).engine.name
-    rows, done = [], 0
+    done = 0
     benchmark = reports.Benchmark(
         version=bounce_mjx.__version__,
         device=jax.devices()[0].device_kind,
         physics=engine,
         episodes=command.episodes,
         seed=command.seed,
-        rows=rows,
+        rows=[],
     )
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("policies", total=sum(map(len, members)))
@@ -92,8 +92,9 @@ def main(args: Sequence[str]) -> None:
                 figures.append(measure(*actor, config.env, options, show))
                 done += 1
             task_and_robot = of_row[0].task, robot_name(of_row[0].env)
-            rows.append(reports.Row(str(path), *task_and_robot, figures))
-            console.out(reports.line(rows[-1]), highlight=False)
+            row = reports.Row(str(path), *task_and_robot, figures)
+            console.out(reports.line(row), highlight=False)
+            benchmark.rows.append(row)
             # Each row takes minutes, so the files have those so far.
             files = {
                 reports.BENCHMARK_FILE: to_json(benchmark),

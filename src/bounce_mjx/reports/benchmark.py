@@ -38,7 +38,7 @@ class Benchmark:
     @property
     def ranking(self) -> list[str]:
         """Names of the tasks' own figures."""
-        return list(dict.fromkeys(n for r in self.rows for f in r.figures for n in f.ranking))
+        return _ranking(self.rows)
 
     @property
     def header(self) -> tuple[str, ...]:
@@ -49,6 +49,10 @@ class Benchmark:
     def cells(self) -> list[list[str]]:
         """The rows of the table."""
         return [cells(row, self.ranking) for row in self.rows]
+
+
+def _ranking(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(n for row in rows for f in row.figures for n in f.ranking))
 
 
 def cells(row: Row, ranking: Sequence[str]) -> list[str]:
@@ -71,7 +75,7 @@ def cells(row: Row, ranking: Sequence[str]) -> list[str]:
 
 def line(row: Row) -> str:
     """A row as a line of text, such as "robust: seeds 1; suite met 137 of 144; latency, ms 100"."""
-    ranking = list(dict.fromkeys(name for figures in row.figures for name in figures.ranking))
+    ranking = _ranking([row])
     name, *values = cells(row, ranking)
     titles = (*_HEADER, *ranking)[1:]
     return f"{name}: " + "; ".join(
