@@ -17,7 +17,8 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.runs.config import TrainConfig, read_preset
+from bounce_mjx.lazy import np
+from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -92,11 +93,7 @@ def main(args: Sequence[str]) -> None:
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the engine and the world that are to be shown."""
-    return _changed(command.config_of(checkpoint), command)
-
-
-def _changed(config: TrainConfig, command: PlayCommand) -> TrainConfig:
-    """A config with the engine and the randomisation that the command line gives."""
+    config = command.config_of(checkpoint)
     changes = {} if command.physics == "config" else {"physics": command.physics}
     if command.randomization.terms:
         changes["randomization"] = command.randomization
@@ -113,6 +110,8 @@ def _replay_log(
         "a checkpoint": command.checkpoints,
         "--actions": command.actions != "policy",
         "--task": command.task,
+        "--physics": command.physics != "config",
+        "--randomization": command.randomization.terms,
         "--viewer": viewing.viewer != "auto",
         "--video": viewing.video,
         "--num-envs": viewing.num_envs > 1,
@@ -124,28 +123,36 @@ def _replay_log(
         )
     page = viewing.html or Path(f"{command.log.stem}.html")
     with no_garbage_collection():
+        from bounce_mjx.env.env import Env
         from bounce_mjx.identify.bags import Topics
         from bounce_mjx.identify.reading import read_log
         from bounce_mjx.identify.replay import replay_log
-        from bounce_mjx.robot.model import load_model
-        from bounce_mjx.runs.files import check_output, writable, write_output
+        from bounce_mjx.runs.files import check_output
         from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.viewers.comparison import comparison_page
-        from bounce_mjx.viewers.page import DEFAULT_FPS, SUFFIXES
+        from bounce_mjx.viewers.comparison import recording
+        from bounce_mjx.viewers.page import SUFFIXES, write_page
 
     check_output(page, "--html", SUFFIXES)
     preset = read_preset(Path("default"), command.robot, world=command.world)
-    config = _changed(preset, command).env
-    commands, console = given_commands(config), Console(soft_wrap=True, highlight=False)
-    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    topics = Topics(**command.topics.model_dump())
-    log = read_log(command.log, model, topics, lambda x: console.out(f"warning: {x}"))
-    set_up_jax(config)
+    estimates, shown = {}, "the model's own world"
+    if command.world is not None:
+        estimates = in_world(preset, command.world)[1].estimates
+        kind = "the estimates" if estimates else "the middle of each range"
+        shown = f"{kind} of {command.world}"
+    commands, console = given_commands(preset.env), Console(highlight=False)
+    set_up_jax(preset.env)
+    env, topics = Env(preset.env), Topics(**command.topics.model_dump())
+    log = read_log(command.log, env.mj_model, topics, lambda x: console.out(f"warning: {x}"))
     with console.status("simulating"):
-        found = replay_log(config, log, viewing.seconds)
-        text = comparison_page(config, found, viewing.fps or DEFAULT_FPS, commands)
-    with writable(page, "give another file with --html"):
-        write_output(page, text)
+        found = replay_log(preset.env, log, estimates, viewing.seconds)
+        frames = recording(env, found, commands)
+        write_page(page, env, frames, viewing.fps, ("measured", "simulated"))
+    angles, ball = found.distances
+    far = "" if np.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
+    console.out(
+        f"simulated in {shown}; joint angles differ by {1e3 * angles:.2f} mrad{far} "
+        "(root mean square)"
+    )
     console.out(f"written: {page}")
 
 

@@ -1,9 +1,12 @@
 """A log's run beside the simulation of its servo targets in a known world."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.identify.fit import Fit, Problem, minimise
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import make_run, make_simulator
@@ -24,16 +27,28 @@ _ITERATIONS = 3
 class Replay(NamedTuple):
     """The measured run and the simulated one, in this order, as the sensors show them."""
 
-    times: np.ndarray
-    """Time [T] of each control step, s."""
     angles: np.ndarray
-    """Joint angles [T, 2, n], rad."""
+    """Joint angles [T, 2, n] at each control step, rad."""
     balls: np.ndarray
     """The ball [T, 2, 3], m; NaN where it is not shown."""
 
+    @property
+    def distances(self) -> tuple[float, float]:
+        """Root mean square of what the simulated angles (rad) and ball (m; NaN if it is never
+        shown) are off, for each joint and coordinate."""
+        off = (self.angles[:, 1] - self.angles[:, 0], self.balls[:, 1] - self.balls[:, 0])
+        shown = [x[~np.isnan(x)] for x in off]
+        return tuple(float(np.sqrt(np.mean(x**2))) if x.size else np.nan for x in shown)
 
-def replay_log(config: WorldConfig, log: Log, seconds: float | None = None) -> Replay:
-    """Simulates a log's servo targets in the middle of each range of a config's randomisation.
+
+def replay_log(
+    config: WorldConfig,
+    log: Log,
+    estimates: Mapping[str, float | tuple[float, ...]] = MappingProxyType({}),
+    seconds: float | None = None,
+) -> Replay:
+    """Simulates a log's servo targets in a world with the estimates, and the middle of each other
+    range of a config's randomisation.
 
     The ball's path is chaotic over many bounces. The simulation therefore starts again in each
     window of the identification, from the state that best explains what was measured: the ball's,
@@ -41,13 +56,14 @@ def replay_log(config: WorldConfig, log: Log, seconds: float | None = None) -> R
     shown; nor is it where no picture shows the measured one.
 
     Args:
+      estimates: values of the world's terms, as in `NamedWorld`.
       seconds: length of the replay, s; by default, that of the log.
 
     Raises:
-      UserError: the log has no window.
+      UserError: the log has no window, or an estimate has the wrong size.
     """
     windows = cut(log, config.physics_dt, NO_BALL, max_windows=len(log.times))
-    layout, vector = _known(config, log)
+    layout, vector = _known(config, log, estimates)
     run = make_run(config, config.num_joints)
     simulate = make_simulator(run, layout, log, windows)
     fit = _started(Problem(simulate, windows, layout, sensor_noise(log)), vector)
@@ -74,24 +90,34 @@ def replay_log(config: WorldConfig, log: Log, seconds: float | None = None) -> R
         if has_ball:
             balls[at[s, used]] = shown.balls[0, s, used]
     balls[np.isnan(seen)] = np.nan
-    return Replay(times, np.stack([measured, angles], 1), np.stack([seen, balls], 1))
+    return Replay(np.stack([measured, angles], 1), np.stack([seen, balls], 1))
 
 
-def _known(config: WorldConfig, log: Log) -> tuple[Layout, np.ndarray]:
-    """The layout with all terms of the config's randomisation, and the vector [P] of their middles;
-    a term without a range is nominal."""
-    given = {name: float(np.mean(ends)) for name, ends in config.randomization.ranges().items()}
+def _known(
+    config: WorldConfig, log: Log, estimates: Mapping[str, float | tuple[float, ...]]
+) -> tuple[Layout, np.ndarray]:
+    """The layout with all terms of the world, and their values [P]; a term with neither an estimate
+    nor a range is nominal."""
+    middles = {name: float(np.mean(ends)) for name, ends in config.randomization.ranges().items()}
     layout = make_layout(config.num_joints, True, config.physics_dt)
-    others = {}
-    for name in given.keys() - layout.unknowns.keys():
-        size = TERMS[name].size
-        others[name] = Unknown(0.0, 1.0, 1.0, "", "", size and size[0] if size != () else 0)
-    nominal = {name: TERMS[name].nominal for name in layout.unknowns}
-    world = {name: value for name, value in nominal.items() if value is not None} | given
-    if "ball_latency" in given:
+    others = {
+        name: Unknown(0.0, 1.0, 1.0, "", "", None if size is None else sum(size))
+        for name, (size, _, _) in TERMS.items()
+        if name in middles.keys() - layout.unknowns.keys()
+    }
+    layout = layout._replace(unknowns=layout.unknowns | others)
+    for name, value in estimates.items():
+        place = layout.slices().get(name, slice(0, 0))
+        if np.size(value) != place.stop - place.start:
+            raise UserError(
+                f"the world's estimates have {np.size(value)} numbers for {shorten(name)}, and the "
+                f"robot has {place.stop - place.start}; identify it again"
+            )
+    nominal = {name: term.nominal for name, term in TERMS.items() if term.nominal is not None}
+    world = nominal | middles | estimates
+    if "ball_latency" in middles.keys() | estimates.keys():
         # That of a world is from the exposure to the arrival; the log's stamps may be earlier.
         world["ball_latency"] -= least_age(log)
-    layout = layout._replace(unknowns=layout.unknowns | others)
     return layout, layout.vector(world)
 
 

@@ -1,33 +1,24 @@
-"""The page of a log: the measured robot beside the simulated one."""
+"""A log as the frames of a viewer: the measured robot beside the simulated one."""
 
-import mujoco
 import numpy as np
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.identify.replay import Replay
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.simulation import EnvFrame
-from bounce_mjx.world.config import WorldConfig
 
-NAMES = ("measured", "simulated")
 # Below the floor, m: a ball that is not shown, and the markers of commands that a log lacks.
 _HIDDEN = -10.0
 
 
-def comparison_page(config: WorldConfig, found: Replay, fps: int, command: dict[str, float]) -> str:
-    """A page (HTML) with both robots.
+def recording(env: Env, found: Replay, command: dict[str, float]) -> EnvFrame:
+    """The frames [T, 2, ...] of the measured and the simulated robot, for a page.
+
+    Each time at which a ball appears or vanishes counts as a reset, over which no line is drawn.
 
     Args:
       command: known values of the task's commands.
     """
-    env = Env(config)
-    return replay(env, recording(env, found, command), fps, NAMES)
-
-
-def recording(env: Env, found: Replay, command: dict[str, float]) -> EnvFrame:
-    """The frames [T, 2, ...] of both robots. Each time at which a ball appears or vanishes counts
-    as a reset, over which no viewer draws a line."""
     model = env.mj_model
     addresses, shape = find_addresses(model), found.angles.shape[:2]
     hidden = np.isnan(found.balls[..., 0])
@@ -43,20 +34,9 @@ def recording(env: Env, found: Replay, command: dict[str, float]) -> EnvFrame:
         time=(steps - begins) * env.dt,
         qpos=qpos,
         balls=balls[:, :, None],
-        paddle=_paddles(model, qpos),
+        paddle=np.zeros((*shape, 3)),
         command={name: np.full(shape, value) for name, value in known.items()},
         metrics={},
         over=over,
         lost=np.zeros(shape, bool),
     )
-
-
-def _paddles(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """The paddle's centre [..., 3] at positions [..., nq]."""
-    data, geom = mujoco.MjData(model), find_addresses(model).paddle_geom
-    places = np.zeros((*qpos.shape[:-1], 3))
-    for index in np.ndindex(qpos.shape[:-1]):
-        data.qpos[:] = qpos[index]
-        mujoco.mj_kinematics(model, data)
-        places[index] = data.geom_xpos[geom]
-    return places
