@@ -36,7 +36,7 @@ class PlayCommand(WorldCommand):
     checkpoints: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="[CHECKPOINT ...]", help_behavior_hint=""),
+        tyro.conf.arg(metavar="[CHECKPOINT ...]"),
     ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained, robust, or the name of a task or an arm. Several
