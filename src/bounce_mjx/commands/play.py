@@ -1,5 +1,6 @@
-"""Shows a trained policy: `bounce-mjx play [CHECKPOINT]`."""
+"""Shows a trained policy, or a robot's log: `bounce-mjx play [CHECKPOINT]`."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,7 +18,6 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-from bounce_mjx.lazy import np
 from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.config import WorldConfig
@@ -148,7 +148,7 @@ def _replay_log(
         frames = recording(env, found, commands)
         write_page(page, env, frames, viewing.fps, ("measured", "simulated"))
     angles, ball = found.distances
-    far = "" if np.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
+    far = "" if math.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
     console.out(
         f"simulated in {shown}; joint angles differ by {1e3 * angles:.2f} mrad{far} "
         "(root mean square)"
