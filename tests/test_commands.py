@@ -237,7 +237,7 @@ BAD_EVAL_FLAGS = {
     "unknown engine": ("--physics warp", "--physics", "{config,fused,mjx,mujoco}", "warp"),
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
-    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder"),
+    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder", "pretrained, robust, "),
     "no runs": ("--log-dir mine", "no run", "in mine", "bounce-mjx train"),
     "no run": (".", "config.yaml", "give a folder that bounce-mjx train made"),
 }
