@@ -117,8 +117,8 @@ def test_command_writes_the_page(log_file: Path, tmp_path: Path, monkeypatch, ca
     world = world_file(tmp_path)
     monkeypatch.chdir(tmp_path)
     main(["play", "--log", str(log_file), "--world", str(world), "--seconds", "2.5"])
-    assert "written: run.html" in capsys.readouterr().out
-    assert "<title>bounce_mjx</title>" in (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert "written: run_replay.html" in capsys.readouterr().out
+    assert "<title>bounce_mjx</title>" in (tmp_path / "run_replay.html").read_text(encoding="utf-8")
 
 
 def test_a_ball_that_vanishes_is_under_the_floor_and_draws_no_line() -> None:

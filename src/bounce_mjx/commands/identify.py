@@ -64,11 +64,12 @@ def main(args: Sequence[str]) -> None:
     names = joint_names(model)
     topics = Topics(**command.topics.model_dump())
     console = Console(soft_wrap=True, highlight=False)
-
-    def warn(sentence: str) -> None:
-        console.print(f"warning: {sentence}", markup=False)
-
-    logs = [read_log(path, model, topics, warn) for path in command.logs]
+    logs = []
+    for path in command.logs:
+        log, warnings = read_log(path, model, topics)
+        for warning in warnings:
+            console.print(f"warning: {warning}", markup=False)
+        logs.append(log)
     set_up_jax(config)
     log = joined(logs)
     found = identify(

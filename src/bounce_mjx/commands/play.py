@@ -51,8 +51,8 @@ class PlayCommand(WorldCommand):
     """World of the episodes, if a term is given, in place of the world of the training."""
     log: Path | None = None
     """Log of a robot's run, as for bounce-mjx identify; writes a page (--html, by default the log's
-    name with .html) with the measured run beside its simulation in --world. --robot is the robot's
-    config."""
+    name with _replay.html) with the measured run beside its simulation in --world. --robot is the
+    robot's config."""
     topics: TopicsConfig = TopicsConfig()
     """Topics of a log that is a bag."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
@@ -121,7 +121,7 @@ def _replay_log(
             f"--log writes a page of the recorded run, and {' and '.join(refused)} cannot be "
             "combined with it; omit one of the two"
         )
-    page = viewing.html or Path(f"{command.log.stem}.html")
+    page = viewing.html or Path(f"{command.log.stem}_replay.html")
     with no_garbage_collection():
         from bounce_mjx.env.env import Env
         from bounce_mjx.identify.bags import Topics
@@ -142,17 +142,15 @@ def _replay_log(
     commands, console = given_commands(preset.env), Console(highlight=False)
     set_up_jax(preset.env)
     env, topics = Env(preset.env), Topics(**command.topics.model_dump())
-    log = read_log(command.log, env.mj_model, topics, lambda x: console.out(f"warning: {x}"))
+    log, _ = read_log(command.log, env.mj_model, topics)
     with console.status("simulating"):
         found = replay_log(preset.env, log, estimates, viewing.seconds)
         frames = recording(env, found, commands)
         write_page(page, env, frames, viewing.fps, ("measured", "simulated"))
     angles, ball = found.distances
-    far = "" if math.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
-    console.out(
-        f"simulated in {shown}; joint angles differ by {1e3 * angles:.2f} mrad{far} "
-        "(root mean square)"
-    )
+    off = f"joint angles differ by {1e3 * angles:.2f} mrad"
+    off += " (no bounce is shown)" if math.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
+    console.out(f"simulated in {shown}; root mean square: {off}")
     console.out(f"written: {page}")
 
 
