@@ -74,7 +74,7 @@ def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, c
     first, second = table.splitlines()[2:4]
     assert first.startswith("| seeds | 2 | 7 of 9 | 20 | 0.10 | 15 (10 to 20) |")
     assert second.startswith("| robust | 1 | 7 of 9 | 20 | 0.10 | 30 |")
-    assert '<td class="">robust</td>' in (tmp_path / "found/benchmark.html").read_text()
+    assert 'title="policy">robust</td>' in (tmp_path / "found/benchmark.html").read_text()
 
 
 def test_an_interrupted_benchmark_leaves_the_rows_so_far(tmp_path: Path, monkeypatch) -> None:

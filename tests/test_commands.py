@@ -1,5 +1,6 @@
 """The commands: the files that they write, and their messages after mistakes."""
 
+import contextlib
 import io
 import json
 import os
@@ -10,20 +11,23 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+import tyro
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
-from bounce_mjx.commands import play as play_command
-from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.commands.main import COMMANDS
+from bounce_mjx.commands.main import main as console_script
+from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.resources import resource_path
@@ -233,7 +237,7 @@ BAD_EVAL_FLAGS = {
     "unknown engine": ("--physics warp", "--physics", "{config,fused,mjx,mujoco}", "warp"),
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
-    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder"),
+    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder", "pretrained, robust, "),
     "no runs": ("--log-dir mine", "no run", "in mine", "bounce-mjx train"),
     "no run": (".", "config.yaml", "give a folder that bounce-mjx train made"),
 }
@@ -406,15 +410,54 @@ def test_help(main: Callable[[list[str]], None], capsys) -> None:
     assert flag in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "main", [train_command.main, eval_command.main, play_command.main, plot_command.main]
-)
-def test_help_has_no_empty_default_and_no_nested_brackets(main, capsys) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_plain_forms_and_no_empty_default(command: str, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit):
-        main(["--help"])
+        console_script([command, "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", "").split())
     assert "usage: " in shown
-    assert "[[" not in shown and "(default: )" not in shown
+    for oddity in ("None}", "{None", "[[", "...]]", "(default: )", "(default: None)", "{True"):
+        assert oddity not in shown
+
+
+def test_help_shows_the_form_of_each_kind_of_value(monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+
+    class Inner(StrictModel):
+        pair: tuple[float, float] | None = (1.0, 2.0)
+        """A pair
+        of numbers."""
+
+    class Command(StrictModel):
+        files: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+        path: Path | None = None
+        counts: tuple[int, ...] = (3, 4)
+        limits: tuple[float | None, ...] | None = None
+        shares: dict[str, float] | None = None
+        kind: Literal["a", "b"] | None = None
+        switch: bool = True
+        inner: Inner = Inner()
+
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):
+        parse(Command, ["--help"], prog="it")
+    assert "A pair of numbers." in shown.getvalue(), "a docstring's line break is kept"
+    text = " ".join(shown.getvalue().replace("│", "").split())
+    for form in (
+        "[PATH ...]",
+        "--path PATH",
+        "--counts INT ... (default: 3 4)",
+        "--limits FLOAT ...",
+        "--shares STR FLOAT ...",
+        "--kind {a,b}",
+        "--switch, --no-switch (default: True)",
+        "--inner.pair FLOAT FLOAT A pair of numbers. (default: 1.0 2.0)",
+    ):
+        assert form in text, form
+    command = parse(Command, ["--inner.pair", "None", "--limits", "1", "None"], prog="it")
+    assert command.inner.pair is None and command.limits == (1.0, None)
+    assert parse(Command, ["a", "b"], prog="it").files == (Path("a"), Path("b"))
 
 
 def test_training_ends_at_the_whole_block_nearest_to_its_steps(tmp_path: Path, capsys) -> None:

@@ -281,6 +281,11 @@ def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     assert low - 3e-3 < truth["action_latency"] < high + 3e-3 and high - low < 0.01
     assert 115.0 < np.mean(ranges["camera_rate"]) < 125.0
     assert ranges["frame_drop"][0] < 0.05 < ranges["frame_drop"][1] + 0.02
+    known = {name: np.array(value) for name, value in world.estimates.items()}
+    late, true = (w["action_latency"] + w["servo_lag"] for w in (known, truth))
+    assert abs(late - true) < 1.5e-3
+    damping, true = (w["servo_damping"] / w["servo_gain"] for w in (known, truth))
+    np.testing.assert_allclose(damping, true, rtol=0.3)
     # Gain and mass cannot be told apart by such a log, and the file says so.
     assert "randomization.link_mass" in world.assumed
     assert any("link_mass" in sentence for sentence in sentences(found, NAMES))

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
@@ -464,6 +465,25 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     assert header == ["condition", "strength", "C", "P", "H", "U", "S"]
     described = [line.strip() for line in lines]
     assert "U  upward speed: what upward speed means, m/s" in described
+
+
+LONG_NAME = "twice randomization.joint_velocity_noise_of_a_long_name"
+
+
+def test_a_long_name_is_whole_in_one_line_of_a_pipe_and_in_a_narrow_terminal(
+    report: RobustnessReport, monkeypatch, capsys
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    report.outcomes[-1].perturbation = LONG_NAME
+    table = robustness_table(report)
+    stdout().print(table)
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if LONG_NAME in line]
+    assert row.split()[-6:] == ["100.0", "99.0", "98.0", "1.40", "100.0", "pass"]
+    stdout(width=80, force_terminal=True, color_system=None).print(table)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    first_words = "".join(line[: line.find("  ")] for line in lines if "  " in line)
+    assert LONG_NAME.replace(" ", "") in first_words.replace(" ", "")
 
 
 def test_the_score_names_its_misses_and_shows_survival_with_the_other_results(

@@ -33,7 +33,6 @@ from bounce_mjx.runs.config import (
     load_config,
     load_run_config,
     read_preset,
-    train_config,
 )
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
@@ -52,7 +51,6 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.reading import read_policy
-from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training import job
 from tiny_runs import contents
 
@@ -401,15 +399,6 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
         path.write_text(f"total_steps: {bad}")
         with pytest.raises(UserError, match="total_steps is"):
             load_config(path)
-
-
-def test_a_config_of_an_older_version_may_name_its_network(tmp_path: Path) -> None:
-    file = tmp_path / "config.yaml"
-    file.write_text("ppo: {network: mlp, gru_size: 64, num_envs: 8}")
-    assert load_config(file) == train_config(Bounce)(ppo={"num_envs": 8})
-    file.write_text("ppo: {network: gru, gru_size: 64}")
-    with pytest.raises(UserError, match="network is gru, .* no recurrent policies; train a policy"):
-        load_config(file)
 
 
 def test_pipe_in_place_of_a_config_does_not_block(tmp_path: Path) -> None:

@@ -39,14 +39,14 @@ PUBLIC = re.compile(
 RESULT = r"rests +episodes"
 
 # A baseline for bouncing; a ball that hits something in the physics of the world; a default or an
-# example in a sentence for users; and the keys of older files.
+# example in a sentence for users.
 ALLOWED = {
     "__init__.py", "baselines/mirror.py",
-    "deploy/metadata.py", "commands/main.py", "commands/train.py",
+    "commands/main.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
     "world/ball_filter.py", "world/observation.py", "world/randomization.py",
-    "identify/fit.py", "identify/stages.py",
+    "identify/fit.py", "identify/replay.py", "identify/stages.py",
     "identify/unknowns.py", "identify/windows.py", "identify/words.py", "identify/world.py",
 }  # fmt: skip
 

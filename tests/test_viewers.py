@@ -1133,7 +1133,7 @@ def test_a_replay_shows_the_commands_of_any_task(
     shown = []
     watch(monkeypatch, Scene, "update", lambda _, frames: shown.extend(frames))
     leaning.command = {"lean_angle": 0.1, "pace": 1.5}
-    write_page(tmp_path / "a.html", leaning, leaning.record(0.2), fps=20)
+    write_page(tmp_path / "a.html", leaning.env, leaning.record(0.2), fps=20)
     assert (tmp_path / "a.html").exists() and len(shown) == 4
     for frame in shown:
         np.testing.assert_allclose(frame.command["lean_angle"], [0.1, 0.1])

@@ -11,7 +11,7 @@ ARM_POLICIES = ("ur5e", "panda", "iiwa")
 POLICIES = {PRETRAINED: PRETRAINED} | {
     name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES, *ARM_POLICIES)
 }
-"""The policies that may come with the package, and their folders."""
+"""The policies that come with the package, and their folders."""
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -24,8 +24,3 @@ def resource_path(name: str) -> Path:
     inside = _PACKAGE / name
     # Unlike os.path.exists, Path.exists raises an error for a name that is too long.
     return inside if os.path.exists(inside) else _PACKAGE.parent.parent / name
-
-
-def present_policies() -> str:
-    """Names of the policies that come with this version of the package, for a sentence."""
-    return ", ".join(name for name in POLICIES if os.path.isdir(resource_path(POLICIES[name])))

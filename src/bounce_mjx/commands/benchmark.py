@@ -26,7 +26,7 @@ from bounce_mjx.interrupt import interruptible
 class BenchmarkCommand(ActorCommand):
     """Ranks policies by figures beyond the expected results (docs/benchmark.md)."""
 
-    policies: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    policies: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY ...")]
     """Rows of the table: a run, a checkpoint, a policy that comes with the package, mirror for the
     mirror law, or a folder whose runs are the seeds of one training."""
     episodes: Count = DEFAULT_CONDITION_EPISODES

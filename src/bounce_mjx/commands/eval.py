@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -65,7 +66,7 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
-    console = Console()
+    console = stdout()
     checkpoint = command.choose(command.checkpoint, console)
     if command.nominal and command.world is not None:
         raise UserError("--nominal and --world cannot be combined; omit one")

@@ -8,23 +8,13 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from bounce_mjx.commands.run_options import TopicsConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import read_preset
-
-
-class TopicsConfig(StrictModel):
-    """Topics of a ROS bag."""
-
-    joints: str = "/joint_states"
-    """JointState with the measured joint angles."""
-    targets: str = "/servo_targets"
-    """JointState or Float64MultiArray with the servo targets."""
-    ball: str = "/ball"
-    """PointStamped or PoseStamped with the ball's position."""
 
 
 class IdentifyCommand(StrictModel):
@@ -53,13 +43,13 @@ def main(args: Sequence[str]) -> None:
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
     with no_garbage_collection():
-        from bounce_mjx.identify.bags import Topics, is_bag, read_bag
-        from bounce_mjx.identify.log import check, in_one_clock, read_csv
+        from bounce_mjx.identify.bags import Topics
+        from bounce_mjx.identify.reading import read_log
         from bounce_mjx.identify.stages import identify, joined
         from bounce_mjx.identify.words import estimates, sentences
         from bounce_mjx.identify.world import compare, world_of
         from bounce_mjx.reports.identification import identification_page
-        from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+        from bounce_mjx.robot.model import joint_names, load_model
         from bounce_mjx.runs.files import check_output, writable, write_output
         from bounce_mjx.training.setup import set_up_jax
         from bounce_mjx.world.named import read_world
@@ -72,15 +62,14 @@ def main(args: Sequence[str]) -> None:
     config = read_preset(Path("default"), command.robot).env
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     names = joint_names(model)
-    ranges = model.jnt_range[list(find_addresses(model).arm_joints)]
     topics = Topics(**command.topics.model_dump())
     console = Console(soft_wrap=True, highlight=False)
     logs = []
     for path in command.logs:
-        log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
-        for warning in check(log, names, ranges):
+        log, warnings = read_log(path, model, topics)
+        for warning in warnings:
             console.print(f"warning: {warning}", markup=False)
-        logs.append(in_one_clock(log))
+        logs.append(log)
     set_up_jax(config)
     log = joined(logs)
     found = identify(

@@ -20,7 +20,7 @@ class PlotCommand(RunCommand):
     runs: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="[RUN ...]", help_behavior_hint=""),
+        tyro.conf.arg(metavar="[RUN ...]"),
     ] = ()
     """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one

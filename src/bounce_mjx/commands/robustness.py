@@ -4,11 +4,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import OneActorCommand
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -70,7 +69,7 @@ def main(args: Sequence[str]) -> None:
 
     if command.assumed and command.world is None:
         raise UserError("--assumed needs a named world; give one with --world, or leave it out")
-    console = Console()
+    console = stdout()
     checkpoint = command.choose(command.checkpoint, console)
     config = command.config_of(checkpoint)
     suite = resource_path("configs/robustness.yaml")

@@ -7,7 +7,6 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.command_line import NO_DEFAULT
 from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import interruptible_imports, leave
@@ -34,7 +33,7 @@ class TrainCommand(TrainingCommand):
     """Serve a page during the training, with the newest policy, the curves and the results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
-    watch_allow_host: Annotated[tuple[HostName, ...], NO_DEFAULT] = ()
+    watch_allow_host: tuple[HostName, ...] = ()
     """Other names under which a browser may open that page, such as a proxy's."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""

@@ -2,17 +2,28 @@
 
 import difflib
 import itertools
+import re
 import sys
 import typing
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pydantic
 import tyro
 from pydantic.fields import FieldInfo
+from rich.console import Console
 
 # tyro's own hook for replacing its error boxes; unstable, so pyproject.toml bounds the version.
 from tyro import _errors as tyro_errors
+from tyro.constructors import (
+    MISSING_NONPROP,
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from bounce_mjx.config.settings import whole_number
 from bounce_mjx.config.validation import describe
@@ -20,8 +31,23 @@ from bounce_mjx.errors import UserError
 
 CommandT = TypeVar("CommandT")
 
-NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
-"""Marks a setting whose help names no default value, as it is empty."""
+# Columns: more than any table or line has.
+_NO_WRAP = 100_000
+
+_REGISTRY = ConstructorRegistry()
+
+
+def stdout(**options: Any) -> Console:
+    """The console that a command prints to. Elsewhere than on a terminal, such as in a pipe, it
+    neither wraps nor cuts a line.
+
+    Args:
+      options: arguments of `rich.console.Console`.
+    """
+    console = Console(**options)
+    if not console.is_terminal:
+        console.width = _NO_WRAP
+    return console
 
 
 def parse(
@@ -54,11 +80,48 @@ def parse(
                 args=words,
                 prog=prog,
                 description=description,
+                registry=_REGISTRY,
                 **({} if default is None else {"default": default}),
             )
         # tyro raises the errors of groups without a prefix, and reports the others as an event.
         except pydantic.ValidationError as error:
             raise UserError(f"{_bad_value(error, command_class)} (see {prog} --help)") from error
+
+
+@_REGISTRY.struct_rule
+def _described(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """A group of settings with help that reads well: tyro's own rule keeps the line breaks of the
+    docstrings, and shows `{None}|PATH` and `(default: )`."""
+    if not (isinstance(info.type, type) and issubclass(info.type, pydantic.BaseModel)):
+        return None
+    fields = []
+    for name, field in info.type.model_fields.items():
+        default = getattr(info.default, name, MISSING_NONPROP)
+        if default is MISSING_NONPROP and not field.is_required():
+            default = field.get_default(call_default_factory=True)
+        hint = "" if default in (None, (), MISSING_NONPROP) else "(default: {})".format
+        # The field's own marks follow, and win.
+        mark = tyro.conf.arg(metavar=_metavar(field), help_behavior_hint=hint)
+        kind = Annotated[field.annotation, mark, *field.metadata]
+        text = " ".join((field.description or "").split())
+        fields.append(StructFieldSpec(name, kind, default, text or None))
+    return StructConstructorSpec(info.type, tuple(fields))
+
+
+def _metavar(field: FieldInfo) -> str | None:
+    """The form of a setting's value: `PATH` of tyro's `{None}|PATH`, `INT ...` of
+    `[INT [INT ...]]`; None for a group or a switch, which take none."""
+    if field.annotation is bool or _is_group(field):
+        return None
+    kind = PrimitiveTypeInfo.make(field.annotation, set())
+    spec = ConstructorRegistry.get_primitive_spec(kind)
+    if not isinstance(spec, PrimitiveConstructorSpec):
+        return None
+    form = re.sub(r"\{None\}\||(?<=\{)None,", "", spec.metavar)
+    form = re.sub(r"\[(.+?) \[\1 \.\.\.\]\]", r"\1 ...", form)
+    if "," not in form:
+        form = form.strip("{}")
+    return f"[{form}]" if tyro.conf.Positional in field.metadata else form
 
 
 def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> list[str]:
@@ -116,7 +179,7 @@ def _mistake(
     if argument is None:
         return "the command line is not understood"
     flag = (argument.lowered.name_or_flags or [argument.field.extern_name])[0]
-    wanted = (argument.lowered.metavar or "no value").removeprefix("{None}|")
+    wanted = argument.lowered.metavar or "no value"
     return f"{flag} takes {wanted}, but was given {_given(args, flag) or 'nothing'}"
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import POLICIES, present_policies, resource_path
+from bounce_mjx.resources import POLICIES, resource_path
 
 
 def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedPolicy:
@@ -22,11 +22,6 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
     """
     if isinstance(policy, str) and policy in POLICIES:
         path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
-        if not path.is_file():
-            raise UserError(
-                f"the policy {policy} is not in this version of the package; give one of "
-                f"{present_policies()}, a .onnx file or a run's folder"
-            )
         return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
     path = Path(policy)
     if os.path.isdir(path):
@@ -35,7 +30,7 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
         return DeployedPolicy(path.read_bytes(), str(path))
     except OSError as error:
         raise UserError(
-            f"the policy {path} cannot be read ({error.strerror}); give {present_policies()}, "
+            f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
             "a .onnx file or a run's folder"
         ) from error
 

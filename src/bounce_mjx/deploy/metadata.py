@@ -11,7 +11,7 @@ from bounce_mjx.deploy.strict import read
 from bounce_mjx.world.ball_filter import Constants
 
 FORMAT = 3
-"""Version of the entries; readers refuse other versions, except 2."""
+"""Version of the entries; readers refuse other versions."""
 
 UNITS = {
     "joint_angles": "rad",
@@ -168,16 +168,9 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for anything else."""
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
-        if given != 2:
-            raise ValueError(f"its format is {given}, not {FORMAT}")
-        command = {"range": json.loads(entries.get("target_height_range", "0")), "unit": "m"}
-        entries = entries | {"commands": json.dumps({"target_height": command})}
-    # The actions of older files add to the measured angle.
-    entries = {"max_lead": "null"} | _LATER | entries
+        raise ValueError(f"its format is {given}, not {FORMAT}")
+    entries = _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
-    # An entry of older versions.
-    if json.loads(entries.get("memory_size", "0")):
-        raise ValueError("its network has a memory, which this version does not run")
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
     kinds = get_type_hints(Metadata, include_extras=True)

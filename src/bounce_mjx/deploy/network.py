@@ -98,8 +98,7 @@ class OnnxNetwork:
         stated = {}
         for part in metadata.observation:
             if part.name not in remembered and part.name not in sizes:
-                advice = "; export the policy again" if metadata.format == 2 else ""
-                raise ValueError(f"its input {part.name} is unknown here{advice}")
+                raise ValueError(f"its input {part.name} is unknown here")
             if (size := sizes.get(part.name, part.size)) != part.size:
                 raise ValueError(f"its input {part.name} must have the size {size}")
             stated[part.name] = _FLOAT, [part.history, part.size]

@@ -8,12 +8,11 @@ import numpy as np
 import pydantic
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.episodes import reset_episodes
+from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
 from bounce_mjx.evaluation.results import episodes_of
 from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_conditions
-from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import load_suite, neutral_commands
 from bounce_mjx.interrupt import in_daemon_thread
 from bounce_mjx.learning.policy import Actor, Policy
@@ -109,27 +108,15 @@ def measure_nominal(
     # A ball that rests on the paddle is never lost.
     most_steps = int(MOST_SECONDS / env.dt) if hits else env.config.episode_steps
 
+    def lasts(statistics: Statistics) -> jax.Array | bool:
+        return statistics.tally.sums[hits] < MOST_HITS if hits else True
+
     @jax.jit
     def run(policy: Policy | None, key: jax.Array) -> Statistics:
         states = reset_episodes(env, key, HIT_EPISODES if hits else TIMED_EPISODES, ranges or None)
 
-        def unfinished(now: tuple[State, Statistics, jax.Array]) -> jax.Array:
-            return jnp.any(now[1].running) & (now[2] < most_steps)
-
-        def advance(
-            now: tuple[State, Statistics, jax.Array],
-        ) -> tuple[State, Statistics, jax.Array]:
-            states, statistics, step = now
-            actions = acting.act(policy, states.obs.T).T
-            states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions)
-            statistics = accumulate(env, statistics, states, step)
-            if hits:
-                goes_on = statistics.running & (statistics.tally.sums[hits] < MOST_HITS)
-                statistics = statistics._replace(running=goes_on)
-            return states, statistics, step + 1
-
-        start = states, empty_statistics(env, states), jnp.int32(0)
-        return jax.lax.while_loop(unfinished, advance, start)[1]
+        begun = begin(env, states, recorded=0)
+        return run_until(env, acting, policy, begun, most_steps, lasts).statistics
 
     statistics = run(policy, jax.random.PRNGKey(seed))
     statistics = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)

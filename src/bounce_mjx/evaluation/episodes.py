@@ -16,7 +16,7 @@ from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
 
-class _UnderWay(NamedTuple):
+class UnderWay(NamedTuple):
     """Episodes under way, batch last."""
 
     states: State
@@ -45,12 +45,12 @@ def make_evaluator(
         return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
 
     @jax.jit
-    def start(key: jax.Array, ranges: Ranges | None) -> _UnderWay:
-        return _begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
+    def start(key: jax.Array, ranges: Ranges | None) -> UnderWay:
+        return begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
 
     @jax.jit
-    def go_on(policy: Policy, now: _UnderWay, last_step: jax.Array) -> _UnderWay:
-        return _run_until(env, actor, policy, now, last_step)
+    def go_on(policy: Policy, now: UnderWay, last_step: jax.Array) -> UnderWay:
+        return run_until(env, actor, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         now, limit = start(key, ranges), env.config.episode_steps
@@ -87,13 +87,14 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
-    begun = _begin(env, states, recorded)
-    ended = _run_until(env, actor, policy, begun, env.config.episode_steps)
+    begun = begin(env, states, recorded)
+    ended = run_until(env, actor, policy, begun, env.config.episode_steps)
     return ended.statistics, ended.recording
 
 
-def _begin(env: Env, states: State, recorded: int) -> _UnderWay:
-    return _UnderWay(
+def begin(env: Env, states: State, recorded: int) -> UnderWay:
+    """Episodes before their first step, from initial states (batch last)."""
+    return UnderWay(
         states=states,
         statistics=empty_statistics(env, states),
         recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
@@ -101,24 +102,30 @@ def _begin(env: Env, states: State, recorded: int) -> _UnderWay:
     )
 
 
-def _run_until(
+def run_until(
     env: Env,
     actor: Actor,
-    policy: Policy,
-    progress: _UnderWay,
+    policy: Policy | None,
+    progress: UnderWay,
     last_step: int | jax.Array,
-) -> _UnderWay:
-    """Goes on until all episodes have ended or `last_step` is reached."""
+    lasts: Callable[[Statistics], jax.Array | bool] = lambda statistics: True,
+) -> UnderWay:
+    """Continues until all episodes have ended or `last_step` is reached.
 
-    def unfinished(now: _UnderWay) -> jax.Array:
+    Args:
+      lasts: whether each episode continues by its statistics so far [E], bool.
+    """
+
+    def unfinished(now: UnderWay) -> jax.Array:
         return jnp.any(now.statistics.running) & (now.step < last_step)
 
-    def advance(now: _UnderWay) -> _UnderWay:
+    def advance(now: UnderWay) -> UnderWay:
         actions = actor.act(policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        return _UnderWay(
+        statistics = accumulate(env, now.statistics, states, now.step)
+        return UnderWay(
             states=states,
-            statistics=accumulate(env, now.statistics, states, now.step),
+            statistics=statistics._replace(running=statistics.running & lasts(statistics)),
             recording=record(env, now.recording, states, now.statistics.running, now.step),
             step=now.step + 1,
         )

@@ -16,7 +16,7 @@ from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.world.randomization import RandomizationConfig, Ranges
 
 
 class PolicyEvaluation(NamedTuple):
@@ -48,16 +48,13 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
-    env = Env(_with_options(env_config, options))
-    commands = _commands(env_config, options)
+    env, commands, ranges = _prepared(env_config, options)
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
     evaluate = make(env, actor(env), options.episodes, progress)
-    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    key = jax.random.PRNGKey(options.seed)
-    statistics = evaluate(policy, key, ranges if commands else None)
+    statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
     return PolicyEvaluation(
         judge(env, statistics, commands),
         engine,
@@ -75,13 +72,18 @@ def recorded_episodes(
 ) -> Recording:
     """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`. In
     place of MuJoCo's C engine, the config's simulates."""
-    env = Env(_with_options(env_config, options))
-    commands = _commands(env_config, options)
+    env, _, ranges = _prepared(env_config, options)
     evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
+    return jax.device_get(evaluate(policy, jax.random.PRNGKey(options.seed), ranges)[1])
+
+
+def _prepared(
+    config: WorldConfig, options: EvaluationOptions
+) -> tuple[Env, dict[str, tuple[float, float]], Ranges | None]:
+    """The environment, the changed ranges of commands, and the ranges of its resets."""
+    env, commands = Env(_with_options(config, options)), _commands(config, options)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    key = jax.random.PRNGKey(options.seed)
-    _, recording = evaluate(policy, key, ranges if commands else None)
-    return jax.device_get(recording)
+    return env, commands, ranges if commands else None
 
 
 def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:

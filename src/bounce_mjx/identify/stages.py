@@ -24,10 +24,10 @@ _FRICTIONS = (0.01, 0.2)
 # Windows in which the first candidates are compared.
 _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
-# Time before a bounce at which a flight counts as over, s: the camera's jitter and half a contact.
-_BEFORE_BOUNCE = 0.012
-# A ball this high above a model's origin touches nothing, m.
-_NO_BALL = np.array([0.0, 0.0, 50.0])
+BEFORE_BOUNCE = 0.012
+"""Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
+NO_BALL = np.array([0.0, 0.0, 50.0])
+"""The ball in windows without one, m: so high above a model's origin it touches nothing."""
 _FEWEST_BOUNCES = 3
 
 
@@ -140,7 +140,7 @@ def identify(
     Raises:
       UserError: the log has no window.
     """
-    windows = cut(log, config.physics_dt, _NO_BALL)
+    windows = cut(log, config.physics_dt, NO_BALL)
     if len(windows.first) < 5:
         raise UserError(
             f"{log.source} has {len(windows.first)} stretches of unbroken joint angles and servo "
@@ -153,7 +153,7 @@ def identify(
     run, noise = make_run(config, config.num_joints), sensor_noise(log)
 
     def search_in(log: Log) -> _Search:
-        windows = cut(log, config.physics_dt, _NO_BALL)
+        windows = cut(log, config.physics_dt, NO_BALL)
         simulate = make_simulator(run, layout, log, windows)
         return _Search(Problem(simulate, windows, layout, noise), progress)
 
@@ -235,7 +235,7 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
     windows, ball_state = search.problem.windows, ~search.arm_state
     search.progress("flight")
-    flying = windows.picture_times < windows.bounces[:, None] - _BEFORE_BOUNCE
+    flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
     fit = search.run(["flight"], fit, flying * 1.0, 4, ball_state)
     search.progress("bounce")
     # A ball that slips and one that sticks are two valleys, and each latency may be one.

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.identify.log import Log
 
 MAX_DELAY = 0.08
@@ -68,9 +69,17 @@ def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240
     Args:
       no_ball: position [3] of the ball in windows without one, away from the paddle.
       max_windows: the largest number; of more, every k-th is kept.
+
+    Raises:
+      UserError: there is none.
     """
     spans = [(b - before, b + after, b) for b, before, after in _bounces(log)]
     spans += [(start, end, np.nan) for start, end in _rest(log, spans)]
+    if not spans:
+        raise UserError(
+            f"{log.source} has no stretch of unbroken joint angles and servo targets; record at "
+            "least 5 s"
+        )
     spans.sort()
     if len(spans) > max_windows:
         keep = np.linspace(0, len(spans) - 1, max_windows).round().astype(int)

@@ -1,4 +1,4 @@
-"""The identified world in a file: the ranges for a training, each with its source."""
+"""The identified world in a file: the estimates, and ranges for a training with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world.
+    """YAML text of the identified world: the estimates, and ranges for a training.
 
     The range of a term covers what the log allows for each of its entries while all other unknowns
     have their estimates, with a margin of half: independent draws from the whole intervals of
@@ -32,8 +32,9 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     places, listed = found.layout.slices(), estimates(found, joint_names)
     for name, place in places.items():
         by_term[name] = listed[place]
-    late = _least_age(log)
+    late = least_age(log)
     ranges: dict[str, list[float]] = {}
+    identified: dict[str, float | list[float]] = {}
     sources: dict[str, str] = {}
     assumed = []
     for name, entries in by_term.items():
@@ -41,6 +42,8 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
             continue
         shift = late if name == "ball_latency" else 0.0
         ranges[name] = _range(name, entries, shift)
+        each = [float(f"{entry.value + shift:.5g}") for entry in entries]
+        identified[name] = each if len(each) > 1 else each[0]
         shown = [entry for entry in entries if entry.seen]
         if len(shown) < len(entries):
             assumed.append(name)
@@ -60,12 +63,13 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     content["env"] = {"randomization": ranges}
     content["sources"] = {f"randomization.{name}": text for name, text in sources.items()}
     content["assumed"] = [f"randomization.{name}" for name in assumed]
+    content["estimates"] = identified
     head = f"# Identified from {log.source}: bounce-mjx train --world FILE\n"
     # Ranges on one line each, and sources below one another.
     parts = [
         yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
         for key, value in content.items()
-        for style in [None if key == "env" else False]
+        for style in [None if key in ("env", "estimates") else False]
     ]
     return head + "".join(parts)
 
@@ -76,7 +80,7 @@ def compare(
     """Terms of a world that a log contradicts, a sentence each; none if the robot is still the
     same."""
     given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
-    late, changed = _least_age(log), []
+    late, changed = least_age(log), []
     for name, place in found.layout.slices().items():
         if name not in given:
             continue
@@ -110,7 +114,7 @@ def _clipped(name: str, low: float, high: float) -> list[float]:
     return [float(f"{x:.4g}") for x in ends]
 
 
-def _least_age(log: Log) -> float:
+def least_age(log: Log) -> float:
     """Time from a picture's stamp to its arrival, s: 0 if the stamp is that of the arrival. Of the
     youngest pictures, as the others wait for the next control step."""
     if not len(log.arrivals):

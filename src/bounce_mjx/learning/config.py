@@ -1,6 +1,6 @@
 """Settings of the trainer."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
@@ -67,19 +67,6 @@ class PPOConfig(StrictModel):
     critic_metrics: tuple[str, ...] | None = None
     """Metrics of the environment that are inputs of the value network in addition to the
     observation; null for those that the task names, because its reward depends on them."""
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _check_network(cls, values: Any) -> Any:
-        """Configs of older versions name the kind of the policy network."""
-        if not isinstance(values, dict):
-            return values
-        if values.get("network", "mlp") != "mlp":
-            raise ValueError(
-                f"network is {values['network']}, but this version has no recurrent policies; "
-                "train a policy that sees past values, such as env.observation.ball_position: 10"
-            )
-        return {key: x for key, x in values.items() if key not in ("network", "gru_size")}
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):

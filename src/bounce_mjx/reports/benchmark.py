@@ -2,6 +2,7 @@
 training."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -117,7 +118,11 @@ def caption(benchmark: Benchmark) -> str:
 
 
 def page(benchmark: Benchmark) -> str:
-    """The table as a page of HTML."""
+    """The table as a page of HTML, in which no interval is broken into two lines."""
+    rows = [
+        [re.sub(r"\(.*?\)", lambda part: part[0].replace(" ", "\u00a0"), cell) for cell in row]
+        for row in benchmark.cells
+    ]
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -128,8 +133,8 @@ def page(benchmark: Benchmark) -> str:
 </head>
 <body>
 <h1>Benchmark</h1>
-{table(benchmark.header, benchmark.cells)}
 <p>{caption(benchmark)}</p>
+{table(benchmark.header, rows, has_many_columns=True)}
 </body>
 </html>
 """

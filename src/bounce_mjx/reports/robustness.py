@@ -79,7 +79,8 @@ def robustness_table(report: RobustnessReport) -> Table:
         padding=(0, 0, 0, 1),
         pad_edge=False,
     )
-    table.add_column("condition")
+    # A word that is wider than the terminal leaves continues in the next line.
+    table.add_column("condition", overflow="fold")
     table.add_column("strength", justify="right")
     for header in (*(f"{letter} " for letter in letters.values()), ""):
         table.add_column(header, justify="right")

@@ -34,13 +34,7 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import (
-    POLICIES,
-    PRETRAINED,
-    TASK_POLICIES,
-    present_policies,
-    resource_path,
-)
+from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
@@ -221,13 +215,7 @@ def best_checkpoint(run: Path) -> Checkpoint:
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
     """Checkpoint of a policy in `POLICIES`."""
-    folder = resource_path(POLICIES[name])
-    if not folder.is_dir():
-        raise UserError(
-            f"the policy {name} is not in this version of the package; give {present_policies()} "
-            "or a run's folder"
-        )
-    return best_checkpoint(folder)
+    return best_checkpoint(resource_path(POLICIES[name]))
 
 
 def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Checkpoint:
@@ -248,6 +236,11 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
+    if not os.path.isdir(run):
+        raise UserError(
+            f"there is no run {run}, and no policy of this name; give a run's folder such as "
+            f"runs/bounce_ball/<time stamp>, or {', '.join(POLICIES)}"
+        )
     if run != path:
         for line in _introduction(run, log_dir):
             console.out(line, highlight=False)

@@ -14,7 +14,9 @@ from bounce_mjx.task.results import (
     share_of_events,
 )
 from bounce_mjx.task.rewards import (
+    Gaussian,
     Near,
+    Proportional,
     RewardTerm,
     gaussian,
     horizontal_distance,
@@ -37,6 +39,7 @@ __all__ = [
     "Episodes",
     "Figure",
     "Flight",
+    "Gaussian",
     "Histogram",
     "History",
     "Hits",
@@ -46,6 +49,7 @@ __all__ = [
     "Near",
     "NumBalls",
     "ObservationConfig",
+    "Proportional",
     "Quantity",
     "RandomizationConfig",
     "Recording",

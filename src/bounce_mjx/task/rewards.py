@@ -39,6 +39,25 @@ class Near(RewardTerm):
         return 1.0 / (1.0 + jnp.sum(jnp.square(error)) / self.scale**2)
 
 
+class Gaussian(RewardTerm):
+    """A term that falls with an error: weight * exp(-error^2 / (2 scale^2))."""
+
+    scale: Positive = 0.05
+    """Width, in the unit of the error."""
+
+    def value(self, error: jax.Array) -> jax.Array:
+        """The unweighted term [] for an error []."""
+        return gaussian(error, self.scale)
+
+
+class Proportional(RewardTerm):
+    """A term proportional to a number."""
+
+    def value(self, number: jax.Array) -> jax.Array:
+        """The number [] itself."""
+        return 1.0 * number
+
+
 def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
     """Names of the terms in a group of settings, in order."""
     return tuple(

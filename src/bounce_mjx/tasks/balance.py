@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, NonNegative, Positive
+from bounce_mjx.config.settings import Finite, NonNegative
 from bounce_mjx.lazy import jax, jnp
 
 REACH = 0.03
@@ -29,48 +29,15 @@ MIN_STABLE = 0.99
 """Least share of episodes that last."""
 
 
-class Inputs(NamedTuple):
-    """What the reward terms depend on, each []: the horizontal distance of the ball from the point
-    and the distance of the paddle from its home (m), and the mean squared change of the action."""
-
-    error: jax.Array
-    paddle: jax.Array
-    action_change: jax.Array
-
-
-class PointReward(task.RewardTerm):
-    """Point: the ball is at the point."""
-
-    scale: Positive = 0.015
-    """Width of the Gaussian, m."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return task.gaussian(inputs.error, self.scale)
-
-
-class HomeReward(task.RewardTerm):
-    """Home: the paddle stays where it is held at a reset."""
-
-    scale: Positive = 0.05
-    """Width of the Gaussian, m."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return task.gaussian(inputs.paddle, self.scale)
-
-
-class ActionRateReward(task.RewardTerm):
-    """Action rate: the action does not jump."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return inputs.action_change
-
-
 class Rewards(task.StrictModel):
     """The reward terms."""
 
-    point: PointReward = PointReward(weight=2.0)
-    home: HomeReward = HomeReward()
-    action_rate: ActionRateReward = ActionRateReward(weight=-0.2)
+    point: task.Gaussian = task.Gaussian(weight=2.0, scale=0.015)
+    """The ball is at the point."""
+    home: task.Gaussian = task.Gaussian(scale=0.05)
+    """The paddle stays where it is held at a reset."""
+    action_rate: task.Proportional = task.Proportional(weight=-0.2)
+    """The mean squared change of the action: it does not jump."""
 
 
 class Observation(task.ObservationConfig):
@@ -133,16 +100,16 @@ class Balance(task.Task):
     def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
         truth, error = step.truth, _error(step.truth, step.command)
         offset = truth.ball_position - truth.paddle_position
-        inputs = Inputs(
-            error=task.length(error),
-            paddle=task.length(truth.paddle_position - jnp.array(self.focus())),
-            action_change=jnp.mean(jnp.square(step.action - step.last_action)),
-        )
+        values = {
+            "point": task.length(error),
+            "home": task.length(truth.paddle_position - jnp.array(self.focus())),
+            "action_rate": jnp.mean(jnp.square(step.action - step.last_action)),
+        }
         return task.TaskStep(
             state=centre,
-            reward=task.weighted_terms(self.config.reward, inputs),
+            reward={n: term.weight * term.value(values[n]) for n, term in self.config.reward},
             ended=(offset[2] < -LOST_DEPTH) | (task.length(offset) > LOST_DISTANCE),
-            metrics={"error": inputs.error},
+            metrics={"error": values["point"]},
         )
 
     def next_command(self, centre: jax.Array, command: task.Values) -> task.Values:

@@ -111,20 +111,6 @@ class BounceConfig(WorldConfig):
     reward: BounceReward = BounceReward()
     """The reward terms."""
 
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _read_former_keys(cls, values: Any) -> Any:
-        """Earlier configs have the target height among the terms of the randomisation."""
-        terms = values.get("randomization") if isinstance(values, dict) else None
-        if not isinstance(terms, dict) or not terms.keys() & {"target_height", "target_interval"}:
-            return values
-        terms = dict(terms)
-        heights, interval = terms.pop("target_height", None), terms.pop("target_interval", None)
-        if interval is not None:
-            terms["command_interval"] = interval
-        moved = {} if heights is None else {"target_height_range": heights}
-        return values | {"randomization": terms} | moved
-
     @pydantic.model_validator(mode="after")
     def _check_heights(self):
         low, high = self.target_height_range

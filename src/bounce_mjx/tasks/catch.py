@@ -30,58 +30,18 @@ LOST_DEPTH, FLOOR = 0.05, 0.02
 GRAVITY = 9.81
 
 
-class Inputs(NamedTuple):
-    """What the reward terms depend on, each []: the horizontal distance of the ball from the
-    paddle's centre (m), the speed relative to the paddle at which it meets it or would (m/s),
-    whether it touches the paddle and is slow, and the mean squared change of the action."""
-
-    distance: jax.Array
-    fall: jax.Array
-    resting: jax.Array
-    action_change: jax.Array
-
-
-class CentreReward(task.RewardTerm):
-    """Centre: the ball is over the paddle's centre."""
-
-    scale: Positive = 0.05
-    """Width of the Gaussian, m."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return task.gaussian(inputs.distance, self.scale)
-
-
-class FallReward(task.RewardTerm):
-    """Fall: the ball has little energy relative to the paddle."""
-
-    scale: Positive = 0.7
-    """Width of the Gaussian, m/s."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return task.gaussian(inputs.fall, self.scale)
-
-
-class RestReward(task.RewardTerm):
-    """Rest: the ball touches the paddle and moves with it."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return 1.0 * inputs.resting
-
-
-class ActionRateReward(task.RewardTerm):
-    """Action rate: the action does not jump."""
-
-    def value(self, inputs: Inputs) -> jax.Array:
-        return inputs.action_change
-
-
 class Rewards(task.StrictModel):
     """The reward terms."""
 
-    centre: CentreReward = CentreReward()
-    fall: FallReward = FallReward()
-    rest: RestReward = RestReward(weight=3.0)
-    action_rate: ActionRateReward = ActionRateReward(weight=-0.1)
+    centre: task.Gaussian = task.Gaussian(scale=0.05)
+    """The ball is over the paddle's centre."""
+    fall: task.Gaussian = task.Gaussian(scale=0.7)
+    """The ball has little energy: the speed relative to the paddle at which it meets it or would,
+    m/s."""
+    rest: task.Proportional = task.Proportional(weight=3.0)
+    """The ball touches the paddle and moves with it."""
+    action_rate: task.Proportional = task.Proportional(weight=-0.1)
+    """The mean squared change of the action: it does not jump."""
 
 
 class Config(task.WorldConfig):
@@ -159,15 +119,15 @@ class Catch(task.Task):
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
         drop = 2.0 * GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
-        inputs = Inputs(
-            distance=task.length(offset[:2]),
-            fall=task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
-            resting=resting,
-            action_change=jnp.mean(jnp.square(step.action - step.last_action)),
-        )
+        values = {
+            "centre": task.length(offset[:2]),
+            "fall": task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
+            "rest": resting,
+            "action_rate": jnp.mean(jnp.square(step.action - step.last_action)),
+        }
         return task.TaskStep(
             state=CatchState(truth.ball_velocity[2], offset, contact, rest, caught),
-            reward=task.weighted_terms(self.config.reward, inputs),
+            reward={n: term.weight * term.value(values[n]) for n, term in self.config.reward},
             ended=(offset[2] < -LOST_DEPTH) | (truth.paddle_position[2] < FLOOR),
             metrics={"caught": caught},
         )

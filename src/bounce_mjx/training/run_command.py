@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from rich.console import Console
 
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, install_command, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
@@ -43,7 +44,7 @@ def run_command(
             "--wandb needs the package wandb; install it with: "
             f"{install_command('bounce_mjx[wandb]')}"
         )
-    console = Console(quiet=not hosts.is_leader())
+    console = stdout(quiet=not hosts.is_leader())
     # A later command has to name the task's file again.
     task = f" --task {shlex.quote(command.task)}" if is_file(command.task) else ""
     try:

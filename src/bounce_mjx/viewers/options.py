@@ -6,7 +6,6 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from bounce_mjx.config.command_line import NO_DEFAULT
 from bounce_mjx.config.settings import HostName, Positive, StrictModel
 
 MAX_ENVS = 16
@@ -43,7 +42,7 @@ class ViewerOptions(StrictModel):
     """Seed of the resets."""
     host: str = "127.0.0.1"
     """Address of the page's server; 0.0.0.0 also admits other machines."""
-    allow_host: Annotated[tuple[HostName, ...], NO_DEFAULT] = ()
+    allow_host: tuple[HostName, ...] = ()
     """Other names under which a browser may open the page, such as a proxy's."""
     port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of the page's server, or the next free port."""

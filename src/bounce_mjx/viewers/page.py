@@ -7,7 +7,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.runs.files import writable, write_output
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at, resample
+from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample
 
 SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
@@ -16,12 +16,12 @@ _VISER_TITLE = "<title>Viser</title>"
 
 def write_page(
     path: Path,
-    simulation: Simulation,
+    env: Env,
     recording: EnvFrame,
     fps: int | None,
     names: Sequence[str] | None = None,
 ) -> None:
-    """Writes a recording of all environments of the simulation as a page.
+    """Writes a recording [T, N, ...] as a page.
 
     Args:
       names: see `Scene`.
@@ -29,7 +29,7 @@ def write_page(
     Raises:
       UserError: the file cannot be written.
     """
-    text = replay(simulation.env, recording, fps or _DEFAULT_FPS, names)
+    text = replay(env, recording, fps or _DEFAULT_FPS, names)
     with writable(path, "give another file with --html"):
         write_output(path, text)
 

@@ -170,7 +170,7 @@ class Scene:
         if short:
             return name + next(iter(readings.values()), "")
         text = name + "   ".join(f"{word} {value}" for word, value in readings.items())
-        return text.strip()
+        return text.strip(": ")
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a new page, and once more when its panels have taken their room."""

@@ -98,7 +98,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
             if film is not None:
                 film.write(simulation, recording)
             if options.html is not None:
-                write_page(options.html, simulation, recording, options.fps, start.names)
+                write_page(options.html, simulation.env, recording, options.fps, start.names)
         for path in (options.video, options.html):
             if path is not None:
                 console.out(f"written: {path}", highlight=False)

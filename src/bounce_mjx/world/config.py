@@ -145,20 +145,10 @@ class WorldConfig(StrictModel):
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
 
-    @classmethod
-    def __pydantic_init_subclass__(cls, **keywords: Any) -> None:
-        super().__pydantic_init_subclass__(**keywords)
-        for former in _FORMER_RESET_KEYS.keys() & cls.__annotations__.keys():
-            raise UserError(
-                f"{cls.__name__} has the setting {former}, which is reset."
-                f"{_FORMER_RESET_KEYS[former]} now; give reset: task.ResetConfig = "
-                f"task.ResetConfig({_FORMER_RESET_KEYS[former]}=...)"
-            )
-
     @pydantic.model_validator(mode="before")
     @classmethod
     def _read_former_reset(cls, values: Any) -> Any:
-        """Earlier configs have the noise of a reset beside the other settings."""
+        """The configs of 0.1.0 have the noise of a reset beside the other settings."""
         if not isinstance(values, dict) or not _FORMER_RESET_KEYS.keys() & values.keys():
             return values
         moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}

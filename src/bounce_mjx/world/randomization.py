@@ -33,7 +33,7 @@ shape."""
 
 
 class Term(NamedTuple):
-    """A quantity that may differ between episodes."""
+    """A quantity that may differ between episodes: the metadata of its range."""
 
     size: tuple[int, ...] | None
     """Shape of one episode's draw; None for one entry for each acting joint."""
@@ -55,125 +55,86 @@ _NOT_NEGATIVE = (0.0, math.inf)
 IMPACT_SPEED = 2.45
 """Speed of the impact that the restitution is of if it has a slope, m/s."""
 
-TERMS: dict[str, Term] = {
-    "restitution": Term((), 0.85, (0.6, 0.98)),
-    "restitution_slope": Term((), 0.0, (0.0, 0.1)),
-    "ball_mass": Term((), 1.0, _FACTOR),
-    "ball_radius": Term((), 1.0, _FACTOR),
-    "air_drag": Term((), 0.0, _NOT_NEGATIVE),
-    "air_lift": Term((), 0.0, _NOT_NEGATIVE),
-    "contact_friction": Term((), 0.0, _NOT_NEGATIVE),
-    "servo_gain": Term(None, 1.0, _FACTOR),
-    "servo_damping": Term(None, 1.0, _FACTOR),
-    "servo_lag": Term((), 0.0, _NOT_NEGATIVE),
-    "torque_limit": Term(None, None, (1e-3, math.inf)),
-    "joint_damping": Term(None, 0.0, _NOT_NEGATIVE),
-    "joint_frictionloss": Term(None, 0.0, _NOT_NEGATIVE),
-    "armature": Term(None, 1.0, _FACTOR),
-    "link_mass": Term(None, 1.0, _FACTOR),
-    "paddle_offset": Term((3,), 0.0, _ANY),
-    "paddle_tilt": Term((2,), 0.0, _ANY),
-    "gravity_tilt": Term((2,), 0.0, _ANY),
-    "action_latency": Term((), 0.0, _NOT_NEGATIVE),
-    "ball_latency": Term((), 0.0, _NOT_NEGATIVE),
-    "camera_rate": Term((), None, (1.0, 1e4)),
-    "frame_drop": Term((), 0.0, (0.0, 0.99)),
-    "ball_position_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "ball_position_bias": Term((3,), 0.0, _ANY),
-    "ball_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "ball_velocity_bias": Term((3,), 0.0, _ANY),
-    "joint_angle_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "encoder_bias": Term(None, 0.0, _ANY),
-    "joint_velocity_noise": Term((), 0.0, _NOT_NEGATIVE),
-    "joint_velocity_bias": Term(None, 0.0, _ANY),
-    "push_speed": Term((), 0.0, _NOT_NEGATIVE),
-    "push_interval": Term((), None, (0.01, math.inf)),
-    "command_interval": Term((), None, (0.01, math.inf)),
-    "ball_start": Term((3,), 0.0, _ANY),
-    "joint_start": Term(None, 0.0, _ANY),
-}
-"""All terms of `RandomizationConfig`."""
-
 
 class RandomizationConfig(StrictModel):
     """The world that each episode draws: a range for each term, null for off."""
 
-    restitution: Range | None = None
+    restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98))] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    restitution_slope: Range | None = None
+    restitution_slope: Annotated[Range | None, Term((), 0.0, (0.0, 0.1))] = None
     """Fall of the restitution for each m/s of the impact's speed beyond 2.45 m/s, that of the
     ITTF's drop from 30.5 cm, s/m; with restitution. Balls bounce less in faster impacts (Hubbard
     and Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
-    ball_mass: Range | None = None
+    ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
     """Factor of the ball's mass."""
-    ball_radius: Range | None = None
+    ball_radius: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
     """Factor of the ball's radius."""
-    air_drag: Range | None = None
+    air_drag: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
-    air_lift: Range | None = None
+    air_lift: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
     velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
     speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
     "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
-    contact_friction: Range | None = None
+    contact_friction: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Coefficient of sliding friction between ball and paddle."""
-    servo_gain: Range | None = None
+    servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each servo's stiffness."""
-    servo_damping: Range | None = None
+    servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each servo's damping."""
-    servo_lag: Range | None = None
+    servo_lag: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Range | None = None
+    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, math.inf))] = None
     """Largest torque of each servo, N m."""
-    joint_damping: Range | None = None
+    joint_damping: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Range | None = None
+    joint_frictionloss: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
     """Dry friction of each joint, N m."""
-    armature: Range | None = None
+    armature: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Range | None = None
+    link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each link's mass."""
-    paddle_offset: Range | None = None
+    paddle_offset: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Range | None = None
+    paddle_tilt: Annotated[Range | None, Term((2,), 0.0, _ANY)] = None
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Range | None = None
+    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, _ANY)] = None
     """Rotation of gravity about the world's x and y axis, rad."""
-    action_latency: Range | None = None
+    action_latency: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Time from an action to its servo targets, s."""
-    ball_latency: Range | None = None
+    ball_latency: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Time from a camera image of the ball to its use, s."""
-    camera_rate: Range | None = None
+    camera_rate: Annotated[Range | None, Term((), None, (1.0, 1e4))] = None
     """Camera images of the ball per second, Hz; each is used until the next one arrives. Without a
     rate there is an image at every control step."""
-    frame_drop: Range | None = None
+    frame_drop: Annotated[Range | None, Term((), 0.0, (0.0, 0.99))] = None
     """Probability that a camera image is lost."""
-    ball_position_noise: Range | None = None
+    ball_position_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Range | None = None
+    ball_position_bias: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
-    ball_velocity_noise: Range | None = None
+    ball_velocity_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
-    ball_velocity_bias: Range | None = None
+    ball_velocity_bias: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Range | None = None
+    joint_angle_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Range | None = None
+    encoder_bias: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Range | None = None
+    joint_velocity_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Range | None = None
+    joint_velocity_bias: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
     """Error of each measured joint velocity, constant in an episode, rad/s."""
-    push_speed: Range | None = None
+    push_speed: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Range | None = None
+    push_interval: Annotated[Range | None, Term((), None, (0.01, math.inf))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Range | None = None
+    command_interval: Annotated[Range | None, Term((), None, (0.01, math.inf))] = None
     """Time between two draws of the task's commands within an episode, s."""
-    ball_start: Range | None = None
+    ball_start: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
-    joint_start: Range | None = None
+    joint_start: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
@@ -224,6 +185,15 @@ class RandomizationConfig(StrictModel):
             return jnp.asarray(start + (end - start) * progress, jnp.float32)
 
         return {name: tuple(grown(name, end) for end in getattr(self, name)) for name in self.terms}
+
+
+TERMS: dict[str, Term] = {
+    name: mark
+    for name, field in RandomizationConfig.model_fields.items()
+    for mark in field.metadata
+    if isinstance(mark, Term)
+}
+"""All terms of `RandomizationConfig`."""
 
 
 def draw_world(
