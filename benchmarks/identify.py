@@ -23,6 +23,7 @@ from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import read_csv
 from bounce_mjx.identify.stages import Identified, identify
 from bounce_mjx.identify.words import estimates
+from bounce_mjx.identify.world import world_of
 from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -37,7 +38,10 @@ _FIXED = (
     "command_interval ball_start"
 ).split()
 _CAMERA_RATE, _LOST, _BALL_NOISE = 120.0, 0.05, 0.002
-_ANGLE_NOISE, _JITTER = 1e-3, 3e-4
+_ANGLE_NOISE, _VELOCITY_NOISE, _JITTER = 1e-3, 0.02, 3e-4
+# Target heights, m, and control steps of each: bounces at several speeds tell the ball's latency
+# from the camera's height.
+_HEIGHTS, _HEIGHT_STEPS = (0.3, 0.8), 300
 _BACKLASH = np.deg2rad(0.1)
 _ASYMMETRY = 0.3
 
@@ -68,6 +72,17 @@ def hidden_robot(seed: int) -> Hidden:
     world = {name: np.asarray(value, np.float32) for name, value in world.items()}
     flaw = ("nothing", "backlash", "nothing", "asymmetric friction")[seed % 4]
     return Hidden(world, flaw)
+
+
+def sensor_terms() -> dict[str, float]:
+    """What is the same for all robots, as terms of the randomisation."""
+    return {
+        "camera_rate": _CAMERA_RATE,
+        "frame_drop": _LOST,
+        "ball_position_noise": _BALL_NOISE,
+        "joint_angle_noise": _ANGLE_NOISE,
+        "joint_velocity_noise": _VELOCITY_NOISE,
+    }
 
 
 class _Robot:
@@ -111,7 +126,7 @@ class _Robot:
         return true + _ANGLE_NOISE * self.random.standard_normal(6)
 
     def velocities(self) -> np.ndarray:
-        return self.data.qvel[self.qvel] + 0.02 * self.random.standard_normal(6)
+        return self.data.qvel[self.qvel] + _VELOCITY_NOISE * self.random.standard_normal(6)
 
     def step(self) -> None:
         """One physics step."""
@@ -154,23 +169,25 @@ class _Robot:
 
 
 def record(config: WorldConfig, seed: int, path: Path, excited=20.0, played=40.0) -> Hidden:
-    """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, which
-    is dropped again after each loss."""
+    """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, at
+    several heights; the ball is dropped again after each loss."""
     hidden = hidden_robot(seed)
     robot, policy = _Robot(config, hidden, seed), load_policy("robust")
     motion = excite(config, excited, 1.5)
     steps = round(config.control_dt / config.physics_dt)
     random = np.random.default_rng([seed, 1])
-    drop_at, playing = excited + 1.0, False
+    drop_at, playing, height = excited + 1.0, False, 0.5
     with Recorder(path, policy.metadata.joint_names, {"target_height": "m"}) as recorder:
         last, before = None, 0.0
         for k in range(round((excited + played) / config.control_dt)):
             now = robot.data.time
+            if k % _HEIGHT_STEPS == 0:
+                height = float(random.uniform(*_HEIGHTS))
             stamp = now + _JITTER * float(np.clip(random.standard_normal(), -3.0, 3.0))
             measured = {
                 "joint_angles": robot.angles(),
                 "joint_velocities": robot.velocities(),
-                "target_height": 0.5,
+                "target_height": height,
                 "time": stamp,
             }
             arrived = [p for p in robot.pictures if p[0] <= now]
@@ -268,7 +285,7 @@ def _seeds(text: str) -> list[int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=_seeds, default=_seeds("1000-1003"))
-    parser.add_argument("--logs", type=Path, default=None, help="folder for the logs")
+    parser.add_argument("--logs", type=Path, default=None, help="folder for the logs and worlds")
     parser.add_argument("--out", type=Path, default=None, help="JSON file")
     given = parser.parse_args()
     folder = given.logs or Path(tempfile.mkdtemp())
@@ -284,9 +301,11 @@ def main() -> None:
             record(config, seed, path)
         hidden, begin = hidden_robot(seed), time.perf_counter()
         begin_processor = time.process_time()
-        found = identify(config, read_csv(path, names))
+        log = read_csv(path, names)
+        found = identify(config, log)
         seconds = time.perf_counter() - begin
         processor = time.process_time() - begin_processor
+        path.with_suffix(".yaml").write_text(world_of(found, log, names, None))
         inside = covered(found, hidden)
         rows.append(
             {

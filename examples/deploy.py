@@ -40,9 +40,9 @@ class Camera:
 
 
 def simulate(
-    policy, camera: Camera, seconds: float, target_height: float, recorder: Recorder | None = None
+    policy, camera: Camera, seconds: float, heights: list[float], recorder: Recorder | None = None
 ) -> list[tuple[int, float]]:
-    """Bounces and length (s) of each episode; after a loss of the ball, the arm starts again."""
+    """Bounces and length (s) of each episode, each from a new start; a target height lasts 3 s."""
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
@@ -58,7 +58,7 @@ def simulate(
         measured = {
             "joint_angles": [joint.qpos[0] for joint in joints],
             "joint_velocities": [joint.qvel[0] for joint in joints],
-            "target_height": target_height,
+            "target_height": heights[int(data.time / 3.0) % len(heights)],
             "time": data.time,
             **camera.measure(data.time),
         }
@@ -87,7 +87,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--target-height", type=float, default=0.5, help="m")
+    parser.add_argument("--target-height", type=float, nargs="+", default=[0.5], help="m")
     parser.add_argument("--log", help="CSV file for the log, which must not exist")
     given = parser.parse_args()
     with exit_on_user_error(), contextlib.ExitStack() as files:
@@ -95,6 +95,6 @@ if __name__ == "__main__":
         if given.log:
             joints = robot.metadata.joint_names
             recorder = files.enter_context(Recorder(given.log, joints, {"target_height": "m"}))
-        seconds, height = given.seconds, given.target_height
-        for count, lasted in simulate(robot, Camera(), seconds, height, recorder):
+        seconds, heights = given.seconds, given.target_height
+        for count, lasted in simulate(robot, Camera(), seconds, heights, recorder):
             print(f"{count} bounces in {lasted:.1f} s of {seconds:g} s")

@@ -1038,14 +1038,15 @@ except UserError as error:
 
 def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
     perfect = EXAMPLE["Camera"](rate=1000.0, noise=0.0, delay=0.0)
-    bounces, survived = EXAMPLE["simulate"](load_policy("pretrained"), perfect, 8.0, 0.5)[0]
+    bounces, survived = EXAMPLE["simulate"](load_policy("pretrained"), perfect, 8.0, [0.5])[0]
     assert bounces >= 10 and survived == pytest.approx(8.0)
 
 
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     """On plain MuJoCo; the defaults of the example."""
+    simulate, camera = EXAMPLE["simulate"], EXAMPLE["Camera"]
     (bounces, survived), (lost_bounces, lost_at) = (
-        EXAMPLE["simulate"](load_policy(name), EXAMPLE["Camera"](120.0, 0.002, 0.020), 8.0, 0.5)[0]
+        simulate(load_policy(name), camera(120.0, 0.002, 0.020), 8.0, [0.5])[0]
         for name in ("robust", "pretrained")
     )
     assert bounces >= 10 and survived == pytest.approx(8.0)

@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from bounce_mjx.commands.main import main
-from bounce_mjx.identify.fit import Noise, Problem, _eliminate, covariance, minimise
+from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, covariance, minimise
 from bounce_mjx.identify.log import Log, read_csv
 from bounce_mjx.identify.simulation import Predicted, _Targets
-from bounce_mjx.identify.stages import identify, joined, sensor_noise
+from bounce_mjx.identify.stages import Identified, identify, joined, sensor_noise
 from bounce_mjx.identify.unknowns import make_layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.words import estimates, sentences
@@ -223,6 +223,24 @@ def test_logs_are_joined_without_a_window_over_both() -> None:
     w = windows_of(log)
     ends = w.origin + 0.001 * w.first + np.max(w.angle_times, axis=1)
     assert not np.any((w.origin + 0.001 * w.first < 2.9) & (ends > 3.9))
+
+
+def test_what_a_log_allows_a_term_alone_is_its_error_once_the_others_are_known() -> None:
+    """Against the error of the best linear prediction of each unknown from all others."""
+    layout, random = make_layout(6, True, 0.001), np.random.default_rng(4)
+    size = len(layout.mean)
+    mixed = np.eye(size) + 0.3 * random.normal(size=(size, size)) / np.sqrt(size)
+    spread = (mixed * layout.deviation[:, None]) @ (mixed * layout.deviation[:, None]).T
+    fit = Fit(layout.mean, *4 * (np.zeros(0),), 0.0)
+    found = Identified(layout, None, None, fit, spread, {}, {"joint_angles": 1.5}, {}, 0)
+    for i, estimate in enumerate(estimates(found, NAMES)):
+        if estimate.label in ("action_latency", "servo_lag"):
+            continue
+        rest = np.delete(np.arange(size), i)
+        predictor = np.linalg.solve(spread[np.ix_(rest, rest)], spread[rest, i])
+        left = spread[i, i] - spread[i, rest] @ predictor
+        assert estimate.alone == pytest.approx(1.96 * 1.5 * np.sqrt(left), rel=1e-3)
+        assert estimate.alone <= 0.5 * (estimate.high - estimate.low) * (1.0 + 1e-9)
 
 
 @pytest.fixture(scope="module")

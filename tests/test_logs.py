@@ -368,7 +368,7 @@ def test_example_writes_a_log_of_its_run(tmp_path: Path) -> None:
 
     policy = load_policy("robust")
     with Recorder(tmp_path / "log.csv", policy.metadata.joint_names) as recorder:
-        example["simulate"](policy, example["Camera"](), 1.5, 0.5, recorder)
+        example["simulate"](policy, example["Camera"](), 1.5, [0.5], recorder)
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     ranges = model.jnt_range[list(find_addresses(model).arm_joints)]
     log = read_csv(tmp_path / "log.csv", policy.metadata.joint_names)

@@ -88,9 +88,9 @@ def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
-    of_angles, used = [], -np.inf
+    of_angles, used, settled = [], -np.inf, _settled(log)
     for (_, end, _), begin in zip(spans, zero, strict=True):
-        inside = np.flatnonzero((log.times >= max(begin, used)) & (log.times < end))
+        inside = np.flatnonzero((log.times >= max(begin, used)) & (log.times < end) & settled)
         of_angles.append(inside)
         used = end
     of_pictures = [
@@ -170,8 +170,8 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
     gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1] + _SETTLING + MAX_DELAY) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + _SETTLING + MAX_DELAY
+    taken += [(log.times[i], log.times[i + 1]) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + MAX_DELAY
     pieces, begin = [], first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
@@ -181,6 +181,14 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
             pieces += list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
         begin = max(begin, end)
     return pieces
+
+
+def _settled(log: Log) -> np.ndarray:
+    """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
+    begins = log.times[np.flatnonzero(np.diff(log.times) > _JOINT_GAP) + 1]
+    begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
+    last = np.maximum(np.searchsorted(begins, log.times, side="right") - 1, 0)
+    return log.times - begins[last] >= _SETTLING
 
 
 def _padded(

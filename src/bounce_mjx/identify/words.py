@@ -32,7 +32,7 @@ _MOTIONS = {
     "joint_frictionloss": "slow motions there and back show it (bounce-mjx excite)",
     "contact_friction": "a ball that slips shows it: one with spin, or thrown from the side",
     "air_drag": "higher flights show it",
-    "ball_latency": "bounces under a fast paddle show it",
+    "ball_latency": "bounces at several target heights show it",
     "restitution": "more bounces show it",
 }
 
@@ -48,6 +48,8 @@ class Estimate(NamedTuple):
     high: float
     seen: bool
     """Whether the log shows it; otherwise the interval is the prior's."""
+    alone: float
+    """Half-width of the interval if all other unknowns had their estimates."""
 
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
@@ -56,15 +58,19 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     world = layout.world(found.fit.vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.unknowns])
     low, high = values - width, values + width
+    alone = _WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     for name, ends in _delays(found).items():
         place = layout.slices()[name]
         low[place], high[place] = ends
+        alone[place] = np.inf
     seen = found.deviation < _UNSEEN * layout.deviation
     units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
     labels = layout.labels(joint_names)
     return [
-        Estimate(label, unit, float(x), float(a), float(b), bool(s))
-        for label, unit, x, a, b, s in zip(labels, units, values, low, high, seen, strict=True)
+        Estimate(label, unit, float(x), float(a), float(b), bool(s), float(w))
+        for label, unit, x, a, b, s, w in zip(
+            labels, units, values, low, high, seen, alone, strict=True
+        )
     ]
 
 

@@ -13,15 +13,17 @@ from bounce_mjx.identify.words import Estimate, estimates
 from bounce_mjx.world.named import NamedWorld
 from bounce_mjx.world.randomization import TERMS
 
-# Factor by which a range is wider than the 95% interval.
+# Factor by which a range is wider than the interval of each term alone.
 _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
     """YAML text of the identified world: the estimates, and ranges for a training.
 
-    The range of a term covers the intervals of all its entries, with a margin of half. A term that
-    the log does not show is assumed.
+    The range of a term covers what the log allows for each of its entries while all other unknowns
+    have their estimates, with a margin of half: independent draws from the whole intervals of
+    terms that the log cannot separate would be worlds that contradict it. A term that the log does
+    not show is assumed.
 
     Args:
       robot: name or file of the robot's config.
@@ -101,8 +103,8 @@ def _words(entry: Estimate, shift: float) -> str:
 
 
 def _range(name: str, entries: Sequence[Estimate], shift: float) -> list[float]:
-    low = min(e.value - _MARGIN * (e.value - e.low) for e in entries) + shift
-    high = max(e.value + _MARGIN * (e.high - e.value) for e in entries) + shift
+    low = min(e.value - _MARGIN * min(e.value - e.low, e.alone) for e in entries) + shift
+    high = max(e.value + _MARGIN * min(e.high - e.value, e.alone) for e in entries) + shift
     return _clipped(name, low, high)
 
 

@@ -1,0 +1,67 @@
+"""Policies in the worlds of hidden robots: what identification buys.
+
+    python benchmarks/identify.py --seeds 0-19 --logs LOGS
+    python train_jax.py --config robust_cpu --world LOGS/0.yaml --total-steps 27000000
+    python benchmarks/identified_training.py --seed 0 --policies RUN robust
+
+The first command writes the log and the identified world of each robot of benchmarks/identify.py.
+A robot that has a flaw is measured without it.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from identify import hidden_robot, sensor_terms
+from rich.console import Console
+
+from bounce_mjx.env.env import Env
+from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.results import Report, judge
+from bounce_mjx.evaluation.suite import neutral_commands
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.runs.reading import read_actor
+from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.world.randomization import RandomizationConfig
+
+
+def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
+    """The results of a policy in the world of one hidden robot, with the task's default target."""
+    checkpoint = choose_checkpoint(path, Path("runs"), Console(quiet=True))
+    config = load_run_config(checkpoint.run)
+    world = {k: jnp.asarray(v, jnp.float32) for k, v in hidden_robot(seed).world.items()}
+    world |= {name: jnp.float32(value) for name, value in sensor_terms().items()}
+    # The config's ranges are numbers; the values of the joints are given to the reset.
+    spans = {name: (float(np.min(v)), float(np.max(v))) for name, v in world.items()}
+    update = {"randomization": RandomizationConfig(**spans)}
+    env = Env(config.env.model_copy(update=update))
+    set_up_jax(env.config)
+    policy, actor = read_actor(checkpoint, config)
+    commands = neutral_commands(env.config)
+    ranges = env.ranges() | {name: (value, value) for name, value in world.items()} | commands
+    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
+    make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
+    evaluate = make(env, actor(env), episodes)
+    return judge(env, evaluate(policy, jax.random.PRNGKey(20_000), ranges), commands)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, required=True, help="the robot")
+    parser.add_argument("--policies", type=Path, nargs="+", required=True)
+    parser.add_argument("--episodes", type=int, default=1024)
+    parser.add_argument("--physics", choices=("fused", "mujoco"), default="mujoco")
+    given = parser.parse_args()
+    for path in given.policies:
+        report = measure(path, given.seed, given.episodes, given.physics)
+        results = {r.name: (r.value, r.passed) for r in report.results}
+        print(json.dumps({"seed": given.seed, "policy": str(path)} | results), flush=True)
+
+
+if __name__ == "__main__":
+    main()
