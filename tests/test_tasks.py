@@ -42,7 +42,7 @@ RESULT = r"rests +episodes"
 # example in a sentence for users.
 ALLOWED = {
     "__init__.py", "baselines/mirror.py",
-    "commands/main.py", "commands/train.py",
+    "commands/main.py", "commands/play.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
     "world/ball_filter.py", "world/observation.py", "world/randomization.py",
