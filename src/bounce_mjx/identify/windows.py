@@ -170,8 +170,8 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
     gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1]) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + MAX_DELAY
+    taken += [(log.times[i], log.times[i + 1] + _SETTLING) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + _SETTLING
     pieces, begin = [], first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
