@@ -1,7 +1,8 @@
-"""Policies in the worlds of hidden robots: what identification buys.
+r"""Policies in the worlds of hidden robots: what identification buys.
 
     python benchmarks/identify.py --seeds 0-19 --logs LOGS
-    python train_jax.py --config robust_cpu --world LOGS/0.yaml --total-steps 27000000
+    python train_jax.py --config robust_cpu --world LOGS/0.yaml --total-steps 27000000 \
+        --decay-steps 22000000
     python benchmarks/identified_training.py --seed 0 --policies RUN robust
 
 The first command writes the log and the identified world of each robot of benchmarks/identify.py.
@@ -20,6 +21,7 @@ from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
@@ -47,14 +49,14 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
     make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
     evaluate = make(env, actor(env), episodes)
-    return judge(env, evaluate(policy, jax.random.PRNGKey(20_000), ranges), commands)
+    return judge(env, evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges), commands)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, required=True, help="the robot")
     parser.add_argument("--policies", type=Path, nargs="+", required=True)
-    parser.add_argument("--episodes", type=int, default=1024)
+    parser.add_argument("--episodes", type=int, default=DEFAULT_EPISODES)
     parser.add_argument("--physics", choices=("fused", "mujoco"), default="mujoco")
     given = parser.parse_args()
     for path in given.policies:
