@@ -1258,6 +1258,15 @@ def test_sliders_extend_the_ranges_of_a_task() -> None:
     np.testing.assert_array_equal(ranges["paddle_tilt"], np.zeros((2, 2)))
 
 
+def test_a_slider_extends_the_ranges_of_all_axes() -> None:
+    tilt = (-0.08, 0.01), (-0.07, 0.2)
+    config = EnvConfig(randomization=RandomizationConfig(paddle_tilt=tilt))
+    widened = with_sliders(config).randomization
+    assert widened.paddle_tilt == (-0.08, 0.2) and sliders_for(widened) == SLIDERS
+    assert not sliders_for(config.randomization)
+    np.testing.assert_allclose(drawn_ranges(config)["paddle_tilt"], tilt)
+
+
 def test_another_robot_has_no_slider_for_the_restitution() -> None:
     """Its own restitution is unknown."""
     config = EnvConfig(mjcf=resource_path("mjcf/bounce_ball.xml"))

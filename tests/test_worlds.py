@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -19,6 +20,7 @@ from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
 from test_deploy import make_run
 
+TWICE = "twice the assumed"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
 WORLD = {
     "env": {"randomization": {"action_latency": [0.01, 0.02], "frame_drop": [0.0, 0.1]}},
@@ -82,6 +84,37 @@ def test_training_has_the_world_in_place_of_the_presets(tmp_path: Path) -> None:
     assert (drawn.action_latency, drawn.frame_drop) == ((0.01, 0.02), (0.0, 0.2))
     assert drawn.share == preset.randomization.share
     assert command.env.observation == preset.observation
+
+
+TILT = (-0.08, 0.01), (-0.07, 0.03)
+TILTED = {
+    "env": {"randomization": {"paddle_tilt": [[-0.08, 0.01], [-0.07, 0.03]]}},
+    "sources": {"randomization": "An example."},
+    "assumed": ["randomization.paddle_tilt"],
+}
+
+
+def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> None:
+    world = written(tmp_path, **TILTED)
+    assert read_command(["--world", str(world)]).env.randomization.paddle_tilt == TILT
+    given = read_command(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
+    assert given.env.randomization.paddle_tilt == (-0.1, 0.1)
+    trained = TrainConfig()
+    there, named = in_world(trained, world)
+    conditions = load_suite(
+        resource_path("configs/robustness.yaml"), there.env, there.env, named.doubled()
+    )
+    nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
+    np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)
+    np.testing.assert_allclose(twice.ranges["paddle_tilt"], 2.0 * np.array(TILT))
+    assert nominal.trained and not twice.trained
+
+
+def test_help_shows_the_ranges_of_a_world(tmp_path: Path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        read_command(["--world", str(written(tmp_path, **TILTED)), "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--randomization.paddle-tilt FLOAT FLOAT Rotation of the paddle" in shown
 
 
 def test_a_world_brings_its_robot() -> None:

@@ -344,5 +344,5 @@ def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
         drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
     if drawn is None:
         return False
-    (low, high), tolerance = drawn, 1e-9
+    (low, high), tolerance = map(np.asarray, drawn), 1e-9
     return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))

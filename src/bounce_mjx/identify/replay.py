@@ -98,7 +98,7 @@ def _known(
 ) -> tuple[Layout, np.ndarray]:
     """The layout with all terms of the world, and their values [P]; a term with neither an estimate
     nor a range is nominal."""
-    middles = {name: float(np.mean(ends)) for name, ends in config.randomization.ranges().items()}
+    middles = {n: np.mean(ends, 0, float) for n, ends in config.randomization.ranges().items()}
     layout = make_layout(config.num_joints, True, config.physics_dt)
     others = {
         name: Unknown(0.0, 1.0, 1.0, "", "", None if size is None else sum(size))

@@ -140,8 +140,9 @@ def _nested(key: str, value: Any) -> dict[str, Any]:
 
 
 def _is_numeric(value: Any) -> bool:
-    values = value if isinstance(value, tuple) else (value,)
-    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+    if isinstance(value, tuple):
+        return all(map(_is_numeric, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _doubled(key: str, value: Any) -> Any:
@@ -153,7 +154,9 @@ def _doubled(key: str, value: Any) -> Any:
     elif group == "robot.limits":
         factor = 0.5
 
-    def changed(number: float) -> float:
-        return min(max(centre + factor * (number - centre), least), most)
+    def changed(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(changed, value))
+        return min(max(centre + factor * (value - centre), least), most)
 
-    return tuple(map(changed, value)) if isinstance(value, tuple) else changed(value)
+    return changed(value)
