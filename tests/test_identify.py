@@ -24,7 +24,6 @@ from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"
 NAMES = tuple(f"Joint{i}" for i in range(1, 7))
-NO_BALL = np.array([0.0, 0.0, 50.0])
 
 
 def test_elimination_gives_the_step_of_the_whole_problem() -> None:
@@ -66,7 +65,7 @@ def flight_log(seconds: float = 6.0, gap: tuple[float, float] = (3.0, 3.5)) -> L
 
 
 def windows_of(log: Log) -> Windows:
-    return cut(log, 0.001, NO_BALL)
+    return cut(log, 0.001)
 
 
 def test_windows_hold_each_bounce_once_and_each_measurement_at_most_once() -> None:

@@ -153,7 +153,7 @@ def test_a_log_without_pictures_shows_the_arm_alone() -> None:
     with pytest.raises(UserError, match="have 5 numbers for encoder_bias, and the robot has 6"):
         replay_log(read_preset(Path("default")).env, log, {"encoder_bias": (0.0,) * 5})
     short = log._replace(times=times[:40], joint_angles=sway[:40])
-    with pytest.raises(UserError, match="no stretch of unbroken .*; record at least 5 s"):
+    with pytest.raises(UserError, match="has 0 stretches of unbroken .*; record at least 5 s"):
         replay_log(read_preset(Path("default")).env, short)
 
 

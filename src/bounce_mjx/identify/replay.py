@@ -10,7 +10,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.identify.fit import Fit, Problem, minimise
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import make_run, make_simulator
-from bounce_mjx.identify.stages import BEFORE_BOUNCE, NO_BALL, sensor_noise
+from bounce_mjx.identify.stages import BEFORE_BOUNCE, sensor_noise
 from bounce_mjx.identify.unknowns import Layout, Unknown, make_layout
 from bounce_mjx.identify.windows import MAX_DELAY, Windows, cut
 from bounce_mjx.identify.world import least_age
@@ -62,7 +62,7 @@ def replay_log(
     Raises:
       UserError: the log has no window, or an estimate has the wrong size.
     """
-    windows = cut(log, config.physics_dt, NO_BALL, max_windows=len(log.times))
+    windows = cut(log, config.physics_dt, max_windows=len(log.times))
     layout, vector = _known(config, log, estimates)
     run = make_run(config, config.num_joints)
     simulate = make_simulator(run, layout, log, windows)
