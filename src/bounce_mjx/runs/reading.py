@@ -26,13 +26,17 @@ from bounce_mjx.learning.policy import (
     networks_of,
     untrained_policy,
 )
-from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.ppo import Params, TrainingState
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint
 from bounce_mjx.tasks.registry import is_file
 
 RECORD_FILE = "run.json"
+NETWORKS = "networks"
+"""Item of a checkpoint that comes with the package: the part of a training state from which another
+training can start."""
 
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
@@ -97,6 +101,25 @@ def load_training_state(
         )
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, "training", template), record.progress
+
+
+def read_networks(
+    checkpoint: Checkpoint, shapes: tuple[Params, RunningStatistics]
+) -> tuple[Params, RunningStatistics]:
+    """Restores both networks of a checkpoint, and the statistics of their inputs.
+
+    Args:
+      shapes: shapes and dtypes, as from `jax.eval_shape`.
+    """
+    items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
+    if not items:
+        raise UserError(
+            f"the checkpoint {checkpoint.folder} holds no value network, only a policy; give a run "
+            "that bounce-mjx train made"
+        )
+    read_record(checkpoint)
+    template = dict(zip(("params", "statistics"), shapes, strict=True))
+    return tuple(_read_arrays(checkpoint, items[0], template).values())
 
 
 def read_record(checkpoint: Checkpoint) -> Record:
