@@ -136,7 +136,7 @@ def covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def measure(command: Command) -> list[dict]:
-    """The blocks of every program, in turns."""
+    """The blocks of every program, alternating."""
     measured = configs(command)
     blocks = programs(measured)
     turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]

@@ -5,7 +5,7 @@
 A cold start has an empty compilation cache; each second start uses the cache of the cold start
 before it. Each is a process of `bounce-mjx train --stop-when-solved`, as a user starts it, with
 the flags that follow `--`. "results" is the end of the first evaluation that meets all five; the
-training, and its phases, go on until they have a margin. (Code without a margin ended there, and
+training, and its phases, continue until they have a margin. (Code without a margin ended there, and
 its "results" include the final evaluation.) The benchmark also times `import bounce_mjx`, the
 import of the environment, and `--help`. Python keeps its bytecode, as it does by default: the
 benchmark unsets PYTHONDONTWRITEBYTECODE, and imports the modules of a training once before.

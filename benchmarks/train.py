@@ -4,7 +4,7 @@
 
 Each training is a separate process with an empty compilation cache. It runs
 `train_jax.py --stop-when-solved` as a user would, with the flags that follow `--`. "solved" is the
-first evaluation that meets all five results; the training, and its time, go on until they have a
+first evaluation that meets all five results; the training, and its time, continue until they have a
 margin. (Code without a margin ended at that evaluation.) `start.py` measures the time to it.
 """
 

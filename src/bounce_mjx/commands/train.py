@@ -53,7 +53,7 @@ def main(args: Sequence[str]) -> None:
 
         set_up_jax(*known_engines)
         if several_hosts is None:
-            # CUDA starts beside the imports.
+            # CUDA starts during the imports.
             find_devices()
         from bounce_mjx.training import hosts
         from bounce_mjx.training.ppo_trainer import PPOTrainer

@@ -48,7 +48,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
         if len(shown) < len(entries):
             assumed.append(name)
         values = ", ".join(_words(entry, shift) for entry in entries)
-        how = "Identified" if shown else "Not shown, so that the prior is kept,"
+        how = "Identified" if shown else "Not shown, so the prior stands,"
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     if "ball_latency" not in by_term:
         for name, unknown in BALL.items():

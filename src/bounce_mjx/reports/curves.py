@@ -126,7 +126,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
 def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     """The settings that affect the training, by dotted name."""
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
-    # The paths of the run's own copies would make every run a group of its own.
+    # The paths of the run's own copies would put every run in a separate group.
     settings["task"] = identify_task(config.task)
     if config.env.mjcf is not None:
         settings["env.mjcf"] = identify_robot(config.env.mjcf, run)

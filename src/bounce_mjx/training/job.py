@@ -79,7 +79,7 @@ class SeedRun:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a training does beside its config."""
+    """What a training does that its config does not say."""
 
     command: str
     """The user's command, to which `--resume` may be added."""

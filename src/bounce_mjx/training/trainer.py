@@ -78,8 +78,8 @@ class Trainer(Protocol):
         """The policy and the whole state."""
 
     def save_models(self, runs: Sequence[Path]) -> None:
-        """Writes what its library needs beside the checkpoint into the folders of the seeds, at the
-        end of the training or when it is stopped."""
+        """Writes what its library needs in addition to the checkpoint into the folders of the
+        seeds, at the end of the training or when it is stopped."""
 
 
 class Watcher(Protocol):

@@ -33,7 +33,7 @@ _MAX_POINTS = 2000
 
 
 class TrainingPage:
-    """A `training.trainer.Watcher` that serves a page from a thread of its own. The simulation runs
+    """A `training.trainer.Watcher` that serves a page from its own thread. The simulation runs
     on the CPU, so that a training on a GPU keeps its speed."""
 
     def __init__(
