@@ -230,7 +230,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
 
 
 def _robot_of(world: NamedWorld, path: Path) -> Path:
-    """The file of a world's robot: one of the package's, or a file relative to the world's folder."""
+    """The file of a world's robot: one of the package's, or one relative to the world's file."""
     robot = named_file(Path(world.robot), ROBOTS)
     return robot if robot != Path(world.robot) else path.parent / robot
 
