@@ -179,7 +179,7 @@ def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys
     with pytest.raises(SystemExit) as exit_info:
         train_command.main(["--resume", str(run)])
     assert exit_info.value.code == 2
-    assert f"error: {run}/{place} is a link, and a training" in capsys.readouterr().err
+    assert f"error: {run}/{place} is a link, and training" in capsys.readouterr().err
     assert contents(other) == before
 
 

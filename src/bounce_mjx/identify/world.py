@@ -1,4 +1,4 @@
-"""The identified world in a file: the estimates, and ranges for a training with their sources."""
+"""The identified world in a file: the estimates, and ranges for training with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world: the estimates, and ranges for a training.
+    """YAML text of the identified world: the estimates, and ranges for training.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent draws from the whole intervals of terms that the

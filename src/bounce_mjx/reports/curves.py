@@ -60,7 +60,7 @@ def read_curves(run: Path) -> RunCurves:
     Raises:
       UserError: the log is damaged or has no scalars.
     """
-    # At the top of the module, this import would delay the start of a training.
+    # At the top of the module, this import would delay the start of training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     files = list(run.glob("*tfevents*"))

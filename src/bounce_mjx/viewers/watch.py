@@ -34,7 +34,7 @@ _MAX_POINTS = 2000
 
 class TrainingPage:
     """A `training.trainer.Watcher` that serves a page from its own thread. The simulation runs
-    on the CPU, so that a training on a GPU keeps its speed."""
+    on the CPU, so that training on a GPU keeps its speed."""
 
     def __init__(
         self,
