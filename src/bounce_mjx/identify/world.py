@@ -1,4 +1,4 @@
-"""The identified world in a file: the estimates, and ranges for a training with their sources."""
+"""The identified world in a file: the estimates, and ranges for training with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world: the estimates, and ranges for a training.
+    """YAML text of the identified world: the estimates, and ranges for training.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent draws from the whole intervals of terms that the
@@ -48,7 +48,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
         if len(shown) < len(entries):
             assumed.append(name)
         values = ", ".join(_words(entry, shift) for entry in entries)
-        how = "Identified" if shown else "Not shown, so that the prior is kept,"
+        how = "Identified" if shown else "Not shown, so the prior stands,"
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     if "ball_latency" not in by_term:
         for name, unknown in BALL.items():
