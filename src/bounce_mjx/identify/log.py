@@ -161,7 +161,7 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
       Warnings, a sentence each.
 
     Raises:
-      UserError: it is too short, its times are not seconds of one clock, a joint is far outside of
+      UserError: it is too short, its times are not seconds of one clock, a joint is far outside
         its range, or the ball is far away.
     """
     if len(log.times) < _MIN_ROWS or len(log.target_times) < _MIN_ROWS:

@@ -54,7 +54,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
         for name, unknown in BALL.items():
             ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
             ranges[name] = _clipped(name, ends)
-            sources[name] = f"{log.source} shows no bounce; this is what is usual."
+            sources[name] = f"{log.source} shows no bounce; these are typical values."
             assumed.append(name)
     for name, (ends, words) in _sensors(found, log).items():
         ranges[name] = _clipped(name, ends)
@@ -89,7 +89,7 @@ def compare(
         for entry, low, high in zip(listed[place], *ends, strict=True):
             if entry.seen and (entry.high + shift < low or entry.low + shift > high):
                 changed.append(
-                    f"{entry.label} is {_words(entry, shift)} now, outside of {low:g} to {high:g}"
+                    f"{entry.label} is {_words(entry, shift)} now, outside {low:g} to {high:g}"
                 )
     return changed
 

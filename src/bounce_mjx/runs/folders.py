@@ -139,7 +139,7 @@ def check_links(run: Path) -> None:
         if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
             raise UserError(
                 f"{path} is a link, and training writes only into the folder of its run; remove "
-                "it, or put in its place what it leads to"
+                "it, or replace it with its target"
             )
 
 

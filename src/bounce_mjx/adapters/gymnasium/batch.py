@@ -212,7 +212,7 @@ class Batch:
         if _jax_process != os.getpid():
             raise UserError(
                 "this process was forked from one that had already used JAX, in which JAX hangs; "
-                'start it otherwise, with AsyncVectorEnv(..., context="forkserver") or '
+                'start it another way, with AsyncVectorEnv(..., context="forkserver") or '
                 'make_vec(..., vector_kwargs={"context": "forkserver"})'
             )
 
