@@ -442,7 +442,7 @@ def test_help_shows_the_form_of_each_kind_of_value(monkeypatch) -> None:
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):
         parse(Command, ["--help"], prog="it")
-    assert "A pair of numbers." in shown.getvalue(), "a docstring's line break is kept"
+    assert "A pair of numbers." in shown.getvalue(), "a docstring's line break remains"
     text = " ".join(shown.getvalue().replace("│", "").split())
     for form in (
         "[PATH ...]",

@@ -322,7 +322,7 @@ def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     values["env"]["randomization"]["action_latency"] = [high + 0.01, high + 0.02]
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     (changed,) = compare(read_world(path), found, log, NAMES)
-    assert changed.startswith("action_latency is ") and "outside of" in changed
+    assert changed.startswith("action_latency is ") and " now, outside " in changed
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""`play --log`: a robot of a known world, beside its simulation in that world and in another."""
+"""`play --log`: a robot of a known world, next to its simulation in that world and in another."""
 
 import runpy
 from pathlib import Path
@@ -58,7 +58,7 @@ def replayed(log: Log, world: Path, **estimates) -> Replay:
 
 @pytest.fixture(scope="module")
 def found(log: Log, tmp_path_factory: pytest.TempPathFactory) -> Replay:
-    """The log beside its simulation in the robot's own world."""
+    """The log next to its simulation in the robot's own world."""
     return replayed(log, world_file(tmp_path_factory.mktemp("world")))
 
 

@@ -765,7 +765,7 @@ def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -
         for page in pages:
             name = page.partition("://")[2]
             assert handshake(address, name, page) == b"101", page
-            # A program that is no browser tells no origin.
+            # A program other than a browser sends no origin.
             assert handshake(address, name, None) == b"101", page
             for stranger in [*strangers, "null", "http://localhost:1", "file://", "http://[", ""]:
                 assert handshake(address, name, stranger) == b"403", (page, stranger)

@@ -44,7 +44,7 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
         len(source.split()) > 3 and source.endswith(".") for source in world.sources.values()
     )
     assert {"action_latency", "ball_latency", "camera_rate"} <= terms.keys()
-    # A number that nobody measured is no measurement with a source on the web.
+    # A number that nobody measured is not a measurement with a source on the web.
     assert not any("issue" in world.sources[key] for key in world.assumed)
 
 

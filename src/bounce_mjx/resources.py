@@ -5,7 +5,7 @@ from pathlib import Path
 
 PRETRAINED = "pretrained"
 TASK_POLICIES = ("balance", "catch", "juggle", "track")
-"""Tasks with a policy of their name, beside that of the default task, `PRETRAINED`."""
+"""Tasks with a policy of their name, in addition to the default task's, `PRETRAINED`."""
 ARM_POLICIES = ("ur5e", "panda", "iiwa")
 """Arms of configs/robots/ with a policy of their name."""
 POLICIES = {PRETRAINED: PRETRAINED} | {

@@ -99,7 +99,7 @@ def main(args: Sequence[str]) -> None:
         console.print(sentence, markup=False)
     if known is not None:
         changed = compare(known, found, log, names)
-        for line in changed or [f"the robot is still that of {command.check}"]:
+        for line in changed or [f"the robot still matches {command.check}"]:
             console.print(line, markup=False)
         sys.exit(1 if changed else 0)
     robot = None if command.robot is None else str(command.robot)

@@ -51,7 +51,7 @@ class PlayCommand(WorldCommand):
     """World of the episodes, if a term is given, in place of the world of the training."""
     log: Path | None = None
     """Log of a robot's run, as for bounce-mjx identify; writes a page (--html, by default the log's
-    name with _replay.html) with the measured run beside its simulation in --world. --robot is the
+    name with _replay.html) with the measured run next to its simulation in --world. --robot is the
     robot's config."""
     topics: TopicsConfig = TopicsConfig()
     """Topics of a log that is a bag."""

@@ -150,7 +150,7 @@ def parse_with_commands(
 
     Returns:
       The command line; and a function of the run's `env` to the given values of its task's commands
-      by name, which raises a UserError for a flag that is not the task's, or a value outside of its
+      by name, which raises a UserError for a flag that is not the task's, or a value outside its
       limits.
 
     Raises:

@@ -117,7 +117,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, its paddle hangs on a joint that is no hinge with a
+      UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
         servo, or a command has the name of a measurement.
     """
     env = config.env

@@ -44,7 +44,7 @@ def _exported(run: Path, task: str | None) -> bytes:
     except ImportError as error:
         raise UserError(
             f"the run {run} must be exported, for which {error.name} is missing; use bounce-mjx "
-            "export on the machine of the training, and give the .onnx file"
+            "export on the machine that trained it, and give the .onnx file"
         ) from error
     checkpoint = find_checkpoint(run)
     load_run_config(checkpoint.run, task)

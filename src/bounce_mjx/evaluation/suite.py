@@ -285,7 +285,7 @@ def _filled_in(value: Any, strength: float | None) -> Any:
 
 
 def _check_limits(env: WorldConfig, ranges: dict[str, Bounds], source: str) -> None:
-    """Fails for values outside of the limits of a term or of a command."""
+    """Fails for values outside the limits of a term or of a command."""
     spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
     for name, (low, high) in list(spans.items()):
         if name not in env.commands:

@@ -1,4 +1,4 @@
-"""A log's run beside the simulation of its servo targets in a known world."""
+"""A log's run next to the simulation of its servo targets in a known world."""
 
 from collections.abc import Mapping
 from types import MappingProxyType

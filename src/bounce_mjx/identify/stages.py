@@ -54,7 +54,7 @@ class Identified(NamedTuple):
 
 
 def joined(logs: Sequence[Log]) -> Log:
-    """Several logs one after the other; no window spans two of them."""
+    """Several logs, one after another; no window spans two of them."""
     parts, start = [], 0.0
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])

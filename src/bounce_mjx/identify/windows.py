@@ -70,7 +70,7 @@ def cut(log: Log, physics_dt: float, min_windows: int = 1, max_windows: int = 24
 
     Args:
       min_windows: the smallest number.
-      max_windows: the largest number; of more, every k-th is kept.
+      max_windows: the largest number; of more, every k-th is used.
 
     Raises:
       UserError: there are fewer.

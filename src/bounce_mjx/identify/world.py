@@ -1,4 +1,4 @@
-"""The identified world in a file: the estimates, and ranges for a training with their sources."""
+"""The identified world in a file: the estimates, and ranges for training with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world: the estimates, and ranges for a training.
+    """YAML text of the identified world: the estimates, and ranges for training.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent draws from the whole intervals of terms that the
@@ -48,13 +48,13 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
         if len(shown) < len(entries):
             assumed.append(name)
         values = ", ".join(_words(entry, shift) for entry in entries)
-        how = "Identified" if shown else "Not shown, so that the prior is kept,"
+        how = "Identified" if shown else "Not shown, so the prior stands,"
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     if "ball_latency" not in by_term:
         for name, unknown in BALL.items():
             ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
             ranges[name] = _clipped(name, ends)
-            sources[name] = f"{log.source} shows no bounce; this is what is usual."
+            sources[name] = f"{log.source} shows no bounce; these are typical values."
             assumed.append(name)
     for name, (ends, words) in _sensors(found, log).items():
         ranges[name] = _clipped(name, ends)
@@ -89,7 +89,7 @@ def compare(
         for entry, low, high in zip(listed[place], *ends, strict=True):
             if entry.seen and (entry.high + shift < low or entry.low + shift > high):
                 changed.append(
-                    f"{entry.label} is {_words(entry, shift)} now, outside of {low:g} to {high:g}"
+                    f"{entry.label} is {_words(entry, shift)} now, outside {low:g} to {high:g}"
                 )
     return changed
 

@@ -46,7 +46,7 @@ CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "pa
 
 
 class PPO(NamedTuple):
-    """What stays the same during a training."""
+    """What stays the same during training."""
 
     config: PPOConfig
     env: AnyEnv
@@ -133,7 +133,7 @@ def make_trainer(
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
 
     Args:
-      num_devices: devices that share the environments of one training.
+      num_devices: devices that share the environments of one training run.
 
     Raises:
       UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
@@ -422,7 +422,7 @@ def loss(ppo: PPO, params: Params, samples: Samples) -> tuple[jax.Array, Metrics
 
 
 def population(trainer: TrainingFunctions) -> TrainingFunctions:
-    """A trainer of S independent trainings: keys [S, 2] -> states with S as the first axis of every
+    """A trainer of S independent runs: keys [S, 2] -> states with S as the first axis of every
     array; metrics are [S, I]."""
 
     def run(states: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:

@@ -155,7 +155,7 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     """Writes a pytree of arrays as `reading.open_array` opens them, all in one go."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     with tensorstore.Transaction() as together:
-        # With a context of its own, each array would be written, and flushed, on its own.
+        # With separate contexts, each array would be written, and flushed, by itself.
         shared = dict(context=tensorstore.Context(), transaction=together)
         options = shared | dict(create=True, write=True)
         opening = [open_array(folder, path, leaf, **options) for path, leaf in leaves]

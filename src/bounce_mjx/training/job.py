@@ -57,7 +57,7 @@ REPORT_MODULE = "bounce_mjx.reports.page"
 
 @dataclasses.dataclass
 class SeedRun:
-    """One seed of a training."""
+    """One seed of a training run."""
 
     run: Path
     """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
@@ -80,7 +80,7 @@ class SeedRun:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a training does beside its config."""
+    """What a training run does that its config does not say."""
 
     command: str
     """The user's command, to which `--resume` may be added."""
@@ -133,7 +133,7 @@ def train(
 
 
 class _Job:
-    """A training in progress.
+    """A training run in progress.
 
     With several seeds the run's folder has the latest state of all seeds. Each seed has its own
     folder in it, which looks like the folder of a run of one seed. On several hosts every process
@@ -264,7 +264,7 @@ class _Job:
             say(self.console, f"{met}; {how if self.config.stop_when_solved else continues}")
 
     def compile(self) -> None:
-        """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
+        """Compiles the programs that training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
         with self.console.status("compiling"), no_garbage_collection():
@@ -429,7 +429,7 @@ class _Job:
 
     def _run_block(self) -> None:
         started = time.perf_counter()
-        # A training that was stopped inside a block first completes that block.
+        # A run that was stopped inside a block first completes that block.
         rest = self.block_steps - self.steps % self.block_steps
         block = self.pool.submit(
             self.trainer.run,
@@ -456,7 +456,7 @@ class _Job:
         self.reporter.saving_problem(next(filter(None, problems), None))
 
     def _check_faults(self, faults: np.ndarray) -> None:
-        """Ends a training that diverged, because its state is useless; with several seeds, the
+        """Ends a run that diverged, because its state is useless; with several seeds, the
         other seeds continue.
 
         Args:

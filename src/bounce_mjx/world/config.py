@@ -148,7 +148,7 @@ class WorldConfig(StrictModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _read_former_reset(cls, values: Any) -> Any:
-        """The configs of 0.1.0 have the noise of a reset beside the other settings."""
+        """The configs of 0.1.0 have the noise of a reset among the other settings."""
         if not isinstance(values, dict) or not _FORMER_RESET_KEYS.keys() & values.keys():
             return values
         moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}

@@ -45,7 +45,8 @@ class NamedWorld(StrictModel):
     """The content of a world's file."""
 
     robot: str | None = None
-    """Name of a robot in configs/robots/, or its file, beside the world's; null for any robot."""
+    """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
+    robot."""
     env: WorldSettings = WorldSettings()
     """Settings of the environment. Its randomisation is the whole one: a term that it does not have
     is as in the model."""

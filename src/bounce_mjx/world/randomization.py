@@ -75,9 +75,9 @@ class RandomizationConfig(StrictModel):
     restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98))] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
     restitution_slope: Annotated[Range | None, Term((), 0.0, (0.0, 0.1))] = None
-    """Fall of the restitution for each m/s of the impact's speed beyond 2.45 m/s, that of the
-    ITTF's drop from 30.5 cm, s/m; with restitution. Balls bounce less in faster impacts (Hubbard
-    and Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
+    """Drop of the restitution per m/s of impact speed above 2.45 m/s, the speed of the ITTF's drop
+    test from 30.5 cm, s/m; needs restitution. Balls bounce less in faster impacts (Hubbard and
+    Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
     ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
