@@ -27,7 +27,7 @@ from bounce_mjx.learning.policy import (
     untrained_policy,
 )
 from bounce_mjx.learning.ppo import Params, TrainingState
-from bounce_mjx.learning.statistics import RunningStatistics
+from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint
@@ -104,22 +104,25 @@ def load_training_state(
 
 
 def read_networks(
-    checkpoint: Checkpoint, shapes: tuple[Params, RunningStatistics]
+    checkpoint: Checkpoint, config: TrainConfig, num_critic_metrics: int
 ) -> tuple[Params, RunningStatistics]:
-    """Restores both networks of a checkpoint, and the statistics of their inputs.
-
-    Args:
-      shapes: shapes and dtypes, as from `jax.eval_shape`.
-    """
+    """Restores both networks of a checkpoint, and the statistics of their inputs."""
+    read_record(checkpoint)
     items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
     if not items:
         raise UserError(
-            f"the checkpoint {checkpoint.folder} holds no value network, only a policy; give a run "
-            "that bounce-mjx train made"
+            f"the checkpoint {checkpoint.folder} holds no value network, only a policy; give "
+            "robust_small, or a run that bounce-mjx train made"
         )
-    read_record(checkpoint)
-    template = dict(zip(("params", "statistics"), shapes, strict=True))
-    return tuple(_read_arrays(checkpoint, items[0], template).values())
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints, num_critic_metrics)
+
+    def initial() -> dict[str, Any]:
+        params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
+        return {"params": params, "statistics": init_statistics(size + num_critic_metrics)}
+
+    stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    return stored["params"], stored["statistics"]
 
 
 def read_record(checkpoint: Checkpoint) -> Record:

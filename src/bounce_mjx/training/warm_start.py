@@ -8,9 +8,8 @@ from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
-from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import TrainConfig, in_world, load_run_config, read_preset
 from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint
@@ -59,14 +58,8 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
             "hidden layers than this training; leave out the flags that change them"
         )
     names = names_of_critic_metrics(own.ppo, Env(own.env))
+    params, statistics = read_networks(checkpoint, own, len(names))
     size = own.env.layout.size
-    networks = make_networks(own.ppo, size, own.env.num_joints, len(names))
-
-    def initial() -> tuple[Params, RunningStatistics]:
-        inits = (network.init(jax.random.PRNGKey(0)) for network in networks)
-        return Params(*inits), init_statistics(size + len(names))
-
-    params, statistics = read_networks(checkpoint, jax.eval_shape(initial))
     wanted = names_of_critic_metrics(config.ppo, env)
     known = np.array([True] * size + [name in names for name in wanted])
     rows = [*range(size), *(size + names.index(n) if n in names else 0 for n in wanted)]
