@@ -107,11 +107,11 @@ def read_networks(
     checkpoint: Checkpoint, config: TrainConfig, num_critic_metrics: int
 ) -> tuple[Params, RunningStatistics]:
     """Restores both networks of a checkpoint, and the statistics of their inputs."""
-    read_record(checkpoint)
+    made_here = read_record(checkpoint).progress.get("library", "jax") == "jax"
     items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
-    if not items:
+    if not (items and made_here):
         raise UserError(
-            f"the checkpoint {checkpoint.folder} holds no value network, only a policy; give "
+            f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
             "robust_small, or a run that bounce-mjx train made"
         )
     size = config.env.layout.size

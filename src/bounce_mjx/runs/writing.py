@@ -49,9 +49,9 @@ class CheckpointWriter:
         steps: int,
         policy: Policy,
         training: TrainingState | None = None,
-        networks: tuple[Params, RunningStatistics] | None = None,
         progress: dict[str, Any] | None = None,
         results: dict[str, Any] | None = None,
+        networks: tuple[Params, RunningStatistics] | None = None,
     ) -> None:
         """Starts a save after waiting for the previous save.
 
@@ -59,9 +59,9 @@ class CheckpointWriter:
           names: the checkpoints to write, "latest" before "best".
           steps: environment steps trained.
           training: None for a checkpoint that cannot be resumed.
-          networks: without `training`, the part of it with which another training can start.
           progress: the evaluations so far, plain data.
           results: the run's results, plain data.
+          networks: without `training`, the part of it with which another training can start.
         """
         items = {"policy": policy} | ({} if training is None else {"training": training})
         if networks is not None:

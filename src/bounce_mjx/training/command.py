@@ -103,7 +103,7 @@ def read_training(
     own_class = train_config(base.env.task, command_class)
     default = own_class(**dict(start), config=config_path, robot=robot, world=world, resume=resume)
     command = parse(own_class, args, prog=prog, default=default)
-    if warm_start:
+    if warm_start and not resume:
         # By its own name, if it was the latest.
         command = command.model_copy(update={"warm_start": base.warm_start})
     if resume:
