@@ -29,7 +29,7 @@ class TrainingCommand(TrainConfig):
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
-    """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer);
+    """Preset: a YAML file, or the name of one in configs/, such as cpu, robust or finetune;
     a task's own preset of that name, such as configs/track/cpu.yaml, has priority. The default is
     default on an accelerator, and cpu on a CPU."""
     robot: Path | None = None
