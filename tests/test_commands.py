@@ -138,7 +138,7 @@ BAD_FLAGS = {
     "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
-    "no such preset": ("--config nope", "no preset is named nope", "cpu, default, robust"),
+    "no such preset": ("--config nope", "no preset is named nope", "cpu, default, finetune"),
     "no such robot": ("--robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     "run missing": ("--resume nowhere", "nowhere", "give a run's folder"),
     "MJCF missing": ("--mjcf a.xml", "a.xml", "does not exist", "give the path"),

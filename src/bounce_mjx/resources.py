@@ -9,7 +9,8 @@ TASK_POLICIES = ("balance", "catch", "juggle", "track")
 ARM_POLICIES = ("ur5e", "panda", "iiwa")
 """Arms of configs/robots/ with a policy of their name."""
 POLICIES = {PRETRAINED: PRETRAINED} | {
-    name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES, *ARM_POLICIES)
+    name: f"{PRETRAINED}/{name}"
+    for name in ("robust", "robust_small", *TASK_POLICIES, *ARM_POLICIES)
 }
 """The policies that come with the package, and their folders."""
 

@@ -39,9 +39,9 @@ class PlayCommand(WorldCommand):
         tyro.conf.arg(metavar="[CHECKPOINT ...]"),
     ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
-    policy that comes with the package: pretrained, robust, or the name of a task or an arm. Several
-    are shown side by side. The default is the newest run, or the task's policy in the package if
-    there is no run. mirror stands for the mirror law, a model-based baseline."""
+    policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
+    an arm. Several are shown side by side. The default is the newest run, or the task's policy in
+    the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
     actions: Literal["policy", "mirror"] = "policy"
     """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
     mirror."""

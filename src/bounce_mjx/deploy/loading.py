@@ -12,9 +12,10 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
     """Loads a policy that runs without JAX.
 
     Args:
-      policy: the name of a policy that comes with the package, "pretrained", "robust", or that of a
-        task such as "juggle" or of an arm; a `.onnx` file from `bounce-mjx export`; or a run's
-        folder or a checkpoint in it, which is first exported with JAX.
+      policy: the name of a policy that comes with the package, "pretrained", "robust",
+        "robust_small", or that of a task such as "juggle" or of an arm; a `.onnx` file from
+        `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
+        JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
 
     Raises:

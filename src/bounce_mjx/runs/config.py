@@ -85,6 +85,9 @@ class TrainConfig(StrictModel):
     them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
     with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
     steps of the first evaluation that meets all."""
+    warm_start: PlainPath | None = None
+    """The run with whose policy and value network the training starts, or the name of a policy that
+    comes with the package. Its environment and hidden layers take the place of the preset's."""
     log_dir: PlainPath
     """Folder in which the run creates its own, named by the time."""
 

@@ -44,6 +44,7 @@ from bounce_mjx.training.trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
+from bounce_mjx.training.warm_start import read_start
 
 Tree = TypeVar("Tree")
 
@@ -157,6 +158,8 @@ class _Job:
         self.env = Env(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
+        warm = config.warm_start is not None and not self.resumed
+        self.first = read_start(config, self.env) if warm else None
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
@@ -280,6 +283,8 @@ class _Job:
             hosts.any_of(False)
             self.trainer.start(self.state)
             self.state = None
+            if self.first is not None:
+                self.trainer.warm_start(*self.first)
         if hosts.is_leader():
             self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
         for writer in self.writers:
@@ -354,7 +359,9 @@ class _Job:
 
     def _is_due(self) -> bool:
         done = self.steps >= self.config.total_steps
-        at_evaluation = self.steps > 0 and (done or self.steps % self.eval_steps == 0)
+        # A policy that is good already is the first that counts as best.
+        trained = self.steps > 0 or self.first is not None
+        at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
         nothing = any(member.progress.best is None for member in self._healthy())
         return (at_evaluation and not self._evaluated()) or (done and nothing)
 

@@ -10,6 +10,8 @@ from jax.sharding import Mesh
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import Params
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 
 Metrics = dict[str, np.ndarray]
@@ -61,6 +63,10 @@ class Trainer(Protocol):
 
     def start(self, state: Any | None = None) -> None:
         """Starts from the seeds, or from the state of a `snapshot`."""
+
+    def warm_start(self, params: Params, statistics: RunningStatistics) -> None:
+        """Puts the networks of an earlier training into the first state, after `start`; see
+        `learning.ppo.warm_started`."""
 
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         """Trains for I iterations, or fewer where a slow trainer sees between two of them that

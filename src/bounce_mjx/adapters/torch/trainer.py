@@ -41,6 +41,11 @@ class TorchTrainer:
                 f"num_devices is {config.num_devices}, but PyTorch trains on one device here; "
                 "leave it out, or train with bounce-mjx train"
             )
+        if config.warm_start is not None:
+            raise UserError(
+                f"warm_start is {config.warm_start}, but PyTorch's trainings start untrained; "
+                "leave it out, or train with bounce-mjx train"
+            )
         self.library = library
         self._curves = env.task.curves
         self.mesh: Mesh = make_mesh(1, config.ppo)
