@@ -181,6 +181,7 @@ def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     return Problem(simulate, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
 
 
+@pytest.mark.slow
 def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     """The deviations are those of estimates from many draws of the noise, half of which is a common
     error of each window along the derivatives."""

@@ -153,6 +153,7 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
         in_world(config, Path("ur5e_rtde"))
 
 
+@pytest.mark.slow
 def test_robustness_measures_twice_the_assumed_alone(tmp_path, capsys) -> None:
     run = make_run(tmp_path / "run", {"episode_seconds": 0.05})
     with pytest.raises(SystemExit):
