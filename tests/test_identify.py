@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from bounce_mjx.commands.main import main
-from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, covariance, minimise
+from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log, read_csv
 from bounce_mjx.identify.simulation import Predicted, _Targets
 from bounce_mjx.identify.stages import Identified, identify, joined, sensor_noise
@@ -198,7 +198,7 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
         one = problem._replace(windows=w._replace(angles=noisy))
         fit = minimise(one, truth, w.starts, free, weights, 4)
         estimates.append(fit.vector[place])
-        deviations.append(np.sqrt(covariance(one, fit)[place, place]))
+        deviations.append(np.sqrt(certainty(one, fit).covariance[place, place]))
         of_noise = np.linalg.inv(fit.information + np.diag(layout.deviation**-2.0))
         independent.append(np.sqrt(of_noise[place, place]))
     assert np.std(estimates) > 1.5 * np.mean(independent)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.fit import Fit, Noise, Problem, covariance, minimise, picture_weights
+from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
 from bounce_mjx.identify.unknowns import Layout, make_layout
@@ -263,12 +263,13 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
     before = fit._replace(predicted=problem.at(own, fit.starts))
     of_balls = fit.weights[:, -3 * windows.balls.shape[1] :]
     dropped = windows.has_ball & np.all(of_balls == 0.0, axis=1)
+    known = certainty(problem, fit)
     return Identified(
         layout,
         windows,
         problem.noise,
-        fit,
-        covariance(problem, fit),
+        fit._replace(information=known.information),
+        known.covariance,
         _errors(problem, before),
         _errors(problem, fit),
         held_out,
