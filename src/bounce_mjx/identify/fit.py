@@ -18,7 +18,7 @@ from bounce_mjx.identify.windows import Windows
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
 # velocities (rad/s); the ball's position (m), velocity (m/s) and spin (rad/s).
 _START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0)
-_START_STEPS = (3e-3, 0.1, 0.01, 0.1, 5.0)
+_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0)
 # Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
 _SEARCHED = (True, False, True, True, True)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
@@ -34,6 +34,8 @@ _WORST = 30.0
 # Largest share of the information along any direction that one window counts for: its own is known
 # up to noise.
 _LARGEST_SHARE = 0.9
+# Share by which two derivatives of a window may differ.
+_DISAGREEMENT = 0.1
 
 
 # Deviation of a bounce from the model's: of the ball's velocity after it along x, y and z, m/s. A
@@ -222,13 +224,18 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     both = np.concatenate([one, two], axis=2)
     reduced = _eliminate(lines[0].residuals, both, by_state, at_guess)
     of_windows = _symmetric(reduced.informations[:, :size, size:])
+    total = np.trace(reduced.informations, axis1=1, axis2=2)
+    agreed = 2.0 * np.trace(of_windows, axis1=1, axis2=2)
+    # A ball that meets the paddle's edge has no derivative.
+    smooth = total - agreed <= _DISAGREEMENT**2 * (total + agreed)
+    of_windows = of_windows * smooth[:, None, None]
     values, vectors = np.linalg.eigh(np.sum(of_windows, axis=0))
     values = np.maximum(values, 0.0)
     # Coordinates in which the covariance of independent residuals is the identity.
     root = vectors / np.sqrt(values + 1.0)
     share, turned = np.linalg.eigh(root.T @ of_windows @ root)
     share = np.clip(share, 0.0, _LARGEST_SHARE)
-    gradients = np.stack(np.split(reduced.gradients, 2, axis=1)) @ root
+    gradients = np.stack(np.split(reduced.gradients * smooth[:, None], 2, axis=1)) @ root
     left_out = np.einsum("sij,sj,skj,lsk->lsi", turned, 1.0 / (1.0 - share), turned, gradients)
     of_noise = root @ root.T
     jackknife = _symmetric(left_out[0].T @ left_out[1]) + np.diag(1.0 / (values + 1.0))
@@ -392,7 +399,7 @@ def _eliminate(
     """
     num_free, num_states = by_unknown.shape[2], at_guess.shape[1]
     columns = np.concatenate([by_unknown, residuals[:, :, None], by_state], axis=2)
-    normal = np.swapaxes(columns, 1, 2) @ columns
+    normal = _squared(columns)
     kept, starts = normal[:, : num_free + 1, : num_free + 1], normal[:, num_free + 1 :]
     across, of_starts = starts[:, :, : num_free + 1], starts[:, :, num_free + 1 :]
     across[:, :, num_free] += at_guess
@@ -404,6 +411,15 @@ def _eliminate(
         change[:, :, :num_free],
         change[:, :, num_free],
     )
+
+
+def _squared(columns: np.ndarray) -> np.ndarray:
+    """Products [S, K, K] of the columns [S, M, K] of each window, in parts that are too small for
+    OpenBLAS to start threads: on a busy machine, these wait for one another a hundred times as long
+    as they compute."""
+    _, rows, size = columns.shape
+    parts = np.array_split(columns, -(-rows * size**2 // 2**18), axis=1)
+    return sum(np.swapaxes(part, 1, 2) @ part for part in parts)
 
 
 def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -246,8 +246,10 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
     few = np.zeros_like(search.training)
     few[_some(used)] = 1.0
-    for kept in (4, 1):
-        found = [search.run(["flight", "bounce"], t, 1.0, 2, ball_state, few) for t in tried]
+    for kept, iterations in ((4, 1), (1, 2)):
+        found = [
+            search.run(["flight", "bounce"], t, 1.0, iterations, ball_state, few) for t in tried
+        ]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
     (fit,) = tried
     fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
