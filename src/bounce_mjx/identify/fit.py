@@ -208,8 +208,9 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     derivatives with independent noise, by central differences of one and of two steps.
 
     Each deviation is the larger of two: that of independent residuals of the sensors' noise, and
-    that of the jackknife over windows, which knows that residuals of one window are correlated
-    (the estimator CR3 of MacKinnon, Nielsen and Webb 2023, "Cluster-robust inference").
+    that of the scatter of the windows' gradients, which knows that residuals of one window are
+    correlated (the estimator CR2 of Bell and McCaffrey 2002, "Bias reduction in standard errors for
+    linear regression with multi-stage samples").
     """
     layout, (deviations, _, searched) = problem.layout, _per_state(problem.windows)
     place, of_state = np.arange(len(fit.vector)), np.flatnonzero(searched)
@@ -236,11 +237,12 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     share, turned = np.linalg.eigh(root.T @ of_windows @ root)
     share = np.clip(share, 0.0, _LARGEST_SHARE)
     gradients = np.stack(np.split(reduced.gradients * smooth[:, None], 2, axis=1)) @ root
-    left_out = np.einsum("sij,sj,skj,lsk->lsi", turned, 1.0 / (1.0 - share), turned, gradients)
+    less = 1.0 / np.sqrt(1.0 - share)
+    gradients = np.einsum("sij,sj,skj,lsk->lsi", turned, less, turned, gradients)
     of_noise = root @ root.T
-    jackknife = _symmetric(left_out[0].T @ left_out[1]) + np.diag(1.0 / (values + 1.0))
-    jackknife = root @ jackknife @ root.T
-    wider = np.sqrt(np.maximum(np.diag(jackknife) / np.diag(of_noise), 1.0)) * scale
+    scatter = _symmetric(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
+    scatter = root @ scatter @ root.T
+    wider = np.sqrt(np.maximum(np.diag(scatter) / np.diag(of_noise), 1.0)) * scale
     information = (vectors * values) @ vectors.T
     return Certainty(of_noise * np.outer(wider, wider), information / np.outer(scale, scale))
 
