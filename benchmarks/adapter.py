@@ -3,7 +3,7 @@
     python benchmarks/adapter.py --num-envs 4096 32768
 
 Each figure is the median over rounds, in which the variants take turns. Within a round the steps
-follow one another as in a training; only the end of the round waits for the device.
+follow one another as in a training run; only the end of the round waits for the device.
 """
 
 import statistics

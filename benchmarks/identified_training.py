@@ -36,16 +36,14 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     """The results of a policy in the world of one hidden robot, with the task's default target."""
     checkpoint = choose_checkpoint(path, Path("runs"), Console(quiet=True))
     config = load_run_config(checkpoint.run)
-    world = {k: jnp.asarray(v, jnp.float32) for k, v in hidden_robot(seed).world.items()}
-    world |= {name: jnp.float32(value) for name, value in sensor_terms().items()}
-    # The config's ranges are numbers; the values of the joints are given to the reset.
-    spans = {name: (float(np.min(v)), float(np.max(v))) for name, v in world.items()}
-    update = {"randomization": RandomizationConfig(**spans)}
-    env = Env(config.env.model_copy(update=update))
+    world = hidden_robot(seed).world | sensor_terms()
+    values = {name: np.asarray(value, float).tolist() for name, value in world.items()}
+    randomization = RandomizationConfig(**{name: (value, value) for name, value in values.items()})
+    env = Env(config.env.model_copy(update={"randomization": randomization}))
     set_up_jax(env.config)
     policy, actor = read_actor(checkpoint, config)
     commands = neutral_commands(env.config)
-    ranges = env.ranges() | {name: (value, value) for name, value in world.items()} | commands
+    ranges = env.ranges() | commands
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
     make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
     evaluate = make(env, actor(env), episodes)

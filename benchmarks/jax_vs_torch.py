@@ -6,7 +6,7 @@
 
 The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax.
 They use the config's hyperparameters as far as each library has them (`trainers.py`,
-`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py`). Each training is a separate process
+`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py`). Each run is a separate process
 with an empty compilation cache. All trainers start episodes with the task's resets. Every
 `eval_every` steps, the same evaluation measures the policy without noise, on the same resets and on
 the fused physics.
@@ -69,12 +69,12 @@ Record = dict[str, Any]
 
 
 class Command(TrainConfig):
-    """The command line: the config's keys as flags, and the trainings to run."""
+    """The command line: the config's keys as flags, and what to train."""
 
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     total_steps: Annotated[int, Field(ge=1)] = 20_000_000
-    """Environment steps of each training."""
+    """Environment steps of each run."""
     eval_every: Annotated[int, Field(ge=1)] = 1_000_000
     """Environment steps between two evaluations, rounded to whole iterations."""
     config: Path | None = None
@@ -82,11 +82,11 @@ class Command(TrainConfig):
     methods: tuple[Method, ...] = METHODS
     """Trainers to run; give none to show only the existing records."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2)
-    """Seeds of the trainings."""
+    """Seeds of the runs."""
     max_seconds: Annotated[float, Field(gt=0.0)] = 570.0
     """Time limit of a training's process, s; after it, the training ends at its next evaluation."""
     stop_at_solved: bool = False
-    """End each training at its first evaluation that meets all five results."""
+    """End each run at its first evaluation that meets all five results."""
     merge: tuple[Path, ...] = ()
     """Further .jsonl files with records to show."""
     out: Path = Path("benchmarks/results")

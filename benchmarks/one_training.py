@@ -1,4 +1,4 @@
-"""One training of `jax_vs_torch.py`, which sets JAX up before it imports the libraries."""
+"""One training run of `jax_vs_torch.py`, which sets JAX up before it imports the libraries."""
 
 import sys
 

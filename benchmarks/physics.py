@@ -40,7 +40,7 @@ class Command(StrictModel):
     engines: tuple[EngineName, ...] = ("fused", "mjx", "c")
     """Engines; c is MuJoCo's C engine on all processor cores."""
     tasks: tuple[str, ...] = ("bounce",)
-    """Tasks whose worlds are measured, in turns; juggle has two balls."""
+    """Tasks whose worlds are measured, alternating; juggle has two balls."""
     control_steps: Annotated[int, Field(ge=1)] = 50
     """Control steps in one measurement of the fused engine; the slower engines take only 2."""
     repeats: Annotated[int, Field(ge=1)] = 5

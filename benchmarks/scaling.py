@@ -79,7 +79,7 @@ def configs(command: Command) -> list[TrainConfig]:
 
 
 def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
-    """Compiles trainings and runs the first block of each; each function runs one more block."""
+    """Compiles each training and runs its first block; each function runs one more block."""
     trainers = [PPOTrainer(config, Env(config.env)) for config in configs]
     with concurrent.futures.ThreadPoolExecutor() as pool:
         for trainer in trainers:
@@ -136,7 +136,7 @@ def covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def measure(command: Command) -> list[dict]:
-    """The blocks of every program, in turns."""
+    """The blocks of every program, alternating."""
     measured = configs(command)
     blocks = programs(measured)
     turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]

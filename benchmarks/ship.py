@@ -15,11 +15,13 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.learning.policy import networks_of
+from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
 from bounce_mjx.runs.config import (
@@ -37,7 +39,7 @@ from bounce_mjx.runs.folders import (
     write_config,
 )
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.runs.reading import read_networks, read_policy
 from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training.setup import set_up_jax
@@ -50,6 +52,8 @@ class ShipCommand(StrictModel):
     """A run's folder (its best checkpoint), or a checkpoint in it."""
     name: Literal[tuple(POLICIES)] = PRETRAINED
     """Name of the policy in the package; an arm's is of a run with that arm as --robot."""
+    networks: bool = False
+    """Also the value network, so that a training can start from the policy."""
     out: Path | None = None
     """Folder to write, by default the policy's own; an existing one is replaced."""
 
@@ -65,12 +69,17 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         set_up_jax()
         out = command.out or Path(POLICIES[command.name])
-        ship(command.run, out, Console(), command.name)
+        ship(command.run, out, Console(), command.name, command.networks)
 
 
-def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None:
+def ship(
+    run: Path, out: Path, console: Console, name: str = PRETRAINED, networks: bool = False
+) -> None:
     """Evaluates the policy of a run in the nominal world, and writes it with its config, its
     results and its ONNX file to `out`.
+
+    Args:
+      networks: whether its value network is written too.
 
     Raises:
       UserError: there is no policy, it misses a result, or the folder cannot be written.
@@ -92,7 +101,7 @@ def ship(run: Path, out: Path, console: Console, name: str = PRETRAINED) -> None
     console.print(details_line(report), highlight=False)
     if not report.passed:
         raise UserError(f"the policy of {run} misses a result; train longer or give another run")
-    write_policy(checkpoint, trained_with, evaluation, out, name)
+    write_policy(checkpoint, trained_with, evaluation, out, name, networks)
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     console.out(f"written: {out} ({size / 1000:.0f} kB)", highlight=False)
 
@@ -128,14 +137,17 @@ def write_policy(
     evaluation: PolicyEvaluation,
     out: Path,
     name: str,
+    networks: bool = False,
 ) -> None:
-    """Writes the folder of a policy.
+    """Writes the folder of a policy, as `ship` does.
 
     Raises:
       UserError: the folder cannot be written.
     """
     report, physics, _ = evaluation
     policy = read_policy(checkpoint, trained_with)
+    critic = len(names_of_critic_metrics(trained_with.ppo, Env(trained_with.env)))
+    start = read_networks(checkpoint, trained_with, critic) if networks else None
     made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": runs_folder(trained_with.env.task)})
@@ -159,7 +171,7 @@ def write_policy(
             made.mkdir()
             write_config(made, config)
             writer = CheckpointWriter(made, config)
-            writer.save(("best",), checkpoint.steps, policy, results=results)
+            writer.save(("best",), checkpoint.steps, policy, networks=start, results=results)
             writer.close()
             if writer.problem():
                 raise UserError(f"{writer.problem()}; free space or give another --out")

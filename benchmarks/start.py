@@ -5,10 +5,10 @@
 A cold start has an empty compilation cache; each second start uses the cache of the cold start
 before it. Each is a process of `bounce-mjx train --stop-when-solved`, as a user starts it, with
 the flags that follow `--`. "results" is the end of the first evaluation that meets all five; the
-training, and its phases, go on until they have a margin. (Code without a margin ended there, and
+training, and its phases, continue until they have a margin. (Code without a margin ended there, and
 its "results" include the final evaluation.) The benchmark also times `import bounce_mjx`, the
 import of the environment, and `--help`. Python keeps its bytecode, as it does by default: the
-benchmark unsets PYTHONDONTWRITEBYTECODE, and imports the modules of a training once before.
+benchmark unsets PYTHONDONTWRITEBYTECODE, and imports the modules of a training run once before.
 """
 
 import json
@@ -61,7 +61,7 @@ class Command(StrictModel):
     """The command line."""
 
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (1, 2)
-    """Seeds of the trainings; each starts cold, then again."""
+    """Seeds of the runs; each starts cold, then again."""
     repetitions: Annotated[int, Field(ge=1)] = 3
     """Repetitions of each import and each `--help`; the shortest time counts."""
     out: Path = Path("benchmarks/results")
@@ -79,7 +79,7 @@ def quick_seconds(arguments: Sequence[str], repetitions: int) -> float:
 
 
 def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
-    """One training to the five results; the times of its phases, s."""
+    """One training run to the five results; the times of its phases, s."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         flags = ["--seed", str(seed), "--stop-when-solved", "--log-dir", str(folder / "runs")]

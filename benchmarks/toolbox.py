@@ -1,4 +1,4 @@
-"""MuJoCo's own identification toolbox (`mujoco[sysid]`) on the log of a hidden robot, beside
+"""MuJoCo's own identification toolbox (`mujoco[sysid]`) on the log of a hidden robot, next to
 benchmarks/identify.py: time and error for the parameters that it has.
 
 `python benchmarks/toolbox.py LOG.csv --seed SEED`. It fits the arm during the excitation, from one

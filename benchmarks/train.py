@@ -1,10 +1,10 @@
-"""Time of whole trainings, and the five results of their policies on every engine, over seeds.
+"""Time of whole training runs, and the five results of their policies on every engine, over seeds.
 
     python benchmarks/train.py --seeds 0 1 2 3 4 --engines fused mjx mujoco
 
-Each training is a separate process with an empty compilation cache. It runs
+Each training run is a separate process with an empty compilation cache. It runs
 `train_jax.py --stop-when-solved` as a user would, with the flags that follow `--`. "solved" is the
-first evaluation that meets all five results; the training, and its time, go on until they have a
+first evaluation that meets all five results; the training, and its time, continue until they have a
 margin. (Code without a margin ended at that evaluation.) `start.py` measures the time to it.
 """
 
@@ -32,11 +32,11 @@ class Command(StrictModel):
     """The command line."""
 
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0, 1, 2, 3, 4)
-    """Seeds of the trainings."""
+    """Seeds of the runs."""
     engines: tuple[Literal["fused", "mjx", "mujoco"], ...] = ("fused", "mujoco")
     """Engines on which each trained policy is evaluated, 1,024 episodes each."""
     stop_when_solved: bool = True
-    """End a training once its results have a margin, or at total_steps."""
+    """End a training run once its results have a margin, or at total_steps."""
     out: Path = Path("benchmarks/results")
     """Folder for train.json and train.md."""
 

@@ -2,7 +2,7 @@
 
 `python examples/playground_rollout.py [pretrained | robust | RUN]` needs
 `pip install 'playground<1'` and the extra `deploy`.
-A training is `python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own
+Training is `python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own
 program.
 """
 

@@ -40,6 +40,7 @@ def test_the_interval_is_that_of_the_mean() -> None:
     assert interval([None], ".1f") == "-" and interval([2.0, 2.0], ".1f") == "2.0"
 
 
+@pytest.mark.slow
 def test_the_mirror_law_hits_until_the_cap(monkeypatch) -> None:
     """Its apexes are near the target, some above and some below."""
     monkeypatch.setattr(benchmark, "MOST_HITS", 8)

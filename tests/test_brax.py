@@ -67,6 +67,7 @@ def test_the_bare_environment_refuses_randomization_by_brax(env):
         training.wrap(env, randomization_fn=lambda system: (system, None))
 
 
+@pytest.mark.slow
 def test_randomization_by_brax_acts_on_the_physics():
     """After a step of free fall, the ball's speed is that of the world's gravity; a time-out keeps
     the world."""
@@ -335,6 +336,7 @@ def test_replicate_copies_arrays_numbers_and_keys():
     )
 
 
+@pytest.mark.slow
 def test_replicate_puts_one_copy_on_each_device():
     # Runs in a separate process because the number of CPU devices is fixed when jax starts.
     program = """

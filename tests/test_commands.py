@@ -138,7 +138,7 @@ BAD_FLAGS = {
     "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
-    "no such preset": ("--config nope", "no preset is named nope", "cpu, default, robust"),
+    "no such preset": ("--config nope", "no preset is named nope", "cpu, default, finetune"),
     "no such robot": ("--robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     "run missing": ("--resume nowhere", "nowhere", "give a run's folder"),
     "MJCF missing": ("--mjcf a.xml", "a.xml", "does not exist", "give the path"),
@@ -442,7 +442,7 @@ def test_help_shows_the_form_of_each_kind_of_value(monkeypatch) -> None:
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):
         parse(Command, ["--help"], prog="it")
-    assert "A pair of numbers." in shown.getvalue(), "a docstring's line break is kept"
+    assert "A pair of numbers." in shown.getvalue(), "a docstring's line break remains"
     text = " ".join(shown.getvalue().replace("│", "").split())
     for form in (
         "[PATH ...]",

@@ -60,6 +60,7 @@ def test_a_margin_counts_what_is_near() -> None:
     assert steps[0] < steps[1] < steps[2]
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_touches_the_floor_only_after_a_noisy_start() -> None:
     """The paddle's home is 5 cm above the floor, and a reset's noise can lower it by as much."""
     checkpoint = pretrained_checkpoint()

@@ -22,7 +22,7 @@ from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import export_jax, export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
-from bounce_mjx.deploy.metadata import CommandRange, from_entries
+from bounce_mjx.deploy.metadata import CommandRange, from_entries, to_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -407,6 +407,16 @@ def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path]) -> None:
     for count in (1, 1000):
         some = {part: values[:count] for part, values in given.items()}
         np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
+
+
+def test_metadata_has_the_ranges_of_each_axis() -> None:
+    ranges = {"air_drag": (0.0, 0.2), "paddle_tilt": ((-0.08, 0.01), (-0.07, 0.03))}
+    metadata = policy_metadata(TrainConfig(env={"randomization": ranges}), 0)
+    assert from_entries(to_entries(metadata)).randomization == {
+        "air_drag": (0.0, 0.2),
+        "paddle_tilt[0]": (-0.08, -0.07),
+        "paddle_tilt[1]": (0.01, 0.03),
+    }
 
 
 def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) -> None:

@@ -98,7 +98,7 @@ with lock_run(run), lock_run(run):
 def test_compiled_programs_are_kept_in_a_private_folder(
     linked: str | None, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    """A link in its place is left alone: a warning tells that nothing is kept."""
+    """A link in its place is left alone: a warning says that nothing is cached."""
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder, target = tmp_path / "cache/bounce_mjx/jax", tmp_path / "target"

@@ -52,6 +52,7 @@ MODELS = {
     "soft": ('solimp="0.95 0.99 0.001"', 'solimp="0.5 0.99 0.02 0.3 3"'),
     "ball as heavy as the arm": ('size="0.019" mass="0.0027"', 'size="0.019" mass="3"'),
 }
+FAST_MODELS = ("as it is", "another one along each tangent")
 
 
 def frictional(cone: str, old: str = "condim", new: str = "condim") -> mujoco.MjModel:
@@ -139,7 +140,10 @@ def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
 
 
 @pytest.mark.parametrize("cone", CONES)
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in FAST_MODELS else pytest.mark.slow) for n in MODELS],
+)
 @pytest.mark.usefixtures("float64")
 def test_one_step_of_a_frictional_model_is_mujocos(name, cone, record_property):
     """From states that stick, slip and separate, on faces, edges and corners."""

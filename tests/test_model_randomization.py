@@ -140,7 +140,7 @@ def test_standard_solref_becomes_direct(mj_model, base):
 
 
 def test_equal_values_change_nothing(mj_model, base):
-    """A function that gives every field a batch axis, but the same values, is no randomisation."""
+    """A function that only gives every field a batch axis is not a randomisation."""
     fields = {name: np.stack([getattr(base, name)] * 2) for name in ("qpos0", "body_mass")}
     assert read(mj_model, base, **fields) == PhysicsParameters()
 

@@ -104,6 +104,7 @@ def test_one_step_in_random_worlds_is_mujocos(mj_model):
     assert_same_step(uncompiled_steps(mj_model, parameters, states), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_each_number_alone_acts_as_in_mujoco(mj_model):
     """In one batch with shared states and parameters, except for one random field."""
@@ -139,6 +140,7 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
     assert_same_step(uncompiled_steps(model, parameters, states), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property):
     """Both engines run freely; neither sees the other's state."""
@@ -297,6 +299,7 @@ def heavy_and_light(key: jax.Array) -> PhysicsParameters:
     return PhysicsParameters(ball_mass=0.0027 * 100.0 ** jax.random.uniform(key))
 
 
+@pytest.mark.slow
 def test_each_environment_of_a_batch_has_its_own_ball():
     """A drawn mass acts like in C with the edited model, and is in the state."""
     with jax.enable_x64(True):

@@ -1,4 +1,4 @@
-"""`play --log`: a robot of a known world, beside its simulation in that world and in another."""
+"""`play --log`: a robot of a known world, next to its simulation in that world and in another."""
 
 import runpy
 from pathlib import Path
@@ -58,7 +58,7 @@ def replayed(log: Log, world: Path, **estimates) -> Replay:
 
 @pytest.fixture(scope="module")
 def found(log: Log, tmp_path_factory: pytest.TempPathFactory) -> Replay:
-    """The log beside its simulation in the robot's own world."""
+    """The log next to its simulation in the robot's own world."""
     return replayed(log, world_file(tmp_path_factory.mktemp("world")))
 
 
@@ -153,7 +153,7 @@ def test_a_log_without_pictures_shows_the_arm_alone() -> None:
     with pytest.raises(UserError, match="have 5 numbers for encoder_bias, and the robot has 6"):
         replay_log(read_preset(Path("default")).env, log, {"encoder_bias": (0.0,) * 5})
     short = log._replace(times=times[:40], joint_angles=sway[:40])
-    with pytest.raises(UserError, match="no stretch of unbroken .*; record at least 5 s"):
+    with pytest.raises(UserError, match="has 0 stretches of unbroken .*; record at least 5 s"):
         replay_log(read_preset(Path("default")).env, short)
 
 

@@ -423,6 +423,7 @@ def test_learning_is_in_float32_with_physics_in_float64(tiny):
     assert {x.dtype for x in jax.tree.leaves(learned)} == {jnp.dtype(jnp.float32)}
 
 
+@pytest.mark.slow
 def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
     """The state stays in float32, and the update has the same direction as in float32."""
     config = tiny.model_copy(update={"compute_dtype": "bfloat16"})

@@ -128,7 +128,7 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console)
 @pytest.mark.parametrize("arm", ARM_POLICIES)
 def test_each_arm_has_a_policy(arm: str) -> None:
     """It has met its results, is small, and its ONNX file, which needs no model of the arm, has the
-    limits of the arm's maker."""
+    limits of the arm's manufacturer."""
     folder = resource_path(POLICIES[arm])
     report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     assert report["passed"] and report["details"]["episodes"] == 1024

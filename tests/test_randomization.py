@@ -1,6 +1,8 @@
 """Randomised worlds: draws, late actions, late and noisy sensors, pushes and targets."""
 
 import functools
+import math
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,11 +11,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import yaml
 from scipy import stats
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config.files import differing_keys, dump_config
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
@@ -25,7 +29,7 @@ from bounce_mjx.learning.ppo import make_trainer
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import TrainConfig, load_config
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import delayed, start_actuation
 from bounce_mjx.world.randomization import (
@@ -66,6 +70,73 @@ def test_draws_are_uniform_in_their_ranges() -> None:
     assert min(p_values) > 1e-3 / len(shares)
     correlation = np.corrcoef(shares) - np.eye(len(shares))
     assert np.abs(correlation).max() < 6 / np.sqrt(2000)
+
+
+GAINS = tuple(0.7 + 0.05 * i for i in range(6)), tuple(0.72 + 0.05 * i for i in range(6))
+OWN = {"paddle_tilt": ((-0.08, 0.01), (-0.07, 0.03)), "servo_gain": GAINS}
+
+
+def test_each_entry_is_drawn_in_its_own_range() -> None:
+    config = RandomizationConfig(**OWN, armature=(0.9, 1.1))
+    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
+    draw = functools.partial(draw_world, dtype=jnp.dtype("float32"), num_joints=6)
+    worlds = jax.jit(jax.vmap(functools.partial(draw, config.ranges())))(keys)
+    for name, (low, high) in OWN.items():
+        shares = (np.asarray(worlds[name], float) - low) / np.subtract(high, low)
+        assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
+        assert min(stats.kstest(entry, "uniform").pvalue for entry in shares.T) > 1e-3 / 8
+    # Ranges that are all the same are one range, drawn from the same numbers.
+    same = RandomizationConfig(servo_gain=((0.8,) * 6, (1.2,) * 6)).ranges()
+    one = RandomizationConfig(servo_gain=(0.8, 1.2)).ranges()
+    np.testing.assert_array_equal(*(draw(r, keys[0])["servo_gain"] for r in (same, one)))
+
+
+def test_each_entry_grows_from_the_nominal_value() -> None:
+    low, high = RandomizationConfig(**OWN).ranges(0.5)["servo_gain"]
+    np.testing.assert_allclose((low, high), 0.5 + 0.5 * np.array(GAINS), rtol=1e-6)
+
+
+def test_ranges_of_entries_are_settings_like_others() -> None:
+    config = EnvConfig(randomization=OWN)
+    assert config.randomization.paddle_tilt == OWN["paddle_tilt"]
+    with warnings.catch_warnings(action="error"):
+        values = yaml.safe_load(dump_config(config))
+        assert config.model_dump()["randomization"]["servo_gain"] == GAINS
+    read = validate(EnvConfig, values, "config.yaml")
+    assert read == config and hash(read.randomization) == hash(config.randomization)
+    assert "env.randomization.servo_gain" in differing_keys(
+        TrainConfig(env=config), TrainConfig(env=EnvConfig(randomization={"servo_gain": (0.7, 1)}))
+    )
+
+
+@pytest.mark.parametrize(
+    "term, ends, wrong",
+    [
+        ("restitution", [[0.7], [0.8]], "is not a range; give two numbers"),
+        ("paddle_tilt", [-0.1, [0.1, 0.1]], "two lists with one for each of 2 axes"),
+        ("paddle_tilt", [[0.0] * 3, [0.1] * 3], "two lists with one for each of 2 axes"),
+        ("paddle_tilt", [[0.0, 0.2], [0.1, 0.1]], "paddle_tilt (0.2, 0.1) is not a range"),
+        ("servo_gain", [[0.9] * 6, [1.1] * 5], "two numbers, or two lists with one for each joint"),
+        ("servo_gain", [[0.9] * 5, [1.1] * 5], "has ranges for 5 joints, but default_joint_angles"),
+        ("servo_gain", [[], []], "has ranges for 0 joints, but default_joint_angles has 6"),
+        ("servo_gain", [[0.9] * 6, [1.1] * 5 + [2e3]], "servo_gain (0.9, 2000.0) leaves 0.001 to"),
+        (
+            "servo_gain",
+            [[0.9] * 6, ["much"] * 6],
+            "servo_gain is 'much', but must be a valid number",
+        ),
+        (
+            "servo_gain",
+            [[0.9] * 6, [math.inf] * 6],
+            "servo_gain is inf, but must be a finite number",
+        ),
+    ],
+)
+def test_a_wrong_range_of_entries_is_one_sentence(term: str, ends: list, wrong: str) -> None:
+    with pytest.raises(UserError) as caught:
+        validate(EnvConfig, {"randomization": {term: ends}}, "config.yaml")
+    message = str(caught.value)
+    assert wrong in message and term in message and "\n" not in message
 
 
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:

@@ -210,6 +210,7 @@ def test_a_checkpoint_counts_until_the_next_is_complete(
     assert [p.name for p in latest.parent.iterdir()] == [str(STEPS)]
 
 
+@pytest.mark.slow
 def test_lost_evaluation_is_repeated(tmp_path: Path, straight: Path) -> None:
     # As after a signal at a step where an evaluation was due.
     run = train(tmp_path, STEPS // 2, "--eval-every", str(STEPS))

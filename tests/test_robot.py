@@ -564,7 +564,7 @@ def test_changes_are_listed(tmp_path) -> None:
     losses = [float(model.dof_frictionloss[model.joint(f"j{i}").dofadr[0]]) for i in range(1, 7)]
     assert losses == [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert model.opt.ls_iterations == mujoco.MjOption().ls_iterations
-    assert len(re.findall("by a position servo: kp", changes)) == 6
+    assert len(re.findall("with a position servo: kp", changes)) == 6
 
 
 def test_an_adopted_config_gives_the_same_model_again(written) -> None:

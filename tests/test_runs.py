@@ -141,7 +141,7 @@ def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
 
 
 def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
-    """Time stamps count, whatever the copy's number or the words beside them; a run without one
+    """Time stamps count, whatever the copy's number or the words next to them; a run without one
     counts from the writing of its config."""
     stamps = "2026-01-02_10-00-00", "2026-01-02_10-00-00_2", "2026-01-02_10-00-00_10"
     names = ["zebra", "2026-01-01_10-00-00", *stamps, "apple", "2026-01-04_10-00-00 long"]
@@ -179,7 +179,7 @@ def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys
     with pytest.raises(SystemExit) as exit_info:
         train_command.main(["--resume", str(run)])
     assert exit_info.value.code == 2
-    assert f"error: {run}/{place} is a link, and a training" in capsys.readouterr().err
+    assert f"error: {run}/{place} is a link, and training" in capsys.readouterr().err
     assert contents(other) == before
 
 

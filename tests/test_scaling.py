@@ -274,6 +274,7 @@ def test_a_training_continues_on_the_devices_that_are_left(
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
 
+@pytest.mark.slow
 def test_a_full_device_is_told_in_one_sentence(tmp_path: Path, monkeypatch, capsys):
     def full(self, *args):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
@@ -515,6 +516,7 @@ def two_hosts(tmp_path: Path, *flags: object) -> list[contextlib.AbstractContext
     ]
 
 
+@pytest.mark.slow
 def test_a_host_with_a_wrong_flag_ends_the_others(tmp_path: Path):
     leading, following = two_hosts(tmp_path, "--sede", 1)
     with leading as leader, following as follower:

@@ -102,7 +102,7 @@ def test_observation_shares_the_memory_of_jax(env, monkeypatch):
 
     monkeypatch.setattr(env, "_jit_step", spy)
     result = env.step(torch.zeros(NUM_ENVS, 6))
-    # One after the other, each at a new word, and none outside the block.
+    # One after another, each at a new word, and none outside the block.
     at = blocks[0].unsafe_buffer_pointer()
     for tensor in result:
         assert tensor.data_ptr() == at and tensor.is_contiguous()

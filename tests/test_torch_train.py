@@ -102,7 +102,7 @@ def test_run_folder_has_the_same_files_as_in_jax(run):
 
 
 def test_rsl_rls_runner_opens_the_model(run, library):
-    """Its runner goes on from the last networks, optimizer and iteration."""
+    """Its runner continues from the last networks, optimizer and iteration."""
     if library != "rsl_rl":
         pytest.skip("the format of rsl_rl's runner")
     config = load_config(run / "config.yaml")

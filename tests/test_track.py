@@ -93,7 +93,7 @@ def test_a_point_stays_where_a_user_sets_it() -> None:
     for path in range(len(paths.NAMES)):
         still = followed(command(path, speed=0.0), 50)
         np.testing.assert_allclose(still, still[:1].repeat(50, 0), atol=1e-6)
-    # A path goes on from the place that a user sets.
+    # A path continues from the place that a user sets.
     now = command(0)
     offset = paths.offset(now, SIZE, now["phase"])
     moved = TRACK.next_command((jnp.array(True), offset), now | {"target_x": jnp.float32(0.7)})

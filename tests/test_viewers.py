@@ -765,7 +765,7 @@ def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -
         for page in pages:
             name = page.partition("://")[2]
             assert handshake(address, name, page) == b"101", page
-            # A program that is no browser tells no origin.
+            # A program other than a browser sends no origin.
             assert handshake(address, name, None) == b"101", page
             for stranger in [*strangers, "null", "http://localhost:1", "file://", "http://[", ""]:
                 assert handshake(address, name, stranger) == b"403", (page, stranger)
@@ -1256,6 +1256,15 @@ def test_sliders_extend_the_ranges_of_a_task() -> None:
     assert set(ranges) == set(widened.terms)
     np.testing.assert_allclose(ranges["restitution"], (0.7, 0.8))
     np.testing.assert_array_equal(ranges["paddle_tilt"], np.zeros((2, 2)))
+
+
+def test_a_slider_extends_the_ranges_of_all_axes() -> None:
+    tilt = (-0.08, 0.01), (-0.07, 0.2)
+    config = EnvConfig(randomization=RandomizationConfig(paddle_tilt=tilt))
+    widened = with_sliders(config).randomization
+    assert widened.paddle_tilt == (-0.08, 0.2) and sliders_for(widened) == SLIDERS
+    assert not sliders_for(config.randomization)
+    np.testing.assert_allclose(drawn_ranges(config)["paddle_tilt"], tilt)
 
 
 def test_another_robot_has_no_slider_for_the_restitution() -> None:

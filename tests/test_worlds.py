@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -19,6 +20,7 @@ from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
 from test_deploy import make_run
 
+TWICE = "twice the assumed"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
 WORLD = {
     "env": {"randomization": {"action_latency": [0.01, 0.02], "frame_drop": [0.0, 0.1]}},
@@ -42,7 +44,7 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
         len(source.split()) > 3 and source.endswith(".") for source in world.sources.values()
     )
     assert {"action_latency", "ball_latency", "camera_rate"} <= terms.keys()
-    # A number that nobody measured is no measurement with a source on the web.
+    # A number that nobody measured is not a measurement with a source on the web.
     assert not any("issue" in world.sources[key] for key in world.assumed)
 
 
@@ -84,6 +86,37 @@ def test_training_has_the_world_in_place_of_the_presets(tmp_path: Path) -> None:
     assert command.env.observation == preset.observation
 
 
+TILT = (-0.08, 0.01), (-0.07, 0.03)
+TILTED = {
+    "env": {"randomization": {"paddle_tilt": [[-0.08, 0.01], [-0.07, 0.03]]}},
+    "sources": {"randomization": "An example."},
+    "assumed": ["randomization.paddle_tilt"],
+}
+
+
+def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> None:
+    world = written(tmp_path, **TILTED)
+    assert read_command(["--world", str(world)]).env.randomization.paddle_tilt == TILT
+    given = read_command(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
+    assert given.env.randomization.paddle_tilt == (-0.1, 0.1)
+    trained = TrainConfig()
+    there, named = in_world(trained, world)
+    conditions = load_suite(
+        resource_path("configs/robustness.yaml"), there.env, there.env, named.doubled()
+    )
+    nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
+    np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)
+    np.testing.assert_allclose(twice.ranges["paddle_tilt"], 2.0 * np.array(TILT))
+    assert nominal.trained and not twice.trained
+
+
+def test_help_shows_the_ranges_of_a_world(tmp_path: Path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        read_command(["--world", str(written(tmp_path, **TILTED)), "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--randomization.paddle-tilt FLOAT FLOAT Rotation of the paddle" in shown
+
+
 def test_a_world_brings_its_robot() -> None:
     command = read_command(["--config", "cpu", "--world", "ur5e_rtde"])
     assert command.env.mjcf.name == "ur5e.xml"
@@ -120,6 +153,7 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
         in_world(config, Path("ur5e_rtde"))
 
 
+@pytest.mark.slow
 def test_robustness_measures_twice_the_assumed_alone(tmp_path, capsys) -> None:
     run = make_run(tmp_path / "run", {"episode_seconds": 0.05})
     with pytest.raises(SystemExit):

@@ -31,10 +31,10 @@ def read_regular(path: Path, limit: int) -> bytes:
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yields a new, empty file beside `path`, with its suffix, which replaces it at the end of the
+    """Yields a new, empty file next to `path`, with its suffix, which replaces it at the end of the
     block; after an exception, the new file is removed.
 
-    A link at `path` is replaced, too, and what it leads to stays as it is.
+    A link at `path` is replaced, too, and its target stays as it is.
 
     Raises:
       OSError: the file cannot be made, or cannot replace the other.

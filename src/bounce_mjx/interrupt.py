@@ -95,7 +95,7 @@ class StopRequest:
 def run_interruptible(
     function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> Result:
-    """Calls a function in a thread of its own and waits for its result.
+    """Calls a function in a new thread and waits for its result.
 
     Python runs signal handlers in the main thread, between two bytecodes. A compilation on that
     thread would therefore delay Ctrl-C until it ends.
@@ -127,7 +127,7 @@ def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Futur
 
 
 def interruptible(command: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A command that runs in a thread of its own, and that Ctrl-C ends at once with status 130."""
+    """A command that runs in its own thread, and that Ctrl-C ends at once with status 130."""
 
     @functools.wraps(command)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -5,11 +5,12 @@ from pathlib import Path
 
 PRETRAINED = "pretrained"
 TASK_POLICIES = ("balance", "catch", "juggle", "track")
-"""Tasks with a policy of their name, beside that of the default task, `PRETRAINED`."""
+"""Tasks with a policy of their name, in addition to the default task's, `PRETRAINED`."""
 ARM_POLICIES = ("ur5e", "panda", "iiwa")
 """Arms of configs/robots/ with a policy of their name."""
 POLICIES = {PRETRAINED: PRETRAINED} | {
-    name: f"{PRETRAINED}/{name}" for name in ("robust", *TASK_POLICIES, *ARM_POLICIES)
+    name: f"{PRETRAINED}/{name}"
+    for name in ("robust", "robust_small", *TASK_POLICIES, *ARM_POLICIES)
 }
 """The policies that come with the package, and their folders."""
 

@@ -335,7 +335,7 @@ def _batches(fields: Fields) -> Fields:
     if batches.keys() != set(traced):
         raise UserError(
             "randomization_fn was called inside jax.jit, so its values cannot be checked; wrap the "
-            "environment outside of it"
+            "environment outside it"
         )
     for name in fields.keys() - batches.keys():
         batches[name] = np.asarray(fields[name])[None]

@@ -1,1 +1,1 @@
-"""Controllers without a training, with which a policy is compared."""
+"""Controllers that are not trained, to compare policies with."""

@@ -28,7 +28,7 @@ class BenchmarkCommand(ActorCommand):
 
     policies: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY ...")]
     """Rows of the table: a run, a checkpoint, a policy that comes with the package, mirror for the
-    mirror law, or a folder whose runs are the seeds of one training."""
+    mirror law, or a folder whose runs are the seeds of one training run."""
     episodes: Count = DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
     seed: NonNegativeInt = DEFAULT_SEED

@@ -15,7 +15,7 @@ from bounce_mjx.errors import exit_on_user_error, install_command, reason_of
 from bounce_mjx.interrupt import interruptible
 
 _DISTRIBUTION = "bounce_mjx"
-# Versions on which the results of a simulation and a training depend.
+# Versions on which the results of simulation and training depend.
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx numpy flax optax tensorstore".split()
 _VARIABLES = ("JAX_", "XLA_", "MUJOCO_GL", "CUDA_VISIBLE_DEVICES")
 _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[([\w,-]+)\])?.*?(?:;.*\bextra == ['\"]([\w-]+)['\"].*)?$")

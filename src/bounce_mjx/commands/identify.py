@@ -11,6 +11,7 @@ from rich.console import Console
 from bounce_mjx.commands.run_options import TopicsConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
+from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
@@ -60,6 +61,10 @@ def main(args: Sequence[str]) -> None:
         for path in (command.out, page):
             check_output(path, "--out")
     config = read_preset(Path("default"), command.robot).env
+    if known is not None:
+        # Its ranges are of this robot's joints.
+        ranges = known.applied({})["randomization"]
+        validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     names = joint_names(model)
     topics = Topics(**command.topics.model_dump())
@@ -94,7 +99,7 @@ def main(args: Sequence[str]) -> None:
         console.print(sentence, markup=False)
     if known is not None:
         changed = compare(known, found, log, names)
-        for line in changed or [f"the robot is still that of {command.check}"]:
+        for line in changed or [f"the robot still matches {command.check}"]:
             console.print(line, markup=False)
         sys.exit(1 if changed else 0)
     robot = None if command.robot is None else str(command.robot)

@@ -39,9 +39,9 @@ class PlayCommand(WorldCommand):
         tyro.conf.arg(metavar="[CHECKPOINT ...]"),
     ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
-    policy that comes with the package: pretrained, robust, or the name of a task or an arm. Several
-    are shown side by side. The default is the newest run, or the task's policy in the package if
-    there is no run. mirror stands for the mirror law, a model-based baseline."""
+    policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
+    an arm. Several are shown side by side. The default is the newest run, or the task's policy in
+    the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
     actions: Literal["policy", "mirror"] = "policy"
     """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
     mirror."""
@@ -51,7 +51,7 @@ class PlayCommand(WorldCommand):
     """World of the episodes, if a term is given, in place of the world of the training."""
     log: Path | None = None
     """Log of a robot's run, as for bounce-mjx identify; writes a page (--html, by default the log's
-    name with _replay.html) with the measured run beside its simulation in --world. --robot is the
+    name with _replay.html) with the measured run next to its simulation in --world. --robot is the
     robot's config."""
     topics: TopicsConfig = TopicsConfig()
     """Topics of a log that is a bag."""

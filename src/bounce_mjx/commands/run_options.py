@@ -98,9 +98,9 @@ class OneActorCommand(ActorCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
-    that comes with the package (pretrained, robust, or the name of a task or an arm), or mirror for
-    the mirror law, a model-based baseline. The default is the newest run, or the task's policy in
-    the package if there is no run."""
+    that comes with the package (pretrained, robust, robust_small, or the name of a task or an arm),
+    or mirror for the mirror law, a model-based baseline. The default is the newest run, or the
+    task's policy in the package if there is no run."""
 
 
 class WorldCommand(ActorCommand):
@@ -138,8 +138,9 @@ class PolicyCommand(RunCommand):
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
     ] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
-    policy that comes with the package: pretrained, robust, or the name of a task or an arm. The
-    default is the newest run, or the task's policy in the package if there is no run."""
+    policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
+    an arm. The default is the newest run, or the task's policy in the package if there is no
+    run."""
 
 
 def parse_with_commands(
@@ -150,7 +151,7 @@ def parse_with_commands(
 
     Returns:
       The command line; and a function of the run's `env` to the given values of its task's commands
-      by name, which raises a UserError for a flag that is not the task's, or a value outside of its
+      by name, which raises a UserError for a flag that is not the task's, or a value outside its
       limits.
 
     Raises:

@@ -53,7 +53,7 @@ def main(args: Sequence[str]) -> None:
 
         set_up_jax(*known_engines)
         if several_hosts is None:
-            # CUDA starts beside the imports.
+            # CUDA starts during the imports.
             find_devices()
         from bounce_mjx.training import hosts
         from bounce_mjx.training.ppo_trainer import PPOTrainer
@@ -67,7 +67,7 @@ def main(args: Sequence[str]) -> None:
             command = read_command(args)
         page = None
         if command.watch and hosts.is_leader():
-            # Only a training that is watched pays for this import.
+            # Only a training run that is watched pays for this import.
             from bounce_mjx.viewers.watch import TrainingPage
 
             address = command.watch_host, command.watch_port
@@ -85,8 +85,8 @@ def read_command(args: Sequence[str], preset: Path | None = None) -> TrainComman
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:
-    """The address, number of processes, number of this process, and time limit of a training on
-    several hosts; None for a training on one, and for a command line that asks for help."""
+    """The address, number of processes, number of this process, and time limit of a training run on
+    several hosts; None for a training run on one, and for a command line that asks for help."""
     address = early_flag(args, "--coordinator-address")
     words = [early_flag(args, f) for f in ("--num-processes", "--process-id", "--host-timeout")]
     try:

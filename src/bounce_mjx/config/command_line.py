@@ -1,5 +1,6 @@
 """Command lines made from config types, with one-sentence errors."""
 
+import dataclasses
 import difflib
 import itertools
 import re
@@ -99,23 +100,33 @@ def _described(info: StructTypeInfo) -> StructConstructorSpec | None:
         default = getattr(info.default, name, MISSING_NONPROP)
         if default is MISSING_NONPROP and not field.is_required():
             default = field.get_default(call_default_factory=True)
+        kind, spec = field.annotation, _spec(field)
+        if spec is not None and isinstance(default, tuple) and spec.is_instance(default) is False:
+            # A file may give what a flag cannot, such as a range for each joint.
+            shown = {"is_instance": lambda _: True, "str_from_instance": lambda given: [str(given)]}
+            kind = Annotated[Any, dataclasses.replace(spec, **shown)]
         hint = "" if default in (None, (), MISSING_NONPROP) else "(default: {})".format
         # The field's own marks follow, and win.
-        mark = tyro.conf.arg(metavar=_metavar(field), help_behavior_hint=hint)
-        kind = Annotated[field.annotation, mark, *field.metadata]
+        mark = tyro.conf.arg(metavar=_metavar(field, spec), help_behavior_hint=hint)
+        kind = Annotated[kind, mark, *field.metadata]
         text = " ".join((field.description or "").split())
         fields.append(StructFieldSpec(name, kind, default, text or None))
     return StructConstructorSpec(info.type, tuple(fields))
 
 
-def _metavar(field: FieldInfo) -> str | None:
-    """The form of a setting's value: `PATH` of tyro's `{None}|PATH`, `INT ...` of
-    `[INT [INT ...]]`; None for a group or a switch, which take none."""
+def _spec(field: FieldInfo) -> PrimitiveConstructorSpec | None:
+    """How tyro reads a setting's value; None for a group or a switch, which take none."""
     if field.annotation is bool or _is_group(field):
         return None
     kind = PrimitiveTypeInfo.make(field.annotation, set())
     spec = ConstructorRegistry.get_primitive_spec(kind)
-    if not isinstance(spec, PrimitiveConstructorSpec):
+    return spec if isinstance(spec, PrimitiveConstructorSpec) else None
+
+
+def _metavar(field: FieldInfo, spec: PrimitiveConstructorSpec | None) -> str | None:
+    """The form of a setting's value: `PATH` of tyro's `{None}|PATH`, `INT ...` of
+    `[INT [INT ...]]`."""
+    if spec is None:
         return None
     form = re.sub(r"\{None\}\||(?<=\{)None,", "", spec.metavar)
     form = re.sub(r"\[(.+?) \[\1 \.\.\.\]\]", r"\1 ...", form)

@@ -35,7 +35,7 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
       example: a file of that kind, for error messages.
 
     Raises:
-      UserError: the file is missing or is no YAML mapping.
+      UserError: the file is missing or is not a YAML mapping.
     """
     try:
         values = _Loader(read_regular(path, _MAX_BYTES).decode("utf-8")).get_single_data()

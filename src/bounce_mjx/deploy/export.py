@@ -35,6 +35,7 @@ from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.estimator import filter_constants, upper_face
 from bounce_mjx.world.observation import ObservationConfig
+from bounce_mjx.world.randomization import entries
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
 _OPSET, _IR_VERSION = 17, 8
@@ -116,7 +117,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
       steps: environment steps of the training.
 
     Raises:
-      UserError: the MJCF file is missing, its paddle hangs on a joint that is no hinge with a
+      UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
         servo, or a command has the name of a measurement.
     """
     env = config.env
@@ -162,7 +163,12 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
             name: CommandRange((command.low, command.high), command.unit)
             for name, command in env.commands.items()
         },
-        randomization={name: getattr(env.randomization, name) for name in env.randomization.terms},
+        randomization={
+            f"{name}[{i}]" if len(own) > 1 else name: ends
+            for name in env.randomization.terms
+            for own in [entries(getattr(env.randomization, name))]
+            for i, ends in enumerate(own)
+        },
         chain=chain,
         paddle=paddle,
         paddle_normal=normal,

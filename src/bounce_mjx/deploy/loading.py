@@ -12,9 +12,10 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
     """Loads a policy that runs without JAX.
 
     Args:
-      policy: the name of a policy that comes with the package, "pretrained", "robust", or that of a
-        task such as "juggle" or of an arm; a `.onnx` file from `bounce-mjx export`; or a run's
-        folder or a checkpoint in it, which is first exported with JAX.
+      policy: the name of a policy that comes with the package, "pretrained", "robust",
+        "robust_small", or that of a task such as "juggle" or of an arm; a `.onnx` file from
+        `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
+        JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
 
     Raises:
@@ -44,7 +45,7 @@ def _exported(run: Path, task: str | None) -> bytes:
     except ImportError as error:
         raise UserError(
             f"the run {run} must be exported, for which {error.name} is missing; use bounce-mjx "
-            "export on the machine of the training, and give the .onnx file"
+            "export on the machine that trained it, and give the .onnx file"
         ) from error
     checkpoint = find_checkpoint(run)
     load_run_config(checkpoint.run, task)

@@ -138,7 +138,8 @@ class Metadata(NamedTuple):
     """The commands of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
-    documents their units; missing terms were not randomised."""
+    documents their units; `paddle_tilt[0]` is the range of one axis or joint alone. Missing terms
+    were not randomised."""
     chain: tuple[Hinge, ...]
     """The hinges from the world to the paddle."""
     paddle: Vector

@@ -189,7 +189,7 @@ class Env:
 
     @property
     def warmup_steps(self) -> int:
-        """Environment steps of a training over which the ranges grow (`ranges`)."""
+        """Environment steps of a training run over which the ranges grow (`ranges`)."""
         return self.config.randomization.warmup_steps
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:

@@ -36,7 +36,7 @@ class AnyEnv(Protocol):
     task, which names what to log."""
 
     task: Task | type[Task]
-    """The task, of which a training reads `curves` and `critic_metrics`."""
+    """The task, of which a training run reads `curves` and `critic_metrics`."""
 
     @property
     def observation_size(self) -> int:

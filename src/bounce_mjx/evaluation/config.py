@@ -6,7 +6,7 @@ from bounce_mjx.world.config import WorldConfig
 
 DEFAULT_EPISODES = 1024
 DEFAULT_SEED = 20_000
-"""Seed of the resets; a training evaluates with a different one."""
+"""Seed of the resets; a training run evaluates with a different one."""
 
 DEFAULT_CONDITION_EPISODES = 64
 """Episodes in each condition of a suite."""

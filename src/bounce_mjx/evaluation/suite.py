@@ -285,7 +285,7 @@ def _filled_in(value: Any, strength: float | None) -> Any:
 
 
 def _check_limits(env: WorldConfig, ranges: dict[str, Bounds], source: str) -> None:
-    """Fails for values outside of the limits of a term or of a command."""
+    """Fails for values outside the limits of a term or of a command."""
     spans = {name: (float(low.min()), float(high.max())) for name, (low, high) in ranges.items()}
     for name, (low, high) in list(spans.items()):
         if name not in env.commands:
@@ -344,5 +344,5 @@ def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
         drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
     if drawn is None:
         return False
-    (low, high), tolerance = drawn, 1e-9
+    (low, high), tolerance = map(np.asarray, drawn), 1e-9
     return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))

@@ -22,7 +22,7 @@ UNITS = {
 }
 """Units that a column may state in place of the one in SI, and their factors."""
 
-# A joint angle this far beyond the joint's range is no measurement of it, rad.
+# A joint angle this far beyond the joint's range is not a measurement of it, rad.
 _BEYOND_RANGE = 0.5
 _LARGEST_ANGLE = 4.0 * np.pi
 _FARTHEST_BALL = 20.0
@@ -69,7 +69,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
 
     Raises:
       UserError: the file cannot be read, a column is missing or states an unknown unit, or a cell
-        is no finite number.
+        is not a finite number.
     """
     header, rows, lines = _cells(path)
     found = _columns(path, header)
@@ -161,7 +161,7 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
       Warnings, a sentence each.
 
     Raises:
-      UserError: it is too short, its times are no seconds of one clock, a joint is far outside of
+      UserError: it is too short, its times are not seconds of one clock, a joint is far outside
         its range, or the ball is far away.
     """
     if len(log.times) < _MIN_ROWS or len(log.target_times) < _MIN_ROWS:

@@ -1,4 +1,4 @@
-"""A log's run beside the simulation of its servo targets in a known world."""
+"""A log's run next to the simulation of its servo targets in a known world."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -10,7 +10,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.identify.fit import Fit, Problem, minimise
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import make_run, make_simulator
-from bounce_mjx.identify.stages import BEFORE_BOUNCE, NO_BALL, sensor_noise
+from bounce_mjx.identify.stages import BEFORE_BOUNCE, sensor_noise
 from bounce_mjx.identify.unknowns import Layout, Unknown, make_layout
 from bounce_mjx.identify.windows import MAX_DELAY, Windows, cut
 from bounce_mjx.identify.world import least_age
@@ -62,7 +62,7 @@ def replay_log(
     Raises:
       UserError: the log has no window, or an estimate has the wrong size.
     """
-    windows = cut(log, config.physics_dt, NO_BALL, max_windows=len(log.times))
+    windows = cut(log, config.physics_dt, max_windows=len(log.times))
     layout, vector = _known(config, log, estimates)
     run = make_run(config, config.num_joints)
     simulate = make_simulator(run, layout, log, windows)
@@ -98,7 +98,7 @@ def _known(
 ) -> tuple[Layout, np.ndarray]:
     """The layout with all terms of the world, and their values [P]; a term with neither an estimate
     nor a range is nominal."""
-    middles = {name: float(np.mean(ends)) for name, ends in config.randomization.ranges().items()}
+    middles = {n: np.mean(ends, 0, float) for n, ends in config.randomization.ranges().items()}
     layout = make_layout(config.num_joints, True, config.physics_dt)
     others = {
         name: Unknown(0.0, 1.0, 1.0, "", "", None if size is None else sum(size))

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
@@ -26,8 +25,6 @@ _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
 BEFORE_BOUNCE = 0.012
 """Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
-NO_BALL = np.array([0.0, 0.0, 50.0])
-"""The ball in windows without one, m: so high above a model's origin it touches nothing."""
 _FEWEST_BOUNCES = 3
 
 
@@ -57,7 +54,7 @@ class Identified(NamedTuple):
 
 
 def joined(logs: Sequence[Log]) -> Log:
-    """Several logs one after the other; no window spans two of them."""
+    """Several logs, one after another; no window spans two of them."""
     parts, start = [], 0.0
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])
@@ -138,14 +135,9 @@ def identify(
       progress: called with a line about each step.
 
     Raises:
-      UserError: the log has no window.
+      UserError: the log has fewer than five windows.
     """
-    windows = cut(log, config.physics_dt, NO_BALL)
-    if len(windows.first) < 5:
-        raise UserError(
-            f"{log.source} has {len(windows.first)} stretches of unbroken joint angles and servo "
-            "targets; record at least 5 s"
-        )
+    windows = cut(log, config.physics_dt, min_windows=5)
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
@@ -153,7 +145,7 @@ def identify(
     run, noise = make_run(config, config.num_joints), sensor_noise(log)
 
     def search_in(log: Log) -> _Search:
-        windows = cut(log, config.physics_dt, NO_BALL)
+        windows = cut(log, config.physics_dt)
         simulate = make_simulator(run, layout, log, windows)
         return _Search(Problem(simulate, windows, layout, noise), progress)
 

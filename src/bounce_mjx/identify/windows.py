@@ -31,6 +31,8 @@ _SETTLING = 0.3
 _BOUNCING = 0.5
 # Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
 _AT_BOUNCE = 0.01
+# The ball in windows without one, m: so high above a model's origin it touches nothing.
+_NO_BALL = np.array([0.0, 0.0, 50.0])
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
@@ -67,22 +69,22 @@ class Windows(NamedTuple):
         return np.isfinite(self.bounces)
 
 
-def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240) -> Windows:
+def cut(log: Log, physics_dt: float, min_windows: int = 1, max_windows: int = 240) -> Windows:
     """Cuts a log into windows.
 
     Args:
-      no_ball: position [3] of the ball in windows without one, away from the paddle.
-      max_windows: the largest number; of more, every k-th is kept.
+      min_windows: the smallest number.
+      max_windows: the largest number; of more, every k-th is used.
 
     Raises:
-      UserError: there is none.
+      UserError: there are fewer.
     """
     spans = [(b - before, b + after, b) for b, before, after in _bounces(log)]
     spans += [(start, end, np.nan) for start, end in _rest(log, spans)]
-    if not spans:
+    if len(spans) < min_windows:
         raise UserError(
-            f"{log.source} has no stretch of unbroken joint angles and servo targets; record at "
-            "least 5 s"
+            f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
+            "record at least 5 s"
         )
     spans.sort()
     if len(spans) > max_windows:
@@ -112,9 +114,7 @@ def cut(log: Log, physics_dt: float, no_ball: np.ndarray, max_windows: int = 240
     picture_weights = np.where(near, 0.0, picture_weights)
     starts = np.stack(
         [
-            np.concatenate(
-                [_joint_start(log, begin), _ball_start(log, pictures, b, begin, no_ball)]
-            )
+            np.concatenate([_joint_start(log, begin), _ball_start(log, pictures, b, begin)])
             for begin, pictures, b in zip(zero, of_pictures, bounces, strict=True)
         ]
     )
@@ -226,13 +226,11 @@ def _joint_start(log: Log, time: float) -> np.ndarray:
     return np.concatenate([solution[0], solution[1]])
 
 
-def _ball_start(
-    log: Log, pictures: np.ndarray, bounce: float, zero: float, no_ball: np.ndarray
-) -> np.ndarray:
+def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> np.ndarray:
     """Position, velocity and spin [9] of the ball at a time, by a free fall through the pictures
     before the bounce."""
     if not len(pictures):
-        return np.concatenate([no_ball, np.zeros(6)])
+        return np.concatenate([_NO_BALL, np.zeros(6)])
     t = log.picture_times[pictures] - zero
     before = t < bounce - 0.012
     t, balls = t[before], log.ball_positions[pictures][before]

@@ -122,7 +122,7 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "not in free flight; their pictures do not count."
         )
     if not np.any(found.windows.has_ball):
-        said.append("The log shows no bounce, so that only the arm was identified.")
+        said.append("The log shows no bounce, so only the arm was identified.")
     return said + _unseen(found, joint_names)
 
 

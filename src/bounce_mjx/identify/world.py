@@ -1,4 +1,4 @@
-"""The identified world in a file: the estimates, and ranges for a training with their sources."""
+"""The identified world in a file: the estimates, and ranges for training with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,12 +18,12 @@ _MARGIN = 1.5
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world: the estimates, and ranges for a training.
+    """YAML text of the identified world: the estimates, and ranges for training.
 
-    The range of a term covers what the log allows for each of its entries while all other unknowns
-    have their estimates, with a margin of half: independent draws from the whole intervals of
-    terms that the log cannot separate would be worlds that contradict it. A term that the log does
-    not show is assumed.
+    The range of each entry of a term covers what the log allows while all other unknowns have their
+    estimates, with a margin of half: independent draws from the whole intervals of terms that the
+    log cannot separate would be worlds that contradict it. A term that the log does not show is
+    assumed.
 
     Args:
       robot: name or file of the robot's config.
@@ -33,7 +33,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     for name, place in places.items():
         by_term[name] = listed[place]
     late = least_age(log)
-    ranges: dict[str, list[float]] = {}
+    ranges: dict[str, list[Any]] = {}
     identified: dict[str, float | list[float]] = {}
     sources: dict[str, str] = {}
     assumed = []
@@ -48,16 +48,16 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
         if len(shown) < len(entries):
             assumed.append(name)
         values = ", ".join(_words(entry, shift) for entry in entries)
-        how = "Identified" if shown else "Not shown, so that the prior is kept,"
+        how = "Identified" if shown else "Not shown, so the prior stands,"
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     if "ball_latency" not in by_term:
         for name, unknown in BALL.items():
             ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
-            ranges[name] = _clipped(name, *ends)
-            sources[name] = f"{log.source} shows no bounce; this is what is usual."
+            ranges[name] = _clipped(name, ends)
+            sources[name] = f"{log.source} shows no bounce; these are typical values."
             assumed.append(name)
     for name, (ends, words) in _sensors(found, log).items():
-        ranges[name] = _clipped(name, *ends)
+        ranges[name] = _clipped(name, ends)
         sources[name] = f"{words} in {log.source}."
     content: dict[str, Any] = {} if robot is None else {"robot": robot}
     content["env"] = {"randomization": ranges}
@@ -65,7 +65,7 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     content["assumed"] = [f"randomization.{name}" for name in assumed]
     content["estimates"] = identified
     head = f"# Identified from {log.source}: bounce-mjx train --world FILE\n"
-    # Ranges on one line each, and sources below one another.
+    # The numbers of an end on one line, and sources below one another.
     parts = [
         yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
         for key, value in content.items()
@@ -84,12 +84,12 @@ def compare(
     for name, place in found.layout.slices().items():
         if name not in given:
             continue
-        low, high = given[name]
         shift = late if name == "ball_latency" else 0.0
-        for entry in listed[place]:
+        ends = (np.broadcast_to(end, len(listed[place])) for end in given[name])
+        for entry, low, high in zip(listed[place], *ends, strict=True):
             if entry.seen and (entry.high + shift < low or entry.low + shift > high):
                 changed.append(
-                    f"{entry.label} is {_words(entry, shift)} now, outside of {low:g} to {high:g}"
+                    f"{entry.label} is {_words(entry, shift)} now, outside {low:g} to {high:g}"
                 )
     return changed
 
@@ -102,16 +102,18 @@ def _words(entry: Estimate, shift: float) -> str:
     return f"{value:.4g} +- {half:.2g}{unit}"
 
 
-def _range(name: str, entries: Sequence[Estimate], shift: float) -> list[float]:
-    low = min(e.value - _MARGIN * min(e.value - e.low, e.alone) for e in entries) + shift
-    high = max(e.value + _MARGIN * min(e.high - e.value, e.alone) for e in entries) + shift
-    return _clipped(name, low, high)
+def _range(name: str, entries: Sequence[Estimate], shift: float) -> list[Any]:
+    value, low, high, alone = np.transpose([(e.value, e.low, e.high, e.alone) for e in entries])
+    low = value - _MARGIN * np.minimum(value - low, alone)
+    ends = np.stack([low, value + _MARGIN * np.minimum(high - value, alone)]) + shift
+    return _clipped(name, ends if len(entries) > 1 else ends[:, 0])
 
 
-def _clipped(name: str, low: float, high: float) -> list[float]:
+def _clipped(name: str, ends: Any) -> list[Any]:
+    """A range [2], or [2, entries], within the term's limits, for YAML."""
     least, greatest = TERMS[name].limits
-    ends = np.clip([low, high], max(least, -1e6), min(greatest, 1e6))
-    return [float(f"{x:.4g}") for x in ends]
+    ends = np.clip(ends, max(least, -1e6), min(greatest, 1e6))
+    return np.vectorize(lambda x: float(f"{x:.4g}"))(ends).tolist()
 
 
 def least_age(log: Log) -> float:

@@ -31,7 +31,7 @@ class NetworkFunctions(NamedTuple):
 
 
 class Networks(NamedTuple):
-    """The two networks of a training."""
+    """The two networks of a training run."""
 
     policy_network: NetworkFunctions
     """Its inputs are observations, its output is a `Gaussian` over actions [..., A]."""
@@ -45,7 +45,7 @@ class Networks(NamedTuple):
 
 
 class Actor(Protocol):
-    """What acts: the networks of a training, or a law without parameters."""
+    """What acts: the networks of a training run, or a law without parameters."""
 
     def act(self, policy: Any, observation: jax.Array) -> jax.Array:
         """Actions [..., A] in [-1, 1] for observations [..., N]."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
@@ -45,7 +46,7 @@ CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "pa
 
 
 class PPO(NamedTuple):
-    """What stays the same during a training."""
+    """What stays the same during training."""
 
     config: PPOConfig
     env: AnyEnv
@@ -132,7 +133,7 @@ def make_trainer(
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
 
     Args:
-      num_devices: devices that share the environments of one training.
+      num_devices: devices that share the environments of one training run.
 
     Raises:
       UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
@@ -142,17 +143,24 @@ def make_trainer(
             f"rollout_length {config.rollout_length} is longer than an episode of {episode_steps} "
             "control steps; choose a shorter rollout or longer episodes"
         )
-    known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
-    wanted = config.critic_metrics
-    critic_metrics = matching_metrics(
-        env.task.critic_metrics if wanted is None else wanted, known_metrics
-    )
+    critic_metrics = names_of_critic_metrics(config, env)
     sizes = env.observation_size, env.action_size, len(critic_metrics)
     networks = make_networks(config, *sizes, dtype=config.compute_dtype)
     ppo = PPO(
         config, env, episode_steps, critic_metrics, networks, make_optimizer(config), num_devices
     )
     return TrainingFunctions(functools.partial(init, ppo), functools.partial(run, ppo))
+
+
+def names_of_critic_metrics(config: PPOConfig, env: AnyEnv) -> tuple[str, ...]:
+    """Names of the environment's metrics that the value network sees, in order.
+
+    Raises:
+      UserError: the environment lacks one.
+    """
+    known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
+    wanted = config.critic_metrics
+    return matching_metrics(env.task.critic_metrics if wanted is None else wanted, known_metrics)
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -181,6 +189,18 @@ def init(ppo: PPO, key: jax.Array) -> TrainingState:
         key=key,
         iteration=jnp.int32(0),
     )
+
+
+def warm_started(
+    state: TrainingState, params: Params, statistics: RunningStatistics
+) -> TrainingState:
+    """The first state of a training, or of a population, with other networks and statistics of
+    their inputs; all arrays are NumPy arrays."""
+    networks = state.params, state.statistics
+    params, statistics = jax.tree.map(
+        lambda old, new: np.broadcast_to(new, old.shape), networks, (params, statistics)
+    )
+    return state._replace(params=params, statistics=statistics)
 
 
 def run(ppo: PPO, state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
@@ -402,7 +422,7 @@ def loss(ppo: PPO, params: Params, samples: Samples) -> tuple[jax.Array, Metrics
 
 
 def population(trainer: TrainingFunctions) -> TrainingFunctions:
-    """A trainer of S independent trainings: keys [S, 2] -> states with S as the first axis of every
+    """A trainer of S independent runs: keys [S, 2] -> states with S as the first axis of every
     array; metrics are [S, I]."""
 
     def run(states: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:

@@ -17,7 +17,7 @@ _RESAMPLES = 10_000
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """The seeds of one training, or one policy."""
+    """The seeds of one training run, or one policy."""
 
     name: str
     task: str

@@ -60,7 +60,7 @@ def read_curves(run: Path) -> RunCurves:
     Raises:
       UserError: the log is damaged or has no scalars.
     """
-    # At the top of the module, this import would delay the start of a training.
+    # At the top of the module, this import would delay the start of training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     files = list(run.glob("*tfevents*"))
@@ -126,7 +126,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
 def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     """The settings that affect the training, by dotted name."""
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
-    # The paths of the run's own copies would make every run a group of its own.
+    # The paths of the run's own copies would put every run in a separate group.
     settings["task"] = identify_task(config.task)
     if config.env.mjcf is not None:
         settings["env.mjcf"] = identify_robot(config.env.mjcf, run)

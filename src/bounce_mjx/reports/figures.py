@@ -1,4 +1,4 @@
-"""Figures of a training and of an evaluation, drawn with matplotlib.
+"""Figures of a training run and of an evaluation, drawn with matplotlib.
 
 They do not use pyplot, so they need no display and can be drawn in several threads.
 """

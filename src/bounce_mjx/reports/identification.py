@@ -1,4 +1,4 @@
-"""The page about an identified robot: estimates, fits, and measured beside simulated traces."""
+"""The page about an identified robot: estimates, fits, measured and simulated traces."""
 
 import base64
 import html

@@ -1,6 +1,6 @@
 """The report of a run: one self-contained HTML page.
 
-A training writes it after its results; `bounce-mjx report [RUN]` writes it again.
+Training writes it after its results; `bounce-mjx report [RUN]` writes it again.
 """
 
 import base64

@@ -23,7 +23,7 @@ _UNITS = {
 
 
 class _Detail(NamedTuple):
-    """A figure of the task's own, beside the results."""
+    """A figure of the task in addition to the results."""
 
     title: str
     unit: str

@@ -54,7 +54,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     try:
         arm = build_arm(path, config)
         arm.spec.compiler.discardvisual = True
-        # So the paddle keeps a body of its own, which the search turns.
+        # So the paddle keeps its own body, which the search turns.
         arm.spec.compiler.fusestatic = False
         model = compile_spec(arm.spec, path)
         asked = Mount(config.paddle.position, config.paddle.quaternion)

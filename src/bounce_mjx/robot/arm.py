@@ -438,7 +438,7 @@ class _Builder:
         scene = read_spec(resource_path("mjcf/scene.xml"))
         differing = _differing_options(self._model.opt, scene.option)
         if differing:
-            self._changes.append(f"replaced the physics options by the task's ({differing})")
+            self._changes.append(f"replaced the physics options with the task's ({differing})")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
         arm.option = scene.option
@@ -489,7 +489,7 @@ class _Builder:
                 actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
                 actuator.forcerange = [-limit, limit]
             self._changes.append(
-                f"replaced the actuator of {name} by a position servo: kp {stiffness:.4g}, "
+                f"replaced the actuator of {name} with a position servo: kp {stiffness:.4g}, "
                 f"kv {damping:.4g}, {limit_words(limit)}"
             )
 

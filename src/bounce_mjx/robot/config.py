@@ -79,7 +79,7 @@ class RobotConfig(StrictModel):
     """Force limit of each replaced servo, N m or N; null for a servo without one."""
 
     limits: LimitsConfig = LimitsConfig()
-    """The arm's own limits, as its maker states them."""
+    """The arm's own limits, as its manufacturer states them."""
 
     @pydantic.model_validator(mode="after")
     def _check_servos(self):

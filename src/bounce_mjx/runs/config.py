@@ -85,6 +85,9 @@ class TrainConfig(StrictModel):
     them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
     with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
     steps of the first evaluation that meets all."""
+    warm_start: PlainPath | None = None
+    """The run with whose policy and value network the training starts, or the name of a policy that
+    comes with the package. Its environment and hidden layers take the place of the preset's."""
     log_dir: PlainPath
     """Folder in which the run creates its own, named by the time."""
 
@@ -138,7 +141,7 @@ def train_config(task: type[Task], base: type[ConfigT] = TrainConfig) -> type[Co
 
 def runs_folder(task: type[Task]) -> Path:
     """Default folder of a task's runs."""
-    # A task that extends another one has a folder of its own.
+    # A task that extends another one has its own folder.
     return Path("runs") / (vars(task).get("folder") or task.__name__.lower())
 
 
@@ -230,7 +233,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
 
 
 def _robot_of(world: NamedWorld, path: Path) -> Path:
-    """The file of a world's robot: one of the package's, or a file beside the world's."""
+    """The file of a world's robot: one of the package's, or one relative to the world's file."""
     robot = named_file(Path(world.robot), ROBOTS)
     return robot if robot != Path(world.robot) else path.parent / robot
 

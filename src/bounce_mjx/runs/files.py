@@ -167,7 +167,7 @@ def check_copy(path: Path, folder: Path, flag: str) -> None:
     """
     try:
         if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder)):
-            raise ValueError(f"{path} is outside of it")
+            raise ValueError(f"{path} is outside it")
         check_integrity(folder)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -129,7 +129,7 @@ def runs_of_seeds(run: Path) -> list[Path]:
 
 
 def check_links(run: Path) -> None:
-    """Checks that a run's folder holds no links, through which a training would write elsewhere;
+    """Checks that a run's folder holds no links, through which training would write elsewhere;
     those of Weights & Biases do not count, as it makes them anew.
 
     Raises:
@@ -138,8 +138,8 @@ def check_links(run: Path) -> None:
     for path in run.rglob("*"):
         if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
             raise UserError(
-                f"{path} is a link, and a training writes only into the folder of its run; remove "
-                "it, or put in its place what it leads to"
+                f"{path} is a link, and training writes only into the folder of its run; remove "
+                "it, or replace it with its target"
             )
 
 

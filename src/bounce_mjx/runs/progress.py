@@ -13,7 +13,7 @@ from bounce_mjx.runs.files import first_mistake, read_stored
 RESULTS_FILE = "results.json"
 
 PATIENCE = 1.5
-"""Length of a training that waits in vain for a margin, in steps of the first evaluation that met
+"""Length of a run that waits in vain for a margin, in steps of the first evaluation that met
 all results."""
 
 _Steps = Annotated[int, Field(ge=0, lt=2**63)]
@@ -87,7 +87,7 @@ def load_results(run: Path) -> Results | None:
 
 
 class Progress(_Evaluations):
-    """Evaluations of a training so far."""
+    """Evaluations of a run so far."""
 
     best: Report | None = None
     fault: str | None = None

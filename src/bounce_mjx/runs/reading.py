@@ -26,13 +26,17 @@ from bounce_mjx.learning.policy import (
     networks_of,
     untrained_policy,
 )
-from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.ppo import Params, TrainingState
+from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint
 from bounce_mjx.tasks.registry import is_file
 
 RECORD_FILE = "run.json"
+NETWORKS = "networks"
+"""Item of a checkpoint that comes with the package: the part of a training state from which another
+training can start."""
 
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
@@ -97,6 +101,28 @@ def load_training_state(
         )
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, "training", template), record.progress
+
+
+def read_networks(
+    checkpoint: Checkpoint, config: TrainConfig, num_critic_metrics: int
+) -> tuple[Params, RunningStatistics]:
+    """Restores both networks of a checkpoint, and the statistics of their inputs."""
+    made_here = read_record(checkpoint).progress.get("library", "jax") == "jax"
+    items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
+    if not (items and made_here):
+        raise UserError(
+            f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
+            "robust_small, or a run that bounce-mjx train made"
+        )
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints, num_critic_metrics)
+
+    def initial() -> dict[str, Any]:
+        params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
+        return {"params": params, "statistics": init_statistics(size + num_critic_metrics)}
+
+    stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    return stored["params"], stored["statistics"]
 
 
 def read_record(checkpoint: Checkpoint) -> Record:

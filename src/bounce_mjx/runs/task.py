@@ -63,8 +63,8 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
         task = registry.find_task(given)
         if not is_same_task(name, given):
             print(
-                f"warning: {given} differs from the task that {run} was trained with; the one of "
-                f"the training is {name}",
+                f"warning: {given} differs from the task that {run} was trained with; the "
+                f"training's is {name}",
                 file=sys.stderr,
             )
         registry.admit(name, task)

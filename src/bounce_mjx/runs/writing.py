@@ -17,12 +17,13 @@ import tensorstore
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import TrainingState
+from bounce_mjx.learning.ppo import Params, TrainingState
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE
-from bounce_mjx.runs.reading import RECORD_FILE, open_array
+from bounce_mjx.runs.reading import NETWORKS, RECORD_FILE, open_array
 
 
 class CheckpointWriter:
@@ -50,6 +51,7 @@ class CheckpointWriter:
         training: TrainingState | None = None,
         progress: dict[str, Any] | None = None,
         results: dict[str, Any] | None = None,
+        networks: tuple[Params, RunningStatistics] | None = None,
     ) -> None:
         """Starts a save after waiting for the previous save.
 
@@ -59,8 +61,11 @@ class CheckpointWriter:
           training: None for a checkpoint that cannot be resumed.
           progress: the evaluations so far, plain data.
           results: the run's results, plain data.
+          networks: without `training`, the part of it with which another training can start.
         """
         items = {"policy": policy} | ({} if training is None else {"training": training})
+        if networks is not None:
+            items[NETWORKS] = dict(zip(("params", "statistics"), networks, strict=True))
         # A copy, because the training reuses its buffers while the writer is still busy.
         items = jax.tree.map(np.array, items)
         record = to_json({"steps": steps, "config": self._config, "progress": progress or {}})
@@ -155,7 +160,7 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     """Writes a pytree of arrays as `reading.open_array` opens them, all in one go."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     with tensorstore.Transaction() as together:
-        # With a context of its own, each array would be written, and flushed, on its own.
+        # With separate contexts, each array would be written, and flushed, by itself.
         shared = dict(context=tensorstore.Context(), transaction=together)
         options = shared | dict(create=True, write=True)
         opening = [open_array(folder, path, leaf, **options) for path, leaf in leaves]

@@ -67,10 +67,15 @@ def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
     )
 
 
-def weighted_terms(reward: StrictModel, inputs: Any) -> dict[str, jax.Array]:
-    """Each term [] times its weight; their sum is the reward."""
+def weighted_terms(reward: StrictModel, inputs: Any = None, **own: Any) -> dict[str, jax.Array]:
+    """Each term [] times its weight; their sum is the reward.
+
+    Args:
+      inputs: what the formula of every term takes.
+      own: by a term's name, what its formula takes instead.
+    """
     terms = {name: getattr(reward, name) for name in term_names(type(reward))}
-    return {name: term.weight * term.value(inputs) for name, term in terms.items()}
+    return {name: t.weight * t.value(own.get(name, inputs)) for name, t in terms.items()}
 
 
 def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:

@@ -108,7 +108,7 @@ class Task:
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "Config" not in cls.__dict__:
-            # A config has one task, so a task that extends another one needs a class of its own.
+            # A config has one task, so a task that extends another one needs its own class.
             base = cls.__base__.Config
             doc = {"__doc__": base.__doc__, "__module__": cls.__module__}
             cls.Config = type(f"{cls.__name__}Config", (base,), doc)
@@ -189,7 +189,7 @@ class Task:
         return {}
 
     def recorded(self, moment: Moment) -> Values:
-        """Numbers [] of a control step that `plots` needs, beside the coordinates."""
+        """Numbers [] of a control step that `plots` needs in addition to the coordinates."""
         return {}
 
     def plots(self, recording: Recording) -> tuple[Histogram | Hits, ...]:
@@ -207,7 +207,7 @@ class Task:
         return ()
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:
-        """Heights that a plot shows beside those of ball and paddle, m."""
+        """Heights that a plot shows in addition to those of ball and paddle, m."""
         return {}
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:

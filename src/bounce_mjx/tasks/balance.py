@@ -107,7 +107,7 @@ class Balance(task.Task):
         }
         return task.TaskStep(
             state=centre,
-            reward={n: term.weight * term.value(values[n]) for n, term in self.config.reward},
+            reward=task.weighted_terms(self.config.reward, **values),
             ended=(offset[2] < -LOST_DEPTH) | (task.length(offset) > LOST_DISTANCE),
             metrics={"error": values["point"]},
         )

@@ -127,7 +127,7 @@ class Catch(task.Task):
         }
         return task.TaskStep(
             state=CatchState(truth.ball_velocity[2], offset, contact, rest, caught),
-            reward={n: term.weight * term.value(values[n]) for n, term in self.config.reward},
+            reward=task.weighted_terms(self.config.reward, **values),
             ended=(offset[2] < -LOST_DEPTH) | (truth.paddle_position[2] < FLOOR),
             metrics={"caught": caught},
         )

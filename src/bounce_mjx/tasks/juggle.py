@@ -48,7 +48,7 @@ class Config(task.WorldConfig):
     num_balls: task.NumBalls = 2
     """Number of balls, 2 or 3."""
     home: tuple[Finite, Finite, Finite] = (0.59356, 0.0, 0.0498)
-    """Home of the paddle, m; the columns stand beside each other over it."""
+    """Home of the paddle, m; the columns stand side by side over it."""
     spacing: Positive = 0.065
     """Distance between columns, m."""
     height_range: tuple[Finite, Finite] = (0.35, 0.55)

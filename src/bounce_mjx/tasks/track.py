@@ -127,7 +127,7 @@ class Track(task.Task):
         x, y, z = jnp.square(ball - paths.point(command))
         return task.TaskStep(
             state=(velocity[2] > 0.0, offset),
-            reward={n: term.weight * term.value(errors[n]) for n, term in self.config.reward},
+            reward=task.weighted_terms(self.config.reward, **errors),
             ended=(ball[2] < home) | (x + y + z > self.config.max_distance**2),
             metrics={
                 "apexes": is_apex,

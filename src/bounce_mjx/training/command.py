@@ -29,7 +29,7 @@ class TrainingCommand(TrainConfig):
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
     config: Path | None = None
-    """Preset: a YAML file, or the name of one in configs/ (default, cpu, seed, robust or transfer);
+    """Preset: a YAML file, or the name of one in configs/, such as cpu, robust or finetune;
     a task's own preset of that name, such as configs/track/cpu.yaml, has priority. The default is
     default on an accelerator, and cpu on a CPU."""
     robot: Path | None = None
@@ -70,10 +70,14 @@ def read_training(
     """
     config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
     robot, world = path_flag(args, "--robot"), path_flag(args, "--world")
-    task = early_flag(args, "--task")
+    task, warm_start = early_flag(args, "--task"), path_flag(args, "--warm-start")
     for given, flag in ((config_path, "--config"), (robot, "--robot"), (world, "--world")):
         if given and resume:
             raise UserError(f"{flag} and --resume cannot be combined; a resumed run has its config")
+    if warm_start and robot:
+        raise UserError(
+            "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
+        )
     if resume:
         from bounce_mjx.runs.folders import find_run, named_run
         from bounce_mjx.runs.reading import RESUMABLE_KEYS
@@ -86,6 +90,11 @@ def read_training(
                 f"--resume cannot change the task, and {task} differs from {base.task}; restore "
                 "it, name the run's copy, or start a new run"
             )
+    elif warm_start:
+        from bounce_mjx.training.warm_start import warm_config
+
+        log_dir = path_flag(args, "--log-dir") or runs_folder(find_task(task or DEFAULT))
+        base = warm_config(warm_start, log_dir, config_path or preset, task, world)
     else:
         base = read_preset(config_path or preset, robot, task, world)
     start = base
@@ -94,6 +103,9 @@ def read_training(
     own_class = train_config(base.env.task, command_class)
     default = own_class(**dict(start), config=config_path, robot=robot, world=world, resume=resume)
     command = parse(own_class, args, prog=prog, default=default)
+    if warm_start and not resume:
+        # By its own name, if it was the latest.
+        command = command.model_copy(update={"warm_start": base.warm_start})
     if resume:
         command = command.model_copy(update={"resume": resume, "task": base.task})
         changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS

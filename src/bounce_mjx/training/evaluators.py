@@ -30,9 +30,9 @@ _FINAL = 2**31
 
 
 class Evaluators:
-    """The program that evaluates the S policies of a training, compiled in the background.
+    """The program that evaluates the S policies of a training run, compiled in the background.
 
-    A training selects its best policy by evaluations that all use the same resets. The figures of
+    Training selects its best policy by evaluations that all use the same resets. The figures of
     the selected policy are then measured once more on fresh resets, because the best of many
     evaluations on the same resets is biased upwards.
 

@@ -49,7 +49,7 @@ def join(
     process_id: int | None = None,
     timeout: float = DEFAULT_TIMEOUT,
 ) -> None:
-    """Joins the processes of one training; it must be called before any other use of JAX. From now
+    """Joins the processes of one run; it must be called before any other use of JAX. From now
     on, the death of one ends the others with an error message.
 
     Without arguments, Slurm, Open MPI or Kubernetes supply them.

@@ -44,6 +44,7 @@ from bounce_mjx.training.trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
+from bounce_mjx.training.warm_start import read_start
 
 Tree = TypeVar("Tree")
 
@@ -56,7 +57,7 @@ REPORT_MODULE = "bounce_mjx.reports.page"
 
 @dataclasses.dataclass
 class SeedRun:
-    """One seed of a training."""
+    """One seed of a training run."""
 
     run: Path
     """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
@@ -79,7 +80,7 @@ class SeedRun:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a training does beside its config."""
+    """What a training run does that its config does not say."""
 
     command: str
     """The user's command, to which `--resume` may be added."""
@@ -132,7 +133,7 @@ def train(
 
 
 class _Job:
-    """A training in progress.
+    """A training run in progress.
 
     With several seeds the run's folder has the latest state of all seeds. Each seed has its own
     folder in it, which looks like the folder of a run of one seed. On several hosts every process
@@ -157,6 +158,8 @@ class _Job:
         self.env = Env(config.env)
         # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
+        warm = config.warm_start is not None and not self.resumed
+        self.first = read_start(config, self.env) if warm else None
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
@@ -261,7 +264,7 @@ class _Job:
             say(self.console, f"{met}; {how if self.config.stop_when_solved else continues}")
 
     def compile(self) -> None:
-        """Compiles the programs that a training needs to start. Evaluations are compiled, logs are
+        """Compiles the programs that training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
         with self.console.status("compiling"), no_garbage_collection():
@@ -280,6 +283,8 @@ class _Job:
             hosts.any_of(False)
             self.trainer.start(self.state)
             self.state = None
+            if self.first is not None:
+                self.trainer.warm_start(*self.first)
         if hosts.is_leader():
             self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
         for writer in self.writers:
@@ -354,7 +359,9 @@ class _Job:
 
     def _is_due(self) -> bool:
         done = self.steps >= self.config.total_steps
-        at_evaluation = self.steps > 0 and (done or self.steps % self.eval_steps == 0)
+        # A policy that is good already is the first that counts as best.
+        trained = self.steps > 0 or self.first is not None
+        at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
         nothing = any(member.progress.best is None for member in self._healthy())
         return (at_evaluation and not self._evaluated()) or (done and nothing)
 
@@ -422,7 +429,7 @@ class _Job:
 
     def _run_block(self) -> None:
         started = time.perf_counter()
-        # A training that was stopped inside a block first completes that block.
+        # A run that was stopped inside a block first completes that block.
         rest = self.block_steps - self.steps % self.block_steps
         block = self.pool.submit(
             self.trainer.run,
@@ -449,7 +456,7 @@ class _Job:
         self.reporter.saving_problem(next(filter(None, problems), None))
 
     def _check_faults(self, faults: np.ndarray) -> None:
-        """Ends a training that diverged, because its state is useless; with several seeds, the
+        """Ends a run that diverged, because its state is useless; with several seeds, the
         other seeds continue.
 
         Args:

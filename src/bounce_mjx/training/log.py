@@ -1,4 +1,4 @@
-"""The logs of a training: TensorBoard, and Weights & Biases if it is asked for."""
+"""The logs of a training run: TensorBoard, and Weights & Biases if it is asked for."""
 
 import contextlib
 import hashlib

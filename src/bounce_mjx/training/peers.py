@@ -1,4 +1,4 @@
-"""The connection between the processes of one training, separate from JAX's own.
+"""The connection between the processes of one training run, separate from JAX's own.
 
 Process 0 holds a socket to every other process. Three things go over them: values that all
 processes exchange, heartbeats, and the news that a process has died. JAX notices a death too, but
@@ -27,7 +27,7 @@ LOST_STATUS = 2
 
 
 class Peers:
-    """The other processes of a training; process 0 is connected to all, the others to process 0.
+    """The other processes of a run; process 0 is connected to all, the others to process 0.
 
     While they are connected, the death of any process ends all the others, and each prints one
     sentence.

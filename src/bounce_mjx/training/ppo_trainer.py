@@ -9,7 +9,16 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.learning.ppo import CHECKED, TrainingState, make_trainer, policy_of, population
+from bounce_mjx.learning.ppo import (
+    CHECKED,
+    Params,
+    TrainingState,
+    make_trainer,
+    policy_of,
+    population,
+    warm_started,
+)
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
@@ -90,6 +99,9 @@ class PPOTrainer:
             self.state = jax.block_until_ready(self._init.result()(self._seeds))
         else:
             self.state = hosts.distribute(state, self._sharding)
+
+    def warm_start(self, params: Params, statistics: RunningStatistics) -> None:
+        self.start(warm_started(self.snapshot().state, params, statistics))
 
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         program, parts = self._run.result(), []

@@ -1,4 +1,4 @@
-"""A training in a command: its start, the printed results and the report."""
+"""A training run in a command: its start, the printed results and the report."""
 
 import contextlib
 import importlib.util
@@ -63,7 +63,7 @@ def run_command(
 
 
 def print_results(seeds: Sequence[SeedRun], console: Console) -> SeedRun:
-    """Prints the results of a training; returns the best seed."""
+    """Prints the results of a training run; returns the best seed."""
     best = max((s for s in seeds if s.report is not None), key=lambda s: s.report.score)
     if len(seeds) > 1:
         console.print(seeds_table({s.config.seed: s.report for s in seeds}))

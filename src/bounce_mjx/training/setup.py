@@ -43,7 +43,7 @@ def cache_compilations() -> None:
         except OSError as error:
             print(
                 f"warning: compiled programs are not cached, as {error.filename} cannot be used "
-                f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to a folder of yours",
+                f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to your own folder",
                 file=sys.stderr,
             )
         except RuntimeError:

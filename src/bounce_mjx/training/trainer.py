@@ -10,6 +10,8 @@ from jax.sharding import Mesh
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import Params
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 
 Metrics = dict[str, np.ndarray]
@@ -19,7 +21,7 @@ JAX = "jax"
 
 
 class Snapshot(NamedTuple):
-    """The policy and the state of a training at one moment, as pytrees of NumPy arrays."""
+    """The policy and the state of a training run at one moment, as pytrees of NumPy arrays."""
 
     policy: Policy
     state: Any
@@ -40,7 +42,7 @@ def in_whole_blocks(config: TrainConfig) -> TrainConfig:
 
 
 class Trainer(Protocol):
-    """S independent trainings of one algorithm, the seeds of a run.
+    """S independent runs of one algorithm, one for each seed.
 
     With several seeds, the first axis of every array in a state or a policy is the seed.
     """
@@ -62,6 +64,10 @@ class Trainer(Protocol):
     def start(self, state: Any | None = None) -> None:
         """Starts from the seeds, or from the state of a `snapshot`."""
 
+    def warm_start(self, params: Params, statistics: RunningStatistics) -> None:
+        """Puts the networks of an earlier training into the first state, after `start`; see
+        `learning.ppo.warm_started`."""
+
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         """Trains for I iterations, or fewer where a slow trainer sees between two of them that
         `stopping` is true.
@@ -78,12 +84,12 @@ class Trainer(Protocol):
         """The policy and the whole state."""
 
     def save_models(self, runs: Sequence[Path]) -> None:
-        """Writes what its library needs beside the checkpoint into the folders of the seeds, at the
-        end of the training or when it is stopped."""
+        """Writes what its library needs in addition to the checkpoint into the folders of the
+        seeds, at the end of the training or when it is stopped."""
 
 
 class Watcher(Protocol):
-    """An onlooker of a training. Its methods are called between blocks and must return at once."""
+    """An onlooker of training. Its methods are called between blocks and must return at once."""
 
     def block(self, steps: int, means: dict[str, float]) -> None:
         """A block has ended.

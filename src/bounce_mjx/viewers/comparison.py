@@ -1,4 +1,4 @@
-"""A log as the frames of a viewer: the measured robot beside the simulated one."""
+"""A log as the frames of a viewer: the measured robot next to the simulated one."""
 
 import numpy as np
 

@@ -92,7 +92,7 @@ class Controls:
             gui.add_button("nominal world").on_click(self._make_nominal)
 
     def pause(self, _: object) -> None:
-        """Stops the time, or lets it go on."""
+        """Pauses the simulation, or resumes it."""
         self._paused.value = not self._paused.value
 
     def reset(self, _: object) -> None:

@@ -83,7 +83,7 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
 
     Args:
       port: 0 takes any free port.
-      allowed: names of hosts, besides the address, at which a browser may open the page.
+      allowed: names of hosts, in addition to the address, at which a browser may open the page.
 
     Raises:
       UserError: this version of viser cannot be guarded.

@@ -107,7 +107,7 @@ class Window:
                 act(None)
 
     def pause(self, _: object) -> None:
-        """Stops the time, or lets it go on."""
+        """Pauses the simulation, or resumes it."""
         self._paused = not self._paused
 
     def reset(self, _: object) -> None:

@@ -33,8 +33,8 @@ _MAX_POINTS = 2000
 
 
 class TrainingPage:
-    """A `training.trainer.Watcher` that serves a page from a thread of its own. The simulation runs
-    on the CPU, so that a training on a GPU keeps its speed."""
+    """A `training.trainer.Watcher` that serves a page from its own thread. The simulation runs
+    on the CPU, so that training on a GPU keeps its speed."""
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges, entries
 
 
 class WorldSlider(NamedTuple):
@@ -55,8 +55,9 @@ def with_sliders(config: WorldConfig) -> WorldConfig:
     for slider in SLIDERS:
         if slider.term == "restitution" and config.mjcf is not None:
             continue
-        low, high = getattr(config.randomization, slider.term) or slider.span
-        spans[slider.term] = min(low, slider.span[0]), max(high, slider.span[1])
+        own = entries(getattr(config.randomization, slider.term) or slider.span)
+        low, high = zip(slider.span, *own, strict=True)
+        spans[slider.term] = min(low), max(high)
     randomization = config.randomization.model_copy(update=spans)
     return config.model_copy(update={"randomization": randomization})
 
@@ -76,6 +77,6 @@ def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
     return tuple(
         slider
         for slider in SLIDERS
-        if (span := getattr(config, slider.term)) is not None
-        and span[0] <= slider.span[0] <= slider.span[1] <= span[1]
+        if (ends := getattr(config, slider.term)) is not None
+        and all(low <= slider.span[0] and slider.span[1] <= high for low, high in entries(ends))
     )

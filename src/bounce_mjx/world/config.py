@@ -18,7 +18,7 @@ from bounce_mjx.config.settings import (
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
-from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig, entries
 
 PADDLE_HOME = (0.58856, 0.0, 0.05)
 """Where the project's own arm holds the paddle at a reset, m."""
@@ -148,7 +148,7 @@ class WorldConfig(StrictModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _read_former_reset(cls, values: Any) -> Any:
-        """The configs of 0.1.0 have the noise of a reset beside the other settings."""
+        """The configs of 0.1.0 have the noise of a reset among the other settings."""
         if not isinstance(values, dict) or not _FORMER_RESET_KEYS.keys() & values.keys():
             return values
         moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}
@@ -199,6 +199,17 @@ class WorldConfig(StrictModel):
                         f"{acceleration:g} to the opposite within control_dt {self.control_dt:g}; "
                         f"give at least {2.0 * acceleration / self.control_dt:g}"
                     )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_entries(self):
+        for name in self.randomization.terms:
+            count = len(entries(getattr(self.randomization, name)))
+            if TERMS[name].size is None and count not in (1, self.num_joints):
+                raise ValueError(
+                    f"randomization.{name} has ranges for {count} joints, but default_joint_angles "
+                    f"has {self.num_joints}; give one for each acting joint, or one for all"
+                )
         return self
 
     @pydantic.model_validator(mode="after")

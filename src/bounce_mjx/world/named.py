@@ -45,7 +45,8 @@ class NamedWorld(StrictModel):
     """The content of a world's file."""
 
     robot: str | None = None
-    """Name of a robot in configs/robots/, or its file, beside the world's; null for any robot."""
+    """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
+    robot."""
     env: WorldSettings = WorldSettings()
     """Settings of the environment. Its randomisation is the whole one: a term that it does not have
     is as in the model."""
@@ -140,8 +141,9 @@ def _nested(key: str, value: Any) -> dict[str, Any]:
 
 
 def _is_numeric(value: Any) -> bool:
-    values = value if isinstance(value, tuple) else (value,)
-    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+    if isinstance(value, tuple):
+        return all(map(_is_numeric, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _doubled(key: str, value: Any) -> Any:
@@ -153,7 +155,9 @@ def _doubled(key: str, value: Any) -> Any:
     elif group == "robot.limits":
         factor = 0.5
 
-    def changed(number: float) -> float:
-        return min(max(centre + factor * (number - centre), least), most)
+    def changed(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(changed, value))
+        return min(max(centre + factor * (value - centre), least), most)
 
-    return tuple(map(changed, value)) if isinstance(value, tuple) else changed(value)
+    return changed(value)

@@ -1,15 +1,16 @@
 """Domain randomisation: each episode draws its own world.
 
 A term is a key of the config with a range (low, high), from which a reset draws every entry of the
-term uniformly. A term that is null is inactive and costs nothing.
+term uniformly. Each end of a term of several entries may be one number for all, or one for each
+entry. A term that is null is inactive and costs nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import pydantic
 from pydantic import Field
@@ -22,7 +23,18 @@ if TYPE_CHECKING:
     from bounce_mjx.physics import PhysicsParameters
     from bounce_mjx.physics.fused.scalars import Quaternion
 
-Range = tuple[Finite, Finite]
+
+def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float, ...]:
+    return tuple(map(number, end)) if isinstance(end, list | tuple) else number(end)
+
+
+# Not a union of types, for which neither the command line nor an error has a short form.
+_End = Annotated[
+    Finite, pydantic.WrapValidator(_entrywise), pydantic.PlainSerializer(lambda end: end)
+]
+Range = tuple[_End, _End]
+"""Lower and upper end, each a number, or a tuple with one number for each entry of the term. A
+command line takes two numbers."""
 
 World = dict[str, "jax.Array"]
 """Values drawn for one episode, by the names of the active terms."""
@@ -57,14 +69,15 @@ IMPACT_SPEED = 2.45
 
 
 class RandomizationConfig(StrictModel):
-    """The world that each episode draws: a range for each term, null for off."""
+    """The world that each episode draws: a range for each term, null for off. In a file, a term of
+    several joints or axes may have a range for each: two lists, of the lower and the upper ends."""
 
     restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98))] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
     restitution_slope: Annotated[Range | None, Term((), 0.0, (0.0, 0.1))] = None
-    """Fall of the restitution for each m/s of the impact's speed beyond 2.45 m/s, that of the
-    ITTF's drop from 30.5 cm, s/m; with restitution. Balls bounce less in faster impacts (Hubbard
-    and Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
+    """Drop of the restitution per m/s of impact speed above 2.45 m/s, the speed of the ITTF's drop
+    test from 30.5 cm, s/m; needs restitution. Balls bounce less in faster impacts (Hubbard and
+    Stronge 2001, "Bounce of hollow balls on flat surfaces")."""
     ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
@@ -158,13 +171,23 @@ class RandomizationConfig(StrictModel):
         if self.restitution_slope is not None and self.restitution is None:
             raise ValueError("restitution_slope is given without restitution; give both")
         for name in self.terms:
-            (low, high), (least, greatest) = getattr(self, name), TERMS[name].limits
-            if not low <= high:
-                raise ValueError(f"{name} ({low}, {high}) is not a range; give the lower end first")
-            if low < least or high > greatest:
+            ends, (size, _, (least, greatest)) = getattr(self, name), TERMS[name]
+            counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
+            if len(counts) > 1 or (size is not None and not counts <= {0, *size}):
+                each = "joint" if size is None else f"of {sum(size)} axes"
+                lists = "" if size == () else f", or two lists with one for each {each}"
                 raise ValueError(
-                    f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}; narrow the range"
+                    f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}"
                 )
+            for low, high in entries(ends):
+                if not low <= high:
+                    raise ValueError(
+                        f"{name} ({low}, {high}) is not a range; give the lower end first"
+                    )
+                if low < least or high > greatest:
+                    raise ValueError(
+                        f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}; narrow the range"
+                    )
         return self
 
     @property
@@ -179,12 +202,19 @@ class RandomizationConfig(StrictModel):
           progress: share of the warm-up that has passed [], from 0 to 1.
         """
 
-        def grown(name: str, end: float) -> jax.Array:
+        def grown(name: str, end: float | tuple[float, ...]) -> jax.Array:
+            if isinstance(end, tuple):
+                return jnp.stack([grown(name, entry) for entry in end])
             nominal = TERMS[name].nominal
             start = end if nominal is None else nominal
             return jnp.asarray(start + (end - start) * progress, jnp.float32)
 
         return {name: tuple(grown(name, end) for end in getattr(self, name)) for name in self.terms}
+
+
+def entries(ends: Range) -> list[tuple[float, float]]:
+    """The range of each entry; a single one if the ends are numbers."""
+    return list(zip(*ends, strict=True)) if isinstance(ends[0], tuple) else [ends]
 
 
 TERMS: dict[str, Term] = {

@@ -70,7 +70,7 @@ def position_and_velocity(truth: Kinematics) -> jax.Array:
 
 
 def picture_long_ago(truth: Kinematics) -> Picture:
-    """The picture before the first one, so long ago that the difference of both is no velocity."""
+    """The picture before the first one, so long ago that their difference is not a velocity."""
     zero = jnp.zeros((), truth.ball_position.dtype)
     return Picture(truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO)
 

@@ -119,7 +119,7 @@ class Batch:
         """Starts new episodes.
 
         Args:
-          seeds: seed of each environment; None goes on with its random numbers.
+          seeds: seed of each environment; None continues its random numbers.
           generator: seeds the environments that have neither a seed nor random numbers yet.
           mask: environments to reset [B], bool.
           commands: some commands, each [] or [B]; NaN draws it.
@@ -212,7 +212,7 @@ class Batch:
         if _jax_process != os.getpid():
             raise UserError(
                 "this process was forked from one that had already used JAX, in which JAX hangs; "
-                'start it otherwise, with AsyncVectorEnv(..., context="forkserver") or '
+                'start it another way, with AsyncVectorEnv(..., context="forkserver") or '
                 'make_vec(..., vector_kwargs={"context": "forkserver"})'
             )
 

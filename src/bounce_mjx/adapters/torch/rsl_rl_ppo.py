@@ -84,7 +84,7 @@ class RslRlVecEnv(VecEnv):
         )
 
     def seed(self, seed: int = -1) -> int:
-        """Sets the seed of the next `reset`; with -1, the next reset goes on with the present
+        """Sets the seed of the next `reset`; with -1, the next reset continues with the present
         random numbers."""
         self._seed = None if seed < 0 else seed
         return seed

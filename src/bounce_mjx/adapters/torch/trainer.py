@@ -41,6 +41,11 @@ class TorchTrainer:
                 f"num_devices is {config.num_devices}, but PyTorch trains on one device here; "
                 "leave it out, or train with bounce-mjx train"
             )
+        if config.warm_start is not None:
+            raise UserError(
+                f"warm_start is {config.warm_start}, but PyTorch's trainings start untrained; "
+                "leave it out, or train with bounce-mjx train"
+            )
         self.library = library
         self._curves = env.task.curves
         self.mesh: Mesh = make_mesh(1, config.ppo)
@@ -117,7 +122,7 @@ def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
 
 def summarize(iterations: Sequence[Metrics], curves: Sequence[Curve]) -> Metrics:
     """Metrics [I] from those of I iterations of a learner. The environment's metrics [T] are
-    summarised as in the JAX trainer, with the curves of the task; the learner's own [] are kept."""
+    summarised as in the JAX trainer, with the curves of the task; the learner's own [] stay."""
     metrics = {name: np.stack([one[name] for one in iterations]) for name in iterations[0]}
     own = {name: values for name, values in metrics.items() if values.ndim == 1}
     steps = {name: values for name, values in metrics.items() if values.ndim == 2}

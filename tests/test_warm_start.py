@@ -1,0 +1,160 @@
+"""A training that starts with the networks of an earlier one."""
+
+import json
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from bounce_mjx.commands import train as train_command
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import make_networks, networks_of
+from bounce_mjx.learning.ppo import names_of_critic_metrics
+from bounce_mjx.learning.statistics import normalize
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.reading import read_networks, read_policy
+from bounce_mjx.training.command import config_of
+from bounce_mjx.training.warm_start import read_start
+from tiny_runs import STEPS, TINY
+
+CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
+WORLD = {
+    "env": {"randomization": {"restitution": [0.8, 0.82], "action_latency": [0.01, 0.02]}},
+    "sources": {"randomization": "Made for a test."},
+}
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose value network sees two terms of the world."""
+    log_dir = tmp_path_factory.mktemp("first") / "runs"
+    flags = ["--critic-metrics", "n_bounces", "world/*", "--total-steps", str(STEPS)]
+    terms = "--randomization.restitution 0.7 0.9 --randomization.air-drag 0.0 0.2".split()
+    train_command.main([*TINY, *flags, *terms, "--log-dir", str(log_dir)])
+    (run,) = log_dir.iterdir()
+    return run
+
+
+def stored(run: Path):
+    """Config, names of the critic metrics, networks, parameters and statistics of a run."""
+    checkpoint, config = best_checkpoint(run), load_run_config(run)
+    names = names_of_critic_metrics(config.ppo, Env(config.env))
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints, len(names))
+    return config, names, networks, *read_networks(checkpoint, config, len(names))
+
+
+def test_both_networks_are_the_same_functions_in_the_same_world(first: Path) -> None:
+    config, _, networks, params, statistics = stored(first)
+    command = config.model_copy(update={"warm_start": first})
+    start, seen = read_start(command, Env(command.env))
+    inputs = jax.random.normal(jax.random.PRNGKey(1), (32, seen.mean.size))
+    assert seen.mean.size == config.env.layout.size + len(CRITIC)
+    before, after = (normalize(inputs, each.normalizer) for each in (statistics, seen))
+    values = [
+        networks.value_network.apply(each.value, x)
+        for each, x in ((params, before), (start, after))
+    ]
+    np.testing.assert_array_equal(*values)
+    assert np.std(values[0]) > 0
+    # The policy that is evaluated and exported is the one that the training starts with.
+    policy = read_policy(best_checkpoint(first), config)
+    observation = inputs[:, : config.env.layout.size]
+    mean = networks.policy_network.apply(start.policy, after[:, : observation.shape[1]]).mean
+    acts = networks_of(config.ppo)(Env(config.env)).act(policy, observation)
+    np.testing.assert_array_equal(np.clip(mean, -1.0, 1.0), acts)
+
+
+def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_ones(
+    first: Path, tmp_path: Path
+) -> None:
+    config, old_names, networks, params, statistics = stored(first)
+    assert set(old_names) == CRITIC
+    world = tmp_path / "world.yaml"
+    world.write_text(yaml.safe_dump(WORLD))
+    args = ["--warm-start", str(first), "--world", str(world), "--config", "cpu"]
+    command = config_of(train_command.read_command(args))
+    assert command.ppo.critic_metrics == ("n_bounces", "world/*")
+    env = Env(command.env)
+    names = names_of_critic_metrics(command.ppo, env)
+    assert set(names) == {"n_bounces", "world/restitution", "world/action_latency"}
+    start, seen = read_start(command, env)
+    size = command.env.layout.size
+    of_first = jax.random.normal(jax.random.PRNGKey(2), (16, size + len(CRITIC)))
+    # The term that is gone has its mean.
+    at = {name: size + old_names.index(name) for name in old_names}
+    gone = at["world/air_drag"]
+    of_first = of_first.at[:, gone].set(statistics.mean[gone])
+    unknown = np.linspace(-5.0, 5.0, 16)
+    of_new = np.column_stack(
+        [of_first[:, :size], *(of_first[:, at[n]] if n in at else unknown for n in names)]
+    )
+    old = networks.value_network.apply(params.value, normalize(of_first, statistics.normalizer))
+    new = networks.value_network.apply(start.value, normalize(of_new, seen.normalizer))
+    np.testing.assert_allclose(new, old, rtol=1e-5, atol=1e-6)
+
+
+def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Path) -> None:
+    """Its first evaluation, before any step, is that of the run's policy."""
+    args = [*TINY[: TINY.index("--hidden-layers")], *TINY[TINY.index("--block-steps") :]]
+    args = [x for x in args if x not in ("--episode-seconds", "0.5")]
+    args += ["--config", "cpu", "--warm-start", str(first), "--total-steps", str(STEPS)]
+    train_command.main([*args, "--log-dir", str(tmp_path), "--num-seeds", "2"])
+    (run,) = tmp_path.iterdir()
+    assert load_run_config(run).warm_start == best_checkpoint(first).folder
+    before = json.loads((first / "results.json").read_text())
+    (expected,) = (e for e in before["evaluations"] if e["steps"] == before["best_steps"])
+    for seed in ("seed_000", "seed_001"):
+        results = json.loads((run / seed / "results.json").read_text())
+        evaluations = {e.pop("steps"): e for e in results["evaluations"]}
+        assert evaluations.keys() == {0, STEPS // 2, STEPS}
+        expected.pop("steps", None)
+        assert evaluations[0] == expected != evaluations[STEPS]
+
+
+def test_the_small_robust_policy_can_be_trained_further() -> None:
+    args = "--warm-start robust_small --config finetune --world fast_servo".split()
+    command = config_of(train_command.read_command(args))
+    assert str(command.warm_start) == "robust_small"
+    assert command.env.randomization.terms and command.env.randomization.share == 1.0
+    params, _ = read_start(command, Env(command.env))
+    own = read_policy(pretrained_checkpoint("robust_small"), load_run_config_of("robust_small"))
+    jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
+
+
+def load_run_config_of(name: str):
+    return load_run_config(pretrained_checkpoint(name).run)
+
+
+MISTAKES = {
+    "no value network": ("--warm-start robust", "without its value network; give robust_small"),
+    "layers": ("--warm-start robust_small --hidden-layers 8", "other hidden layers"),
+    "observation": ("--warm-start robust_small --observation.action 1", "another observation"),
+    "robot": ("--warm-start robust_small --robot ur5e", "--warm-start and --robot"),
+    "nowhere": ("--warm-start nowhere", "there is no run nowhere, and no policy of this name"),
+    "resume": ("--resume {run} --warm-start robust_small", "--resume cannot change warm_start"),
+}
+
+
+@pytest.mark.parametrize("flags, words", MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_give_one_sentence(
+    flags: str, words: str, first: Path, tmp_path: Path, monkeypatch, capfd
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        train_command.main(flags.format(run=first).split())
+    error = capfd.readouterr().err
+    assert re.fullmatch(r"error: .+\n", error) and words in error, error
+    assert not list(tmp_path.iterdir())
+
+
+def test_torch_does_not_warm_start(torch_libraries) -> None:
+    from bounce_mjx.adapters.torch.trainer import TorchTrainer
+
+    command = train_command.read_command(["--warm-start", "robust_small"])
+    with pytest.raises(UserError, match="warm_start is robust_small, .*bounce-mjx train"):
+        TorchTrainer("rsl_rl", config_of(command), None)
