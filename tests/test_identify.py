@@ -206,6 +206,30 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     np.testing.assert_allclose(np.mean(deviations), np.std(estimates), rtol=0.35)
 
 
+def test_noise_of_derivatives_is_no_information() -> None:
+    """Simulations that scatter whenever link_mass changes, and otherwise do not depend on it."""
+    random = np.random.default_rng(5)
+    problem = linear_problem(flight_log(20.0), random)
+    layout, w = problem.layout, problem.windows
+    place = layout.slices()["link_mass"]
+
+    def scattered(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
+        clean = problem.simulate(vectors, starts, used)
+        changed = np.any(vectors[:, place] != layout.mean[place], axis=1)[:, None, None, None]
+        return clean._replace(
+            angles=clean.angles + 1.5e-5 * changed * random.normal(size=clean.angles.shape)
+        )
+
+    weights, clean = problem.weights(pictures=0.0), problem.at(layout.mean, w.starts).angles
+    measured = w._replace(angles=clean + 1e-3 * random.normal(size=clean.shape))
+    fit = Fit(layout.mean, w.starts, np.zeros(0), Predicted(*2 * (np.zeros(0),)), weights, 0.0)
+    known = certainty(problem._replace(simulate=scattered, windows=measured), fit)
+    deviations = np.sqrt(np.diag(known.covariance))
+    assert np.all(deviations[place] > 0.9 * layout.deviation[place])
+    gains = layout.slices()["servo_gain"]
+    assert np.all(deviations[gains] < 0.1 * layout.deviation[gains])
+
+
 def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:
     random, log = np.random.default_rng(2), flight_log(30.0)
     noisy = log._replace(
