@@ -225,10 +225,14 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     both = np.concatenate([one, two], axis=2)
     reduced = _eliminate(lines[0].residuals, both, by_state, at_guess)
     of_windows = _symmetric(reduced.informations[:, :size, size:])
-    total = np.trace(reduced.informations, axis1=1, axis2=2)
-    agreed = 2.0 * np.trace(of_windows, axis1=1, axis2=2)
-    # A ball that meets the paddle's edge has no derivative.
-    smooth = total - agreed <= _DISAGREEMENT**2 * (total + agreed)
+    # A ball that meets the paddle's edge has no derivative. That of a lag near 0 is another matter.
+    others = place != layout.slices()["servo_lag"].start
+    diagonal = np.diagonal(of_windows, axis1=1, axis2=2)
+    squares = np.diagonal(reduced.informations, axis1=1, axis2=2)
+    agreed = 2.0 * np.sum(diagonal[:, others], axis=1)
+    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
+    differs = total - agreed > _DISAGREEMENT**2 * (total + agreed)
+    smooth = ~(differs & problem.windows.has_ball)
     of_windows = of_windows * smooth[:, None, None]
     values, vectors = np.linalg.eigh(np.sum(of_windows, axis=0))
     values = np.maximum(values, 0.0)
