@@ -52,8 +52,6 @@ MODEL = PhysicsParameters()
 # Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss")
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
-# One of the scene, the ball, the arm's bodies and the servos each.
-FAST_FIELDS = ("gravity", "ball_mass", "link_mass", "servo_gain")
 NUM_WORLDS = 16
 
 
@@ -130,10 +128,7 @@ def test_each_number_alone_acts_as_in_mujoco(mj_model):
     assert np.all(change.max(axis=1) > 1e-4), dict(zip(fields, change.max(axis=1), strict=True))
 
 
-@pytest.mark.parametrize(
-    "field",
-    [pytest.param(f, marks=() if f in FAST_FIELDS else pytest.mark.slow) for f in FIELDS],
-)
+@pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.usefixtures("float64")
 def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
     """One field is given and the rest is None, with a solref in the standard format."""
