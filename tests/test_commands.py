@@ -639,6 +639,7 @@ def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
         newest_run(tmp_path / "2026-01-04")
 
 
+@pytest.mark.slow
 def test_resumed_run_equals_an_uninterrupted_one(trained: Path, tmp_path: Path) -> None:
     log_dir = tmp_path / "runs"
     train_command.main([*TINY, "--total-steps", str(STEPS // 2), "--log-dir", str(log_dir)])

@@ -94,7 +94,6 @@ def differences(seen: Watched) -> np.ndarray:
     return velocity
 
 
-@pytest.mark.slow
 def test_filtered_velocity_is_several_times_better_than_differences(env, watched) -> None:
     """At 120 Hz, 2 mm of noise and 20 ms of latency; in flight and around the bounces."""
     layout = env.layout

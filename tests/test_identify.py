@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from bounce_mjx.commands.main import main
-from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, covariance, minimise
+from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log, read_csv
 from bounce_mjx.identify.replay import _known
 from bounce_mjx.identify.simulation import Predicted, _Targets
@@ -199,11 +199,35 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
         one = problem._replace(windows=w._replace(angles=noisy))
         fit = minimise(one, truth, w.starts, free, weights, 4)
         estimates.append(fit.vector[place])
-        deviations.append(np.sqrt(covariance(one, fit)[place, place]))
+        deviations.append(np.sqrt(certainty(one, fit).covariance[place, place]))
         of_noise = np.linalg.inv(fit.information + np.diag(layout.deviation**-2.0))
         independent.append(np.sqrt(of_noise[place, place]))
     assert np.std(estimates) > 1.5 * np.mean(independent)
     np.testing.assert_allclose(np.mean(deviations), np.std(estimates), rtol=0.35)
+
+
+def test_noise_of_derivatives_is_no_information() -> None:
+    """Simulations that scatter whenever link_mass changes, and otherwise do not depend on it."""
+    random = np.random.default_rng(5)
+    problem = linear_problem(flight_log(20.0), random)
+    layout, w = problem.layout, problem.windows
+    place = layout.slices()["link_mass"]
+
+    def scattered(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
+        clean = problem.simulate(vectors, starts, used)
+        changed = np.any(vectors[:, place] != layout.mean[place], axis=1)[:, None, None, None]
+        return clean._replace(
+            angles=clean.angles + 1.5e-5 * changed * random.normal(size=clean.angles.shape)
+        )
+
+    weights, clean = problem.weights(pictures=0.0), problem.at(layout.mean, w.starts).angles
+    measured = w._replace(angles=clean + 1e-3 * random.normal(size=clean.shape))
+    fit = Fit(layout.mean, w.starts, np.zeros(0), Predicted(*2 * (np.zeros(0),)), weights, 0.0)
+    known = certainty(problem._replace(simulate=scattered, windows=measured), fit)
+    deviations = np.sqrt(np.diag(known.covariance))
+    assert np.all(deviations[place] > 0.9 * layout.deviation[place])
+    gains = layout.slices()["servo_gain"]
+    assert np.all(deviations[gains] < 0.1 * layout.deviation[gains])
 
 
 def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:

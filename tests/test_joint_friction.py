@@ -126,9 +126,7 @@ def test_a_joint_holds_below_its_dry_friction(mj_model):
     ctrl[:, 0] += 5.0 / 1e-3
     state = PhysicsState(jnp.asarray(qpos), jnp.zeros((3, mj_model.nv)))
     step = make_engine(mj_model, "fused").step
-    with jax.disable_jit():
-        for _ in range(8):
-            state = jax.vmap(lambda p, s, u: step(p, s, Control(u), 1))(parameters, state, ctrl)
+    state = jax.jit(jax.vmap(lambda p, s, u: step(p, s, Control(u), 8)))(parameters, state, ctrl)
     free, slid, held = np.asarray(state.qvel)[:, 0]
     assert free > 0.02
     assert slid == pytest.approx((5.0 - 2.0) / 5.0 * free, rel=0.01)
@@ -143,13 +141,13 @@ def test_dry_friction_follows_its_flag():
     """With the flag off, C ignores the model's dry friction and a given one."""
     model = edited("<flag ", '<flag frictionloss="disable" ')
     model.dof_frictionloss[:6] = 5.0
-    states = touching_states(model, 6, seed=3)
-    given = PhysicsParameters(frictionloss=np.full((6, 6), 5.0))
-    expected, _ = c_steps([converged(model)] * 6, states)
+    states = touching_states(model, COUNT, seed=3)
+    given = PhysicsParameters(frictionloss=np.full((COUNT, 6), 5.0))
+    expected, _ = c_steps([converged(model)] * COUNT, states)
     for parameters in (PhysicsParameters(), given):
         assert_same_step(fused_steps(model, parameters, states), expected)
     model.opt.disableflags ^= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
-    without, _ = c_steps([model] * 6, states)
+    without, _ = c_steps([model] * COUNT, states)
     assert np.abs(without.qvel - expected.qvel).max() > 1e-3
     assert_same_step(fused_steps(model, given, states), without)
 

@@ -91,10 +91,12 @@ main(sys.argv[1:])
     [
         ("train", True),
         ("train --mjcf {rk4}", False),
-        ("train --config {run}/config.yaml", False),
+        pytest.param("train --config {run}/config.yaml", False, marks=pytest.mark.slow),
         ("view --html {run}/page.html --mjcf {rk4}", False),
         ("play pretrained --html {run}/page.html", True),
-        ("play pretrained --physics mjx --html {run}/page.html", False),
+        pytest.param(
+            "play pretrained --physics mjx --html {run}/page.html", False, marks=pytest.mark.slow
+        ),
         ("eval pretrained --physics mjx", False),
         ("robustness pretrained --out {run}", True),
     ],

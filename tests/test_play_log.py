@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import _BOUNCE_DEVIATION
 from bounce_mjx.identify.log import Log, read_csv
 from bounce_mjx.identify.replay import Replay, replay_log
-from bounce_mjx.identify.windows import _REACH
+from bounce_mjx.identify.windows import _AFTER, _AFTER_SHARE
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import read_preset
 from bounce_mjx.viewers.comparison import recording
@@ -67,9 +67,9 @@ def test_in_the_world_of_the_robot_only_noise_and_scatter_remain(found: Replay) 
     angles, ball = found.distances
     # The encoders' noise; the time stamps' jitter of 0.3 ms adds 0.2 mrad at 0.5 rad/s.
     assert 0.9 * ANGLE_NOISE < angles < 1.1 * ANGLE_NOISE
-    # Two engines' bounces scatter, as a contact begins anywhere in a physics step. Half of the time
-    # is after a bounce, of which the next window cuts off the rest of the flight.
-    scatter = np.mean(np.square(_BOUNCE_DEVIATION)) * 0.5 * _REACH**2 / 3.0
+    # Two engines' bounces scatter, as a contact begins anywhere in a physics step. A share of
+    # each flight is after a bounce, of which the next window cuts off the rest.
+    scatter = np.mean(np.square(_BOUNCE_DEVIATION)) * _AFTER_SHARE * _AFTER**2 / 3.0
     # The mean square of 8 bounces or more is itself uncertain by a half: three times that.
     assert ball < np.sqrt(2.5 * (BALL_NOISE**2 + scatter))
     seen = ~np.isnan(found.balls[..., 0])
@@ -89,8 +89,8 @@ def test_a_delay_shows_in_the_angles(log: Log, tmp_path: Path) -> None:
 def test_a_dull_paddle_shows_in_the_heights(log: Log, found: Replay, tmp_path: Path) -> None:
     dull = replayed(log, world_file(tmp_path, restitution=0.7))
     lower = np.nanmean(found.balls[:, 1, 2]) - np.nanmean(dull.balls[:, 1, 2])
-    # A fall of 0.3 m ends at 2.4 m/s, of which a tenth is lost, for half of the time.
-    expected = 0.1 * 2.4 * 0.5 * _REACH / 2.0
+    # A fall of 0.3 m ends at 2.4 m/s, of which a tenth is lost, for a share of the time.
+    expected = 0.1 * 2.4 * _AFTER_SHARE * _AFTER / 2.0
     assert 0.5 * expected < lower < 2.0 * expected
 
 
@@ -109,7 +109,7 @@ def test_estimates_of_each_joint_replace_the_middle(
     np.testing.assert_allclose(known.distances, found.distances, rtol=0.02)
     # A paddle that tilts by 0.05 rad sends a ball of 2.4 m/s aside with 0.24 m/s.
     _, ball = replayed(biased, world, action_latency=0.02).distances
-    assert ball > 0.5 * 0.24 * _REACH / np.sqrt(18.0)
+    assert ball > 0.5 * 0.24 * _AFTER * np.sqrt(_AFTER_SHARE / 9.0)
 
 
 @pytest.mark.slow

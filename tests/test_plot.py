@@ -43,17 +43,13 @@ from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.log import WandbLog, open_log
+from tiny_runs import TINY
 
 TERMS = term_names(BounceReward)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
     *(curve for curve in Bounce.curves if curve.title),
 )
-TINY = (
-    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
-    "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
-    "--no-stop-when-solved --episode-seconds 0.5"
-).split()
 
 
 @pytest.fixture(scope="module")

@@ -232,7 +232,7 @@ def two_state_config(**changes) -> PPOConfig:
     ("env", "critic_metrics", "expected"),
     [
         # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out counted as a termination.
-        pytest.param(TwoStates(1.0), (), [1.0, 1.0], id="constant reward"),
+        pytest.param(TwoStates(1.0), (), [1.0, 1.0], id="constant reward", marks=pytest.mark.slow),
         # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led
         # on to the first state of the next episode, they would be worth 0.526 and 0.474.
         pytest.param(TwoStates(0.0), (), [0.9, 1.0], id="second state pays"),

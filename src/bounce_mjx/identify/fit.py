@@ -2,7 +2,7 @@
 
 The residuals are in units of each sensor's noise. The starts, thousands of numbers of which each
 matters in one window, are eliminated inside every step: the variable projection of Golub and
-Pereyra (1973) in the linearised problem, by one QR decomposition for each window.
+Pereyra (1973) in the linearised problem.
 """
 
 import itertools
@@ -17,8 +17,8 @@ from bounce_mjx.identify.windows import Windows
 
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
 # velocities (rad/s); the ball's position (m), velocity (m/s) and spin (rad/s).
-_START_DEVIATIONS = (0.01, 1.0, 0.1, 3.0, 10.0)
-_START_STEPS = (3e-3, 0.1, 0.01, 0.1, 5.0)
+_START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0)
+_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0)
 # Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
 _SEARCHED = (True, False, True, True, True)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
@@ -31,6 +31,11 @@ _HUBER = 3.0
 # Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
 _NO_FLIGHT = 25.0
 _WORST = 30.0
+# Largest share of the information along any direction that one window counts for: its own is known
+# up to noise.
+_LARGEST_SHARE = 0.9
+# Share by which two derivatives of a window may differ.
+_DISAGREEMENT = 0.1
 
 
 # Deviation of a bounce from the model's: of the ball's velocity after it along x, y and z, m/s. A
@@ -186,25 +191,68 @@ def minimise(
     return Fit(vector, starts, whole, predicted, weights, now)
 
 
-def covariance(problem: Problem, fit: Fit) -> np.ndarray:
-    """Covariance [P, P] of the unknowns at a minimum.
+class Certainty(NamedTuple):
+    """What a log says about the unknowns at a minimum."""
+
+    covariance: np.ndarray
+    """[P, P], with the prior."""
+    information: np.ndarray
+    """[P, P], without the prior, after the starts are eliminated."""
+
+
+def certainty(problem: Problem, fit: Fit) -> Certainty:
+    """Information about the unknowns at a minimum, and their covariance.
+
+    A bounce depends on where in a physics step it begins, which makes derivatives noisy; their
+    square would take the noise for information. The information is therefore the product of two
+    derivatives with independent noise, by central differences of one and of two steps.
 
     Each deviation is the larger of two: that of independent residuals of the sensors' noise, and
-    that of the jackknife over windows, which knows that residuals of one window are correlated
-    (the estimator CR3 of MacKinnon, Nielsen and Webb 2023, "Cluster-robust inference").
+    that of the scatter of the windows' gradients, which knows that residuals of one window are
+    correlated (the estimator CR2 of Bell and McCaffrey 2002, "Bias reduction in standard errors for
+    linear regression with multi-stage samples").
     """
     layout, (deviations, _, searched) = problem.layout, _per_state(problem.windows)
     place, of_state = np.arange(len(fit.vector)), np.flatnonzero(searched)
-    line = _linearised(problem, fit.vector, fit.starts, place, of_state, fit.weights)
-    scale, reach = layout.deviation, deviations[of_state]
+    scale, reach, size = layout.deviation, deviations[of_state], len(fit.vector)
+    lines = [
+        _linearised(problem, fit.vector, fit.starts, place, of_state, fit.weights, step)
+        for step in (1.0, -1.0, 2.0, -2.0)
+    ]
+    one, two = (0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:]))
+    by_state = np.mean([line.by_state for line in lines], axis=0) * reach
     at_guess = (fit.starts - problem.windows.starts)[:, of_state] / reach
-    reduced = _eliminate(line.residuals, line.by_unknown * scale, line.by_state * reach, at_guess)
-    hessian = reduced.information + np.eye(len(scale))
-    inverse = np.linalg.inv(hessian)
-    left_out = np.linalg.solve(hessian - reduced.informations, reduced.gradients[:, :, None])
-    jackknife = np.einsum("sfx,sgx->fg", left_out, left_out) + inverse @ inverse
-    wider = np.sqrt(np.maximum(np.diag(jackknife) / np.diag(inverse), 1.0)) * scale
-    return inverse * np.outer(wider, wider)
+    both = np.concatenate([one, two], axis=2)
+    reduced = _eliminate(lines[0].residuals, both, by_state, at_guess)
+    of_windows = _symmetric(reduced.informations[:, :size, size:])
+    # A ball that meets the paddle's edge has no derivative. That of a lag near 0 is another matter.
+    others = place != layout.slices()["servo_lag"].start
+    diagonal = np.diagonal(of_windows, axis1=1, axis2=2)
+    squares = np.diagonal(reduced.informations, axis1=1, axis2=2)
+    agreed = 2.0 * np.sum(diagonal[:, others], axis=1)
+    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
+    differs = total - agreed > _DISAGREEMENT**2 * (total + agreed)
+    smooth = ~(differs & problem.windows.has_ball)
+    of_windows = of_windows * smooth[:, None, None]
+    values, vectors = np.linalg.eigh(np.sum(of_windows, axis=0))
+    values = np.maximum(values, 0.0)
+    # Coordinates in which the covariance of independent residuals is the identity.
+    root = vectors / np.sqrt(values + 1.0)
+    share, turned = np.linalg.eigh(root.T @ of_windows @ root)
+    share = np.clip(share, 0.0, _LARGEST_SHARE)
+    gradients = np.stack(np.split(reduced.gradients * smooth[:, None], 2, axis=1)) @ root
+    less = 1.0 / np.sqrt(1.0 - share)
+    gradients = np.einsum("sij,sj,skj,lsk->lsi", turned, less, turned, gradients)
+    of_noise = root @ root.T
+    scatter = _symmetric(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
+    scatter = root @ scatter @ root.T
+    wider = np.sqrt(np.maximum(np.diag(scatter) / np.diag(of_noise), 1.0)) * scale
+    information = (vectors * values) @ vectors.T
+    return Certainty(of_noise * np.outer(wider, wider), information / np.outer(scale, scale))
+
+
+def _symmetric(matrices: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrices + np.swapaxes(matrices, -1, -2))
 
 
 class _Linearised(NamedTuple):
@@ -233,13 +281,17 @@ class _Difference(NamedTuple):
 
 
 def _differences(
-    problem: Problem, vector: np.ndarray, place: np.ndarray, of_state: np.ndarray
+    problem: Problem, vector: np.ndarray, place: np.ndarray, of_state: np.ndarray, size: float
 ) -> list[_Difference]:
     """The simulations for the F unknowns at `place` and the D entries `of_state` of the starts."""
     layout, n = problem.layout, problem.layout.num_joints
-    ahead = layout.clipped(vector + layout.step) - vector
-    # Differences that stay within the limits.
-    steps = np.where(np.abs(ahead) < 0.5 * layout.step, -layout.step, layout.step)
+
+    def inside(step: np.ndarray) -> np.ndarray:
+        """Differences that stay within the limits."""
+        ahead = layout.clipped(vector + size * step) - vector
+        return np.where(np.abs(ahead) < 0.5 * np.abs(size * step), -size, size) * step
+
+    steps, ball_steps = inside(layout.step), inside(layout.ball_step)
     column = {int(p): np.array([f]) for f, p in enumerate(place)}
     found = []
     for name, at in layout.slices().items():
@@ -255,8 +307,8 @@ def _differences(
             if not unknown.own:
                 found.append(_Difference(column[p], step, of_angles, not apart))
             if unknown.ball_step:
-                found.append(_Difference(column[p], layout.ball_step[[p]], False, True))
-    own, start = _per_state(problem.windows)[1], len(place)
+                found.append(_Difference(column[p], ball_steps[[p]], False, True))
+    own, start = size * _per_state(problem.windows)[1], len(place)
     arm = np.flatnonzero(of_state < n)
     if len(arm):
         # A servo has forgotten its start before the first picture.
@@ -273,8 +325,10 @@ def _linearised(
     place: np.ndarray,
     of_state: np.ndarray,
     weights: np.ndarray,
+    size: float = 1.0,
 ) -> _Linearised:
-    """Derivatives by the F unknowns at `place` and the D entries `of_state` of the starts."""
+    """Derivatives by the F unknowns at `place` and the D entries `of_state` of the starts, by
+    differences of `size` times each step."""
     n, num_free = problem.layout.num_joints, len(place)
     num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
     angles, pictures = (
@@ -282,7 +336,7 @@ def _linearised(
     )
     tried = [
         d
-        for d in _differences(problem, vector, place, of_state)
+        for d in _differences(problem, vector, place, of_state, size)
         if (d.of_angles and np.any(angles)) or (d.of_pictures and np.any(pictures))
     ]
     vectors = np.repeat(vector[None], 1 + len(tried), axis=0)
@@ -319,10 +373,10 @@ class _Reduced(NamedTuple):
     """Of each window [S, F, F]."""
     gradients: np.ndarray
     """Of each window [S, F]."""
-    residuals: np.ndarray
     by_unknown: np.ndarray
-    q: np.ndarray
-    r: np.ndarray
+    """Change [S, D, F] of the starts with the unknowns."""
+    own: np.ndarray
+    """Change [S, D] of the starts if no unknown changes."""
 
     @property
     def information(self) -> np.ndarray:
@@ -336,30 +390,42 @@ class _Reduced(NamedTuple):
 
     def states(self, change: np.ndarray) -> np.ndarray:
         """Change [S, D] of the starts for a change [F] of the unknowns."""
-        left = self.residuals + self.by_unknown @ change
-        right = np.einsum("smd,sm->sd", self.q, left)
-        return -np.linalg.solve(self.r, right[:, :, None])[:, :, 0]
+        return self.own + self.by_unknown @ change
 
 
 def _eliminate(
     residuals: np.ndarray, by_unknown: np.ndarray, by_state: np.ndarray, at_guess: np.ndarray
 ) -> _Reduced:
-    """Eliminates the starts; each of them has a guess with the deviation 1.
+    """Eliminates the starts, each of which has a guess with the deviation 1: the Schur complement
+    of the normal equations of each window.
 
     Args:
       residuals: [S, M]; its derivatives are `by_unknown` [S, M, F] and `by_state` [S, M, D].
       at_guess: distance [S, D] of the starts from their guess.
     """
-    num_windows, num_states = at_guess.shape
-    eye = np.broadcast_to(np.eye(num_states), (num_windows, num_states, num_states))
-    q, r = np.linalg.qr(np.concatenate([by_state, eye], axis=1))
-    nothing = np.zeros((num_windows, num_states, by_unknown.shape[2]))
-    a = np.concatenate([by_unknown, nothing], axis=1)
-    b = np.concatenate([residuals, at_guess], axis=1)
-    # Orthogonal to the starts.
-    rest = a - q @ (np.swapaxes(q, 1, 2) @ a)
-    across = np.swapaxes(rest, 1, 2)
-    return _Reduced(across @ rest, (across @ b[:, :, None])[:, :, 0], b, a, q, r)
+    num_free, num_states = by_unknown.shape[2], at_guess.shape[1]
+    columns = np.concatenate([by_unknown, residuals[:, :, None], by_state], axis=2)
+    normal = _squared(columns)
+    kept, starts = normal[:, : num_free + 1, : num_free + 1], normal[:, num_free + 1 :]
+    across, of_starts = starts[:, :, : num_free + 1], starts[:, :, num_free + 1 :]
+    across[:, :, num_free] += at_guess
+    change = -np.linalg.solve(of_starts + np.eye(num_states), across)
+    reduced = kept + np.swapaxes(across, 1, 2) @ change
+    return _Reduced(
+        reduced[:, :num_free, :num_free],
+        reduced[:, :num_free, num_free],
+        change[:, :, :num_free],
+        change[:, :, num_free],
+    )
+
+
+def _squared(columns: np.ndarray) -> np.ndarray:
+    """Products [S, K, K] of the columns [S, M, K] of each window, in parts that are too small for
+    OpenBLAS to start threads: on a busy machine, these wait for one another a hundred times as long
+    as they compute."""
+    _, rows, size = columns.shape
+    parts = np.array_split(columns, -(-rows * size**2 // 2**18), axis=1)
+    return sum(np.swapaxes(part, 1, 2) @ part for part in parts)
 
 
 def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -90,7 +90,8 @@ def make_run(config: WorldConfig, num_joints: int) -> Run:
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))
 
-        state = jax.vmap(first_state, -1, -1)(starts)
+        # The starts are those that the encoders show: their first guess then suits every bias.
+        state = jax.vmap(first_state, -1, -1)(starts.at[:n].add(-bias))
         _, (path, speed) = jax.lax.scan(body, state, targets)
         angles = at(path[:, :n], speed[:, :n], angle_times) + bias
         balls = at(path[:, n:], speed[:, n:], picture_times - world["ball_latency"])

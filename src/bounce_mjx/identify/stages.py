@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.identify.fit import Fit, Noise, Problem, covariance, minimise, picture_weights
+from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
 from bounce_mjx.identify.unknowns import Layout, make_layout
@@ -238,8 +238,10 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
     few = np.zeros_like(search.training)
     few[_some(used)] = 1.0
-    for kept in (4, 1):
-        found = [search.run(["flight", "bounce"], t, 1.0, 2, ball_state, few) for t in tried]
+    for kept, iterations in ((4, 1), (1, 2)):
+        found = [
+            search.run(["flight", "bounce"], t, 1.0, iterations, ball_state, few) for t in tried
+        ]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
     (fit,) = tried
     fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
@@ -255,12 +257,13 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
     before = fit._replace(predicted=problem.at(own, fit.starts))
     of_balls = fit.weights[:, -3 * windows.balls.shape[1] :]
     dropped = windows.has_ball & np.all(of_balls == 0.0, axis=1)
+    known = certainty(problem, fit)
     return Identified(
         layout,
         windows,
         problem.noise,
-        fit,
-        covariance(problem, fit),
+        fit._replace(information=known.information),
+        known.covariance,
         _errors(problem, before),
         _errors(problem, fit),
         held_out,

@@ -14,8 +14,12 @@ from bounce_mjx.identify.log import Log
 MAX_DELAY = 0.08
 """Time before the first picture of a window at which its simulation starts, s; a picture may be
 later than what it shows by as much."""
-_REACH = 0.3
-_SECONDS = MAX_DELAY + 2.0 * _REACH + 0.03
+# Flight before and after a bounce that belongs to its window, s, at most. An unbroken flight shows
+# gravity and drag with the fifth power of its length, and a bounce scatters: most of each flight
+# belongs to the bounce at its end.
+_BEFORE, _AFTER = 0.55, 0.2
+_AFTER_SHARE = 0.3
+_SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
 _PADDING = 8
 _PICTURE_GAP = 0.06
@@ -148,12 +152,19 @@ def _bounces(log: Log) -> list[tuple[float, float, float]]:
         ends = [t[0], *t[lowest], t[-1]]
         for j, i in enumerate(lowest):
             # The first and the last flight of a run belong to one window each, others to two.
-            before = (t[i] - ends[j]) * (1.0 if j == 0 else 0.5)
-            after = (ends[j + 2] - t[i]) * (1.0 if j == len(lowest) - 1 else 0.5)
-            before, after = min(before, _REACH), min(after, _REACH)
+            before, after = t[i] - ends[j], ends[j + 2] - t[i]
+            before -= _share(before) if j > 0 else 0.0
+            after = _share(after) if j < len(lowest) - 1 else after
+            before, after = min(before, _BEFORE), min(after, _AFTER)
             if min(before, after) > 0.5 * _SHORTEST:
                 found.append((float(t[i]), float(before), float(after)))
     return found
+
+
+def _share(flight: float) -> float:
+    """Time of a flight that belongs to the bounce at its begin, s: enough for the next window to
+    start in the air."""
+    return float(np.clip(_AFTER_SHARE * flight, min(1.25 * MAX_DELAY, 0.5 * flight), _AFTER))
 
 
 def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
@@ -176,7 +187,7 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
         if length > _SHORTEST:
-            count = int(np.ceil(length / (2.0 * _REACH)))
+            count = int(np.ceil(length / (_BEFORE + _AFTER)))
             edges = np.linspace(begin, start, count + 1)
             pieces += list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
         begin = max(begin, end)
