@@ -15,13 +15,11 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
-from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.learning.policy import networks_of
-from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
 from bounce_mjx.runs.config import (
@@ -146,8 +144,7 @@ def write_policy(
     """
     report, physics, _ = evaluation
     policy = read_policy(checkpoint, trained_with)
-    critic = len(names_of_critic_metrics(trained_with.ppo, Env(trained_with.env)))
-    start = read_networks(checkpoint, trained_with, critic) if networks else None
+    start = read_networks(checkpoint, trained_with)[:2] if networks else None
     made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": runs_folder(trained_with.env.task)})

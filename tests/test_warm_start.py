@@ -43,9 +43,10 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def stored(run: Path):
     """Config, names of the critic metrics, networks, parameters and statistics of a run."""
     checkpoint, config = best_checkpoint(run), load_run_config(run)
-    names = names_of_critic_metrics(config.ppo, Env(config.env))
-    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints, len(names))
-    return config, names, networks, *read_networks(checkpoint, config, len(names))
+    *read, names = read_networks(checkpoint, config)
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints, len(names))
+    return config, names, networks, *read
 
 
 def test_both_networks_are_the_same_functions_in_the_same_world(first: Path) -> None:

@@ -26,7 +26,7 @@ from bounce_mjx.learning.policy import (
     networks_of,
     untrained_policy,
 )
-from bounce_mjx.learning.ppo import Params, TrainingState
+from bounce_mjx.learning.ppo import Params, TrainingState, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
@@ -104,9 +104,10 @@ def load_training_state(
 
 
 def read_networks(
-    checkpoint: Checkpoint, config: TrainConfig, num_critic_metrics: int
-) -> tuple[Params, RunningStatistics]:
-    """Restores both networks of a checkpoint, and the statistics of their inputs."""
+    checkpoint: Checkpoint, config: TrainConfig
+) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
+    """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
+    critic metrics among these."""
     made_here = read_record(checkpoint).progress.get("library", "jax") == "jax"
     items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
     if not (items and made_here):
@@ -114,15 +115,15 @@ def read_networks(
             f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
             "robust_small, or a run that bounce-mjx train made"
         )
-    size = config.env.layout.size
-    networks = make_networks(config.ppo, size, config.env.num_joints, num_critic_metrics)
+    size, names = config.env.layout.size, names_of_critic_metrics(config.ppo, Env(config.env))
+    networks = make_networks(config.ppo, size, config.env.num_joints, len(names))
 
     def initial() -> dict[str, Any]:
         params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
-        return {"params": params, "statistics": init_statistics(size + num_critic_metrics)}
+        return {"params": params, "statistics": init_statistics(size + len(names))}
 
     stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
-    return stored["params"], stored["statistics"]
+    return stored["params"], stored["statistics"], names
 
 
 def read_record(checkpoint: Checkpoint) -> Record:

@@ -57,8 +57,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
         )
-    names = names_of_critic_metrics(own.ppo, Env(own.env))
-    params, statistics = read_networks(checkpoint, own, len(names))
+    params, statistics, names = read_networks(checkpoint, own)
     size = own.env.layout.size
     wanted = names_of_critic_metrics(config.ppo, env)
     known = np.array([True] * size + [name in names for name in wanted])
