@@ -120,6 +120,7 @@ except ImportError as error:
     assert re.fullmatch(sentence, done.stdout), done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_another_playground_is_refused_in_one_sentence() -> None:
     """Version 1.0 has the name, and is another program."""
     script = """

@@ -476,6 +476,7 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
 # Paths
 
 
+@pytest.mark.slow
 def test_a_path_may_have_square_brackets(tmp_path: Path, straight: Path, capfd) -> None:
     log_dir = tmp_path / "[/x]" / "exp[lr]"
     run = train(log_dir, STEPS // 2)
@@ -725,6 +726,7 @@ def test_a_solved_run_is_told_as_such(solved: Path, capsys) -> None:
     assert f"{solved} has been trained to its end, 128 steps;" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_solved_run_goes_on_to_new_total_steps(solved: Path, straight: Path, capsys) -> None:
     resume(solved, "--total-steps", str(STEPS))
     assert "it continues to 256 steps" in capsys.readouterr().out

@@ -176,6 +176,7 @@ def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyP
     assert find_checkpoint(newest_run(seeds.parent)) == best_checkpoint(best)
 
 
+@pytest.mark.slow
 def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     plot_command.main([str(seeds), "--out", str(tmp_path), "--formats", "svg"])
     drawn = [str(tmp_path / name) for name in ("curves.svg", "rewards.svg")]
@@ -185,6 +186,7 @@ def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     assert len({tuple(run.curves["loss/value"].values) for run in group.runs}) == SEEDS
 
 
+@pytest.mark.slow
 def test_a_seed_is_evaluated(seeds: Path, tmp_path: Path):
     with pytest.raises(SystemExit) as exit_:
         eval_command.main(
