@@ -562,6 +562,7 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     assert set(range(env.layout.size)) - reached <= still
 
 
+@pytest.mark.slow
 def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) -> None:
     """In rows or one after another, from noisy and late pictures."""
     env = {
@@ -902,6 +903,7 @@ def random_edit(rng: random.Random, text: str) -> str:
     return json.dumps(whole[0])
 
 
+@pytest.mark.slow
 def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.ModelProto) -> None:
     rng, acting = random.Random(0), 0
     entries = {prop.key: prop.value for prop in filtered.metadata_props}

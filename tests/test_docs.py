@@ -416,7 +416,15 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
 
 
-@pytest.mark.parametrize("page", ["load-a-policy.md", "sensors.md", "algorithms.md", "jax.md"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        "load-a-policy.md",
+        "sensors.md",
+        "algorithms.md",
+        pytest.param("jax.md", marks=pytest.mark.slow),
+    ],
+)
 def test_examples_on_jax_run(page: str, capsys) -> None:
     """Compiled functions are only traced, which takes a tenth of the time."""
 

@@ -684,6 +684,7 @@ def test_a_nominal_evaluation_draws_no_worlds(monkeypatch):
     assert [report.results[SPEED].passed for report in reports] == [None, False, False]
 
 
+@pytest.mark.slow
 def test_an_unconverged_solver_gives_a_warning_on_c(random_policy, tmp_path):
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
     mjcf = tmp_path / "one_iteration.xml"

@@ -88,6 +88,7 @@ def test_example_of_purejaxrl_trains():
     assert rewards.shape == (5,) and np.all(np.isfinite(rewards)) and np.ptp(rewards) > 0.0
 
 
+@pytest.mark.slow
 def test_example_of_evosax_searches(need):
     need("evosax")
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))["main"]

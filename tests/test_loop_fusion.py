@@ -92,13 +92,13 @@ main(sys.argv[1:])
         ("train", True),
         ("train --mjcf {rk4}", False),
         pytest.param("train --config {run}/config.yaml", False, marks=pytest.mark.slow),
-        ("view --html {run}/page.html --mjcf {rk4}", False),
-        ("play pretrained --html {run}/page.html", True),
+        pytest.param("view --html {run}/page.html --mjcf {rk4}", False, marks=pytest.mark.slow),
+        pytest.param("play pretrained --html {run}/page.html", True, marks=pytest.mark.slow),
         pytest.param(
             "play pretrained --physics mjx --html {run}/page.html", False, marks=pytest.mark.slow
         ),
         ("eval pretrained --physics mjx", False),
-        ("robustness pretrained --out {run}", True),
+        pytest.param("robustness pretrained --out {run}", True, marks=pytest.mark.slow),
     ],
 )
 def test_each_command_decides_before_jax_starts_its_devices(

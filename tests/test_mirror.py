@@ -65,6 +65,7 @@ def test_an_impact_sends_the_ball_to_its_target(env: Env, apex: float) -> None:
     assert paddle + e * (paddle + arriving) == pytest.approx(leaving, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_law_keeps_the_ball_up(env: Env) -> None:
     """Far longer than a ball bounces on a paddle at rest; a paddle that does not tilt loses it."""
     evaluate = make_evaluator(env, MirrorLaw(env), episodes=16)

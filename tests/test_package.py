@@ -120,6 +120,7 @@ except ImportError as error:
     assert re.fullmatch(sentence, done.stdout), done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_another_playground_is_refused_in_one_sentence() -> None:
     """Version 1.0 has the name, and is another program."""
     script = """
@@ -257,6 +258,7 @@ def test_wheel_has_the_console_script(wheel: Path) -> None:
     assert text.split() == ["[console_scripts]", "bounce-mjx", "=", "bounce_mjx.commands.main:main"]
 
 
+@pytest.mark.slow
 def test_installed_environment_runs(site: Path, tmp_path: Path) -> None:
     script = """
 import jax
@@ -281,6 +283,7 @@ print(*bounce_mjx.__all__)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
     script = """
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
@@ -298,6 +301,7 @@ print(resource_path(f"configs/{preset}.yaml"))
     assert Path(preset).parent == site / "bounce_mjx" / "configs"
 
 
+@pytest.mark.slow
 def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
     script = """
 import jax
@@ -326,7 +330,13 @@ print(len(load_deployed("pretrained").needs))
     ("page", "number", "printed", "needs"),
     [
         ("README.md", 0, "(64, 29) ", None),
-        ("docs/libraries.md", 0, "(29,) (480, 640, 3) (64, 29)\n", "opengl"),
+        pytest.param(
+            "docs/libraries.md",
+            0,
+            "(29,) (480, 640, 3) (64, 29)\n",
+            "opengl",
+            marks=pytest.mark.slow,
+        ),
         ("docs/libraries.md", 1, "torch.Size([64, 29]) ", "torch_libraries"),
         ("docs/jax.md", 0, "(64, 29) 0", None),
     ],

@@ -657,6 +657,7 @@ def test_mjx_refuses_features_that_it_ignores(name):
         make_engine(edited(old, new), "mjx")
 
 
+@pytest.mark.slow
 def test_importing_mjx_prints_nothing_and_keeps_the_lines_of_other_threads():
     program = """
 import threading

@@ -535,6 +535,7 @@ def test_faults_do_not_harm_the_training(tiny):
 # Learning
 
 
+@pytest.mark.slow
 def test_ppo_learns_to_bounce():
     env = BounceBall(EnvConfig(episode_seconds=4.0))
     config = PPOConfig(

@@ -266,6 +266,7 @@ def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, ship, caps
     assert (tmp_path / "mine").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_an_arm_has_a_policy_by_its_name(
     tmp_path: Path, monkeypatch, ship, console, capsys
 ) -> None:

@@ -177,6 +177,7 @@ class NoisyBall(BounceBall):
         return jnp.sin(1e4 * super().observe(state, truth))
 
 
+@pytest.mark.slow
 def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
     """The results and the recording use the true state, even if the policy cannot see it."""
     layers = policy.params["params"] | {

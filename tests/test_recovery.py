@@ -476,6 +476,7 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
 # Paths
 
 
+@pytest.mark.slow
 def test_a_path_may_have_square_brackets(tmp_path: Path, straight: Path, capfd) -> None:
     log_dir = tmp_path / "[/x]" / "exp[lr]"
     run = train(log_dir, STEPS // 2)
@@ -575,6 +576,7 @@ def test_only_an_equal_training_finds_its_programs(
         assert start(changed, **{changed: "0.5"})[2] != trained
 
 
+@pytest.mark.slow
 def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     """The program of a screening of three episodes also runs a full evaluation of four, on the
     resets that one program of four episodes uses."""
@@ -603,6 +605,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     assert screening.details == pytest.approx(judge(env, first_three).details)
 
 
+@pytest.mark.slow
 def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:
     run = train(tmp_path, STEPS, "--screening-episodes", "2")
     said = capfd.readouterr().out
@@ -634,6 +637,7 @@ def test_a_screening_is_never_better_than_a_full_evaluation() -> None:
     assert [e.screening for e in stored.evaluations] == [True, False, True]
 
 
+@pytest.mark.slow
 def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path, monkeypatch) -> None:
     """It tells the first evaluation that met all results, and the end."""
     margins = iter([None, 0.5, 1.0])
@@ -722,6 +726,7 @@ def test_a_solved_run_is_told_as_such(solved: Path, capsys) -> None:
     assert f"{solved} has been trained to its end, 128 steps;" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_solved_run_goes_on_to_new_total_steps(solved: Path, straight: Path, capsys) -> None:
     resume(solved, "--total-steps", str(STEPS))
     assert "it continues to 256 steps" in capsys.readouterr().out

@@ -323,6 +323,7 @@ def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
     assert drag.values["upward speed"] < nominal.values["upward speed"] - 0.005
 
 
+@pytest.mark.slow
 def test_a_policy_that_ignores_the_ball_fails(shipped, tmp_path: Path) -> None:
     policy, ppo, env = shipped
     conditions = three_conditions(tmp_path, env)

@@ -158,6 +158,7 @@ def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_
     assert (together["params.policy.params.Dense_0.kernel"].std(axis=0) > 0).any()
 
 
+@pytest.mark.slow
 def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyPatch):
     folders = [seeds / f"seed_{i:03d}" for i in range(SEEDS)]
     assert sorted(p for p in seeds.iterdir() if p.name.startswith("seed")) == folders
@@ -175,6 +176,7 @@ def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyP
     assert find_checkpoint(newest_run(seeds.parent)) == best_checkpoint(best)
 
 
+@pytest.mark.slow
 def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     plot_command.main([str(seeds), "--out", str(tmp_path), "--formats", "svg"])
     drawn = [str(tmp_path / name) for name in ("curves.svg", "rewards.svg")]
@@ -184,6 +186,7 @@ def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     assert len({tuple(run.curves["loss/value"].values) for run in group.runs}) == SEEDS
 
 
+@pytest.mark.slow
 def test_a_seed_is_evaluated(seeds: Path, tmp_path: Path):
     with pytest.raises(SystemExit) as exit_:
         eval_command.main(
@@ -529,6 +532,7 @@ def test_a_host_with_a_wrong_flag_ends_the_others(tmp_path: Path):
     )
 
 
+@pytest.mark.slow
 def test_hosts_with_different_configs_end_with_a_sentence(tmp_path: Path):
     leading, following = two_hosts(tmp_path, "--seed", 1)
     with leading as leader, following as follower:
@@ -584,7 +588,7 @@ time.sleep(600)
 """
 
 
-@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("joined", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_wait_for_other_hosts(tmp_path: Path, joined: bool):
     address = f"127.0.0.1:{free_port()}"
     flags = ["--coordinator-address", address, "--num-processes", 2, "--process-id", 0]
@@ -612,7 +616,7 @@ def wait_for_port(address: str) -> None:
     pytest.fail(f"nothing listens at {address}")
 
 
-@pytest.mark.parametrize("process_id", [0, 1])
+@pytest.mark.parametrize("process_id", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path, process_id: int):
     flags = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num_processes", 2]
     with job(tmp_path / "log", *flags, "--process_id", process_id, "--host-timeout", 2) as alone:

@@ -820,6 +820,7 @@ def test_keys_act_as_in_the_window(page) -> None:
     client.press("pause")
 
 
+@pytest.mark.slow
 def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
     page, mirrored: Simulation
 ) -> None:
@@ -870,6 +871,7 @@ def test_the_last_seconds_are_saved_as_they_were_seen(
     client.press("pause")
 
 
+@pytest.mark.slow
 def test_a_lost_ball_is_announced(page) -> None:
     client, _ = page
     client.set(client.control("speed, m/s"), 1.0)

@@ -99,6 +99,7 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     np.testing.assert_allclose(new, old, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Path) -> None:
     """Its first evaluation, before any step, is that of the run's policy."""
     args = [*TINY[: TINY.index("--hidden-layers")], *TINY[TINY.index("--block-steps") :]]
