@@ -18,11 +18,12 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--num-envs", type=int, default=256)
 parser.add_argument("--steps", type=int, default=8_000_000)
 parser.add_argument("--judged-steps", type=int, default=2000)
+parser.add_argument("--seed", type=int, default=0)
 arguments = parser.parse_args()
 
 # Most failures come in the first second; short episodes have more first seconds to learn from.
 envs = VecNormalize(Sb3VecEnv(arguments.num_envs, max_episode_steps=400), gamma=0.98)
-envs.seed(0)
+envs.seed(arguments.seed)
 model = PPO(
     "MlpPolicy",
     envs,
@@ -40,7 +41,7 @@ model = PPO(
     },
     device="cpu",
     verbose=1,
-    seed=0,
+    seed=arguments.seed,
 )
 model.learn(arguments.steps, log_interval=20)
 

@@ -58,6 +58,7 @@ def drop_ball(arm: Arm, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Gener
 
 
 @pytest.mark.usefixtures("float64")
+@pytest.mark.slow
 def test_2000_steps_of_any_arm_are_mujocos(arm, record_property):
     """Both engines run freely; neither sees the other's state. Some servos, joints and targets are
     at their limits, and some are not."""

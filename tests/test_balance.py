@@ -75,6 +75,7 @@ def test_the_ball_is_laid_on_the_paddle(env: Env) -> None:
     np.testing.assert_allclose(truth.paddle_position.mean(0), env.task.focus(), atol=5e-4)
 
 
+@pytest.mark.slow
 def test_a_ball_slides_and_rolls_on_fused_as_on_c(env: Env) -> None:
     """A ball at 0.1 m/s without spin, and one on a paddle with a slope of 0.1 rad."""
     model, at = env.mj_model, find_addresses(env.mj_model)

@@ -313,6 +313,7 @@ def test_a_world_of_two_balls_sees_each_late():
     assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s"))]
 
 
+@pytest.mark.slow
 def test_noise_and_pushes_differ_between_the_balls():
     noisy = {"ball_position_noise": (0.01, 0.01), "ball_position_bias": (0.1, 0.1)}
     pushed = {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2, "ball_latency": None}

@@ -531,6 +531,7 @@ def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["all histories", "leading targets", "sensors", "another task"])
+@pytest.mark.slow
 def test_histories_are_those_of_the_environment(name: str, runs, policies) -> None:
     """Policy and environment run side by side in a closed loop."""
     env, policy = Env(load_run_config(runs[name]).env), policies[name]

@@ -536,6 +536,7 @@ def holding_policy(networks):
     return networks._replace(policy_network=network), holding
 
 
+@pytest.mark.slow
 def test_evaluator_equals_a_python_loop(networks):
     episodes, key = 6, jax.random.key(21)
     env = BounceBall(EnvConfig(episode_seconds=2.6))

@@ -21,6 +21,7 @@ def env() -> PureJaxRLBounceBall:
     return PureJaxRLBounceBall(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
 
 
+@pytest.mark.slow
 def test_steps_are_those_of_the_task_until_the_time_limit(env):
     """The plain environment is the reference; at the limit the observation is a new episode's, and
     the last one is in the info."""

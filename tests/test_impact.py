@@ -31,6 +31,7 @@ def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float, lift: f
 
 @pytest.mark.parametrize("friction", (None, 0.3))
 @pytest.mark.usefixtures("float64")
+@pytest.mark.slow
 def test_a_spinning_ball_in_air_is_mujocos(mj_model, friction, record_property):
     """Free runs of 300 steps with bounces; the ball also spins without friction."""
     start = bouncing_states(mj_model, np.random.default_rng(0))

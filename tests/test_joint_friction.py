@@ -108,6 +108,7 @@ def test_one_step_with_dry_friction_is_mujocos(name, record_property, tmp_path, 
 
 
 @pytest.mark.usefixtures("float64")
+@pytest.mark.slow
 def test_a_joint_holds_below_its_dry_friction(mj_model):
     """A weak servo pushes one joint with 5 N m. Below its dry friction, the joint creeps at the
     speed of MuJoCo's soft constraint; beyond it, the friction subtracts from the torque."""

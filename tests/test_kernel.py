@@ -92,6 +92,7 @@ def by_xla(env: BounceBall) -> PhysicsState:
     return jax.jit(batched(env))(*moving(env, BATCH))
 
 
+@pytest.mark.slow
 def test_a_batch_equals_the_xla_program(env, by_xla, in_kernel):
     program = jax.jit(batched(env)).trace(*moving(env, BATCH))
     assert "pallas_call" in str(program.jaxpr)
@@ -100,6 +101,7 @@ def test_a_batch_equals_the_xla_program(env, by_xla, in_kernel):
     assert np.abs(after.qvel - moving(env, BATCH)[0].qvel).max() > 1.0
 
 
+@pytest.mark.slow
 def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
     """Tracing the physics takes some tenths of a second, and a training has several programs."""
     traced = []

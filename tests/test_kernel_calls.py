@@ -113,6 +113,7 @@ for n in (2, 1):
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_is_lowered_on_its_own_for_one_of_several_devices():
     """XLA lowers those of a program for several devices."""
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
@@ -127,6 +128,7 @@ def test_a_kernel_is_lowered_on_its_own_for_one_of_several_devices():
 
 
 @pytest.mark.parametrize("num_seeds", [1, 2])
+@pytest.mark.slow
 def test_a_training_on_a_gpu_lowers_each_kernel_once(lowered_kernels, monkeypatch, num_seeds: int):
     """The kernels of the first states and of the control step."""
     trainer, state = trainer_with_kernels(monkeypatch, num_seeds)

@@ -28,6 +28,7 @@ print(two.lower(jnp.ones(1000)).compile().as_text())
 
 
 @pytest.mark.parametrize("physics", ["auto", "mjx"])
+@pytest.mark.slow
 def test_two_results_of_one_value_share_a_loop_unless_mjx_runs(physics: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM.format(physics=physics)],

@@ -255,6 +255,7 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
     assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
 
 
+@pytest.mark.slow
 def test_update_uses_the_normalisation_of_the_next_rollout():
     """If the policy does not change, the KL divergence of an update is the divergence between the
     policy on the rollout's own normalised observations and on the same observations normalised with
@@ -392,6 +393,7 @@ def test_policy_sees_only_the_observation(tiny, after_two):
     assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
 
 
+@pytest.mark.slow
 def test_two_iterations_equal_one_and_one(init, run, after_two):
     at_once, metrics = after_two
     state, first_metrics = run(init(jax.random.key(0)), 1)

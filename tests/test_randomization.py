@@ -913,6 +913,7 @@ def test_latency_without_a_camera_and_velocity_by_differences() -> None:
         np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_results_are_of_the_truth() -> None:
     """A policy that ignores its observation has the same results even with absurd sensor errors."""
     sensors = {

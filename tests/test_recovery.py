@@ -179,6 +179,7 @@ def test_results_that_are_newer_than_the_checkpoint_do_not_count(run: Path, stra
     assert_same_training(run, straight)
 
 
+@pytest.mark.slow
 def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight: Path) -> None:
     assert best_checkpoint(run).steps == latest_checkpoint(run).steps
     shutil.rmtree(run / "checkpoints/best")
@@ -717,6 +718,7 @@ def solved(run: Path) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_a_solved_run_is_told_as_such(solved: Path, capsys) -> None:
     resume(solved)
     assert latest_checkpoint(solved).steps == STEPS // 2

@@ -97,6 +97,7 @@ def python_loop(single, actions, episode_steps, i):
 
 @pytest.mark.parametrize("i", range(NUM_ENVS))
 @pytest.mark.parametrize(("fixture", "episode_steps"), [("unlimited", NO_LIMIT), ("limited", 25)])
+@pytest.mark.slow
 def test_run_equals_a_loop_over_single_environments(
     i, fixture, episode_steps, single, actions, request
 ):

@@ -1178,6 +1178,7 @@ def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...])
     return simulation.record(seconds)
 
 
+@pytest.mark.slow
 def test_policies_of_different_worlds_are_shown_as_one(
     mirrored: Simulation, played: Simulation
 ) -> None:

@@ -49,6 +49,7 @@ def stored(run: Path):
     return config, names, networks, *read
 
 
+@pytest.mark.slow
 def test_both_networks_are_the_same_functions_in_the_same_world(first: Path) -> None:
     config, _, networks, params, statistics = stored(first)
     command = config.model_copy(update={"warm_start": first})
@@ -70,6 +71,7 @@ def test_both_networks_are_the_same_functions_in_the_same_world(first: Path) -> 
     np.testing.assert_array_equal(np.clip(mean, -1.0, 1.0), acts)
 
 
+@pytest.mark.slow
 def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_ones(
     first: Path, tmp_path: Path
 ) -> None:
