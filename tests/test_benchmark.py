@@ -50,12 +50,18 @@ def test_the_mirror_law_hits_until_the_cap(monkeypatch) -> None:
 
 
 def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, capsys) -> None:
-    """The runs in a folder are one row."""
+    """The runs in a folder are one row, and so is a run that has others in its folder."""
     for name in ("a", "b"):
         run = tmp_path / "seeds" / name
         run.parent.mkdir(exist_ok=True)
         run.symlink_to(resource_path("pretrained"))
-    hits = iter((10.0, 20.0, 30.0))
+    outer = tmp_path / "outer"
+    outer.mkdir()
+    for part in (*resource_path("pretrained").glob("*.*"), resource_path("pretrained/checkpoints")):
+        (outer / part.name).symlink_to(part)
+    for name in ("robust", "robust_small"):
+        (outer / name).symlink_to(resource_path(f"pretrained/{name}"))
+    hits = iter((10.0, 20.0, 30.0, 40.0))
 
     def measure(policy, actor, trained, options, progress) -> Figures:
         assert policy is not None and options.episodes == 64
@@ -65,9 +71,9 @@ def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, c
 
     monkeypatch.setattr(benchmark, "measure", measure)
     monkeypatch.chdir(tmp_path)
-    command.main(["seeds", "robust", "--out", "found"])
+    command.main(["seeds", "robust", "outer", "--out", "found"])
     stored = json.loads((tmp_path / "found/benchmark.json").read_text())
-    assert [len(row["figures"]) for row in stored["rows"]] == [2, 1]
+    assert [len(row["figures"]) for row in stored["rows"]] == [2, 1, 1]
     table = (tmp_path / "found/benchmark.md").read_text()
     printed = capsys.readouterr().out
     assert table in printed

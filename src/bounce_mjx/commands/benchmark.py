@@ -53,7 +53,7 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.reports import benchmark as reports
         from bounce_mjx.reports.tables import robot_name
         from bounce_mjx.runs.files import to_json, writable, write_output
-        from bounce_mjx.runs.folders import runs_in
+        from bounce_mjx.runs.folders import runs_of_row
         from bounce_mjx.runs.reading import read_actor
         from bounce_mjx.training.setup import set_up_jax
 
@@ -61,8 +61,7 @@ def main(args: Sequence[str]) -> None:
         raise UserError("no policy is given; give one, such as pretrained")
     console = Console()
     members = [
-        [command.choose(path, console) for path in runs_in(path) or [path]]
-        for path in command.policies
+        [command.choose(path, console) for path in runs_of_row(path)] for path in command.policies
     ]
     configs = [[command.config_of(checkpoint) for checkpoint in row] for row in members]
     set_up_jax(*(on_engine(c.env, command.physics) for row in configs for c in row))

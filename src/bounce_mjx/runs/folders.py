@@ -186,6 +186,12 @@ def runs_in(folder: Path) -> list[Path]:
     return sorted(filter(_has_checkpoint, _runs(folder)), key=_started)
 
 
+def runs_of_row(path: Path) -> list[Path]:
+    """What a row of a table is about: the runs in a folder, or the path itself. A run may have
+    other runs in its folder, such as the shipped policies in a clone; it is one row."""
+    return [path] if (path / CONFIG_FILE).is_file() else runs_in(path) or [path]
+
+
 def find_checkpoint(path: Path) -> Checkpoint:
     """Finds a checkpoint.
 
