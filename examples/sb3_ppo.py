@@ -23,7 +23,6 @@ arguments = parser.parse_args()
 
 # Most failures come in the first second; short episodes have more first seconds to learn from.
 envs = VecNormalize(Sb3VecEnv(arguments.num_envs, max_episode_steps=400), gamma=0.98)
-envs.seed(arguments.seed)
 model = PPO(
     "MlpPolicy",
     envs,
