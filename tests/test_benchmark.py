@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,8 @@ def test_the_mirror_law_hits_until_the_cap(monkeypatch) -> None:
 
 
 def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, capsys) -> None:
-    """The runs in a folder are one row, and so is a run that has others in its folder."""
+    """The runs in a folder are one row, and so are the seeds of a run; other runs in a run's folder
+    do not count."""
     for name in ("a", "b"):
         run = tmp_path / "seeds" / name
         run.parent.mkdir(exist_ok=True)
@@ -61,7 +63,11 @@ def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, c
         (outer / part.name).symlink_to(part)
     for name in ("robust", "robust_small"):
         (outer / name).symlink_to(resource_path(f"pretrained/{name}"))
-    hits = iter((10.0, 20.0, 30.0, 40.0))
+    several = tmp_path / "several"
+    for seed in ("seed_000", "seed_001"):
+        shutil.copytree(resource_path("pretrained/robust_small"), several / seed)
+    shutil.copy(several / "seed_000/config.yaml", several)
+    hits = iter((10.0, 20.0, 30.0, 40.0, 50.0, 60.0))
 
     def measure(policy, actor, trained, options, progress) -> Figures:
         assert policy is not None and options.episodes == 64
@@ -71,9 +77,9 @@ def test_the_command_writes_a_row_for_each_policy(tmp_path: Path, monkeypatch, c
 
     monkeypatch.setattr(benchmark, "measure", measure)
     monkeypatch.chdir(tmp_path)
-    command.main(["seeds", "robust", "outer", "--out", "found"])
+    command.main(["seeds", "robust", "outer", "several", "--out", "found"])
     stored = json.loads((tmp_path / "found/benchmark.json").read_text())
-    assert [len(row["figures"]) for row in stored["rows"]] == [2, 1, 1]
+    assert [len(row["figures"]) for row in stored["rows"]] == [2, 1, 1, 2]
     table = (tmp_path / "found/benchmark.md").read_text()
     printed = capsys.readouterr().out
     assert table in printed

@@ -187,9 +187,10 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def runs_of_row(path: Path) -> list[Path]:
-    """What a row of a table is about: the runs in a folder, or the path itself. A run may have
-    other runs in its folder, such as the shipped policies in a clone; it is one row."""
-    return [path] if (path / CONFIG_FILE).is_file() else runs_in(path) or [path]
+    """Runs whose figures a row of a table shows: those of a run's seeds or in a folder of runs, or
+    the path itself. Other runs in a run's folder, as in a clone's pretrained/, do not count."""
+    is_run = (path / CONFIG_FILE).is_file()
+    return runs_of_seeds(path) if is_run else runs_in(path) or [path]
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
