@@ -255,12 +255,38 @@ def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, ex
     assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
 
 
+class Precise(TwoStates):
+    """The reward asks for a precise action."""
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return state.replace(reward=-jnp.square(action[0] - 0.3))
+
+
+@pytest.mark.parametrize(("bound", "least", "greatest"), [(0.0, 0.0, 0.05), (0.2, 0.2, 0.3)])
+def test_the_noise_shrinks_to_its_bound(bound, least, greatest):
+    """The bounds of the environments have the mean `min_noise_std`; the policy is as precise."""
+    config = two_state_config(
+        num_envs=64, min_noise_std=bound, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
+        max_learning_rate=1e-2,
+    )  # fmt: skip
+    trainer = ppo.make_trainer(config, Precise(1.0), episode_steps=2)
+    state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 300))(jax.random.key(0))
+    assert least <= metrics["policy/action_std"][-1] < greatest
+    networks = policy.make_networks(config, 2, 1)
+    action = networks.act(ppo.policy_of(state, 2), jnp.eye(2))
+    np.testing.assert_allclose(action, 0.3, atol=0.03)
+
+
 @pytest.mark.slow
-def test_update_uses_the_normalisation_of_the_next_rollout():
+@pytest.mark.parametrize("bound", [0.0, 0.3])
+def test_update_uses_the_normalisation_of_the_next_rollout(bound):
     """If the policy does not change, the KL divergence of an update is the divergence between the
     policy on the rollout's own normalised observations and on the same observations normalised with
     the statistics that include the rollout."""
-    config = two_state_config(num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12)
+    config = two_state_config(
+        num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12, min_noise_std=bound
+    )
     trainer = ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
     before = trainer.init(jax.random.key(0))
     after, metrics = jax.jit(lambda state: trainer.run(state, 1))(before)
@@ -272,7 +298,9 @@ def test_update_uses_the_normalisation_of_the_next_rollout():
         )
         for state in (before, after)
     )
-    of_states = jnp.sum(jnp.square(new - old) / (2.0 * jnp.square(deviation)), axis=-1)
+    bounds = 2.0 * bound * (jnp.arange(4096) + 0.5) / 4096
+    precision = jnp.mean(1.0 / (jnp.square(deviation)[..., None] + jnp.square(bounds)), axis=-1)
+    of_states = jnp.sum(jnp.square(new - old) * precision / 2.0, axis=-1)
     # All environments start in the first state; half of them then time out and are in the first
     # state again.
     divergence = 0.75 * of_states[0] + 0.25 * of_states[1]

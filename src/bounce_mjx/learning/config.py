@@ -59,6 +59,10 @@ class PPOConfig(StrictModel):
     """Factor by which the trainer scales the reward."""
     init_noise_std: Positive = 0.4
     """Standard deviation of the action noise at the start."""
+    min_noise_std: NonNegative = 0.0
+    """Lower bound of that standard deviation, averaged over the environments, whose bounds lie
+    evenly between 0 and twice this; 0 for none. Without it the noise shrinks until no environment
+    visits the states from which a policy must recover, and the policy forgets them."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy and of the value network."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"

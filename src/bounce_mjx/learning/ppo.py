@@ -115,6 +115,8 @@ class Samples(NamedTuple):
     """[T, B]; in a minibatch with the mean 0 and the standard deviation 1."""
     value_target: jax.Array
     """[T, B]."""
+    noise_bound: jax.Array
+    """[T, B, 1]."""
 
 
 class TrainingFunctions(NamedTuple):
@@ -228,6 +230,7 @@ def iterate(ppo: PPO, state: TrainingState) -> tuple[TrainingState, Metrics]:
         log_prob=rollout.log_prob,
         advantage=advantage,
         value_target=value_target,
+        noise_bound=jnp.broadcast_to(noise_bounds(ppo.config), (*value_target.shape, 1)),
     )
     state, minibatches = update(ppo, state, samples, update_key)
     fault = first_fault(metrics["reward"], new_statistics, minibatches, state.params)
@@ -266,7 +269,8 @@ def collect(
         (packed, timeout_inputs), (noise, fresh) = carry, draws
         env_state = unpack(packed)
         inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)
-        policy = distribution(ppo, state.params, normalize(inputs, state.statistics.normalizer))
+        normalized = normalize(inputs, state.statistics.normalizer)
+        policy = distribution(ppo, state.params, normalized, noise_bounds(config))
         action = policy.mean + policy.std * noise
         env_state, result = vector.step_with(
             env, env_state, action, unpack(fresh), ppo.episode_steps
@@ -302,10 +306,28 @@ def network_inputs(ppo: PPO, observation: jax.Array, metrics: Metrics) -> jax.Ar
     return jnp.concatenate([observation, *columns], axis=-1, dtype=jnp.float32)
 
 
-def distribution(ppo: PPO, params: Params, inputs: jax.Array) -> Gaussian:
-    """The policy's distribution of the action [..., A] for normalised inputs [..., N + K]."""
+def noise_bounds(config: PPOConfig) -> jax.Array:
+    """Lower bounds of the action noise of each environment [B, 1]: evenly from 0 to twice
+    min_noise_std.
+
+    With one bound for all, either no environment visits the states from which a policy must
+    recover, or none those in which it must be precise. Different noise for each actor is that of
+    Horgan et al. (2018), Distributed prioritized experience replay.
+    """
+    share = (jnp.arange(config.num_envs) + 0.5) / config.num_envs
+    return 2.0 * config.min_noise_std * share[:, None]
+
+
+def distribution(ppo: PPO, params: Params, inputs: jax.Array, noise_bound: jax.Array) -> Gaussian:
+    """The policy's distribution of the action [..., A] for normalised inputs [..., N + K].
+
+    Args:
+      noise_bound: lower bounds of the standard deviation [..., 1]. It is the root of the sum of
+        squares, as a clipped one would have no gradient.
+    """
     observation = inputs[..., : ppo.env.observation_size]
-    return ppo.networks.policy_network.apply(params.policy, observation)
+    mean, std = ppo.networks.policy_network.apply(params.policy, observation)
+    return Gaussian(mean, jnp.sqrt(jnp.square(std) + jnp.square(noise_bound)))
 
 
 def advantages(
@@ -402,7 +424,7 @@ def minibatch_step(
 def loss(ppo: PPO, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
     """The loss of a minibatch [], and its parts."""
     config = ppo.config
-    policy = distribution(ppo, params, samples.inputs)
+    policy = distribution(ppo, params, samples.inputs, samples.noise_bound)
     log_ratio = policy.log_prob(samples.action) - samples.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)

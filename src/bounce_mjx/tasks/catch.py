@@ -35,7 +35,7 @@ class Rewards(task.StrictModel):
 
     centre: task.Gaussian = task.Gaussian(scale=0.05)
     """The ball is over the paddle's centre."""
-    fall: task.Gaussian = task.Gaussian(scale=0.7)
+    fall: task.Gaussian = task.Gaussian(scale=1.5)
     """The ball has little energy: the speed relative to the paddle at which it meets it or would,
     m/s."""
     rest: task.Proportional = task.Proportional(weight=3.0)
