@@ -14,6 +14,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.tasks.bounce import Bounce, BounceState
+from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 OBSERVATION = EnvConfig().layout
@@ -271,7 +272,14 @@ def test_noise_free_reset_has_the_paddle_at_home():
     np.testing.assert_allclose(obs[0:6], DEFAULT_ANGLES, atol=1e-7)
     np.testing.assert_allclose(obs[6:9], [0.58856, 0, 0.45], atol=1e-7)
     np.testing.assert_allclose(obs[25:28], [0.59356, 0, 0.04980], atol=1e-5)
+    np.testing.assert_allclose(obs[25:28], PADDLE_HOME, atol=1e-5)
     assert obs[28] == np.float32(0.8)
+
+
+def test_another_arm_starts_with_the_ball_over_its_paddle():
+    settings = EnvConfig.settings_at((0.4, -0.2, 0.3))
+    assert settings["ball_init_pos"] == [0.4, -0.2, 0.7]
+    assert (settings["reward"]["target_x"], settings["reward"]["target_y"]) == (0.4, -0.2)
 
 
 # Actions

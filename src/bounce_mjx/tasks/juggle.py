@@ -47,7 +47,7 @@ class Config(task.WorldConfig):
 
     num_balls: task.NumBalls = 2
     """Number of balls, 2 or 3."""
-    home: tuple[Finite, Finite, Finite] = (0.59356, 0.0, 0.0498)
+    home: tuple[Finite, Finite, Finite] = task.PADDLE_HOME
     """Home of the paddle, m; the columns stand side by side over it."""
     spacing: Positive = 0.065
     """Distance between columns, m."""
