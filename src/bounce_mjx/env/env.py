@@ -319,9 +319,9 @@ class Env:
         return [(ball, *(x[i] for x in thrown)) for i, ball in enumerate(balls)]
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [n], clipped to [-1, 1]."""
+        """Advances one control step under the action [n], clipped to [-1, 1]. A NaN action ends the
+        episode and acts as 0."""
         check_unedited(self.mj_model, self._fingerprint)
-        action = jnp.clip(action, -1.0, 1.0)
         state, control = self.begin_step(state, action)
         before = state.pipeline_state
         physics = self.engine.step(
@@ -330,7 +330,8 @@ class Env:
         return self.finish_step(state, action, physics)
 
     def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
-        """The part of a step before the physics: the control of a clipped action [n]."""
+        """The part of a step before the physics: the control of the action [n] of `step`."""
+        action, _ = _acting(action)
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
@@ -477,11 +478,11 @@ class Env:
         """The part of a step after the physics: the task's, and the observation.
 
         A non-finite physics state ends the episode and is replaced by the previous one, so that
-        nothing non-finite leaves the environment.
+        nothing non-finite leaves the environment. A NaN action ends it too.
 
         Args:
           state: before the step.
-          action: clipped [n].
+          action: [n], as `step` takes it.
           physics: after the step, from any engine.
         """
         before = state.pipeline_state
@@ -496,7 +497,9 @@ class Env:
             physics,
             before.physics,
         )
+        action, is_number = _acting(action)
         action = jnp.where(finite, action, before.last_action)
+        finite &= is_number
 
         truth = self.kinematics(before._replace(physics=physics))
         done = self.task.step(before.task, Step(truth, before.command, action, before.last_action))
@@ -755,6 +758,12 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+
+
+def _acting(action: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The action [n] that acts, and whether that is the clipped one []: a NaN acts as 0."""
+    is_number = ~jnp.any(jnp.isnan(action))
+    return jnp.where(is_number, jnp.clip(action, -1.0, 1.0), 0.0), is_number
 
 
 def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
