@@ -155,6 +155,22 @@ def test_a_changed_world_keeps_the_slope():
     assert own > 1.05 * damped(flat)
 
 
+def test_a_changed_world_keeps_the_parameters_of_randomize():
+    """They replace the drawn ones; others follow the world."""
+    own = PhysicsParameters(ball_radius=jnp.float32(0.02), contact_damping=jnp.float32(20.0))
+    config = EnvConfig(randomization=SLOPED | {"ball_mass": (0.9, 1.1)})
+    env = BounceBall(config, randomize=lambda key: own)
+    state = env.reset(jax.random.PRNGKey(0))
+    before = state.pipeline_state
+    world = before.world | {"ball_mass": jnp.float32(2.0), "restitution": jnp.float32(0.8)}
+    begun, _ = env.begin_step(
+        state.replace(pipeline_state=env.in_world(before, world)), jnp.zeros(6)
+    )
+    after = begun.pipeline_state.parameters
+    assert (after.ball_radius, after.contact_damping) == (own.ball_radius, own.contact_damping)
+    assert float(after.ball_mass) == pytest.approx(0.0054)
+
+
 @pytest.mark.parametrize("restitution, slope", [(0.88, 0.03), (0.605, 0.1)])
 @pytest.mark.parametrize("speed", (1.5, 2.45, 3.5, 4.5))
 def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed, restitution, slope):
