@@ -14,6 +14,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.tasks.bounce import Bounce, BounceState
+from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 OBSERVATION = EnvConfig().layout
@@ -271,7 +272,14 @@ def test_noise_free_reset_has_the_paddle_at_home():
     np.testing.assert_allclose(obs[0:6], DEFAULT_ANGLES, atol=1e-7)
     np.testing.assert_allclose(obs[6:9], [0.58856, 0, 0.45], atol=1e-7)
     np.testing.assert_allclose(obs[25:28], [0.59356, 0, 0.04980], atol=1e-5)
+    np.testing.assert_allclose(obs[25:28], PADDLE_HOME, atol=1e-5)
     assert obs[28] == np.float32(0.8)
+
+
+def test_another_arm_starts_with_the_ball_over_its_paddle():
+    settings = EnvConfig.settings_at((0.4, -0.2, 0.3))
+    assert settings["ball_init_pos"] == [0.4, -0.2, 0.7]
+    assert (settings["reward"]["target_x"], settings["reward"]["target_y"]) == (0.4, -0.2)
 
 
 # Actions
@@ -640,13 +648,29 @@ def test_finite_steps_are_not_counted_as_faults(episodes):
     assert all(after.metrics["non_finite"] == 0 for _, _, after in episodes)
 
 
+# An action that acts later, and is seen and remembered in every place.
+LATE = EnvConfig(
+    action={"base": "target"},
+    observation={"action": 2, "servo_lead": 1},
+    randomization={"action_latency": (0.03, 0.03), "servo_lag": (0.01, 0.01)},
+)
+
+
+@pytest.fixture(scope="module")
+def late_step():
+    return jax.jit(BounceBall(LATE).step)
+
+
 @pytest.mark.parametrize("broken", [range(6), [2]], ids=["all entries", "one entry"])
-def test_nan_action_ends_the_episode_and_does_not_spread(broken, walked, step):
-    action = jnp.zeros(6).at[jnp.array(list(broken))].set(jnp.nan)
-    after = step(walked, action)
-    assert after.done == 1
-    assert after.metrics["non_finite"] == 1
-    assert all_finite(after)
+def test_nan_action_ends_the_episode_and_acts_as_zero(broken, walked, step, late_step):
+    action = jnp.full(6, 0.5).at[jnp.array(list(broken))].set(jnp.nan)
+    late = jax.jit(BounceBall(LATE).reset)(jax.random.key(3))
+    for state, advance in ((walked, step), (late, late_step)):
+        after, at_rest = advance(state, action), advance(state, jnp.zeros(6))
+        assert after.done == 1 and after.metrics["non_finite"] == 1 and at_rest.done == 0
+        metrics = at_rest.metrics | {"non_finite": after.metrics["non_finite"]}
+        assert_identical(after, at_rest.replace(done=after.done, metrics=metrics))
+        assert all_finite(after)
 
 
 def test_fault_leaves_the_rest_of_the_batch_alone(env):

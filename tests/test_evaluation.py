@@ -620,8 +620,8 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     key = jax.random.key(31)
     shares, shares_on_c = [], []
     fused = flat(make_evaluator(env, networks, 8, shares.append)(random_policy, key))
-    mujoco = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)(random_policy, key)
-    mujoco = flat(mujoco)
+    evaluate_on_c = make_mujoco_evaluator(env, networks, 8, shares_on_c.append)
+    mujoco = flat(evaluate_on_c(random_policy, key))
     assert shares == shares_on_c == [1.0], "each second of simulated time is reported"
     assert np.any(fused.n_bounces > 0), "a contact is wanted"
     assert not np.all(fused.running), "an end is wanted"
@@ -632,6 +632,11 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
     # One step more or less is worth up to about 15.
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
+
+    params = jax.tree.map(lambda x: jnp.nan * x, random_policy.params)
+    broken = evaluate_on_c(random_policy._replace(params=params), key)
+    np.testing.assert_array_equal(broken.steps, 1)
+    assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
 
 
 def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):

@@ -109,7 +109,7 @@ def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
         world = {name: float(value[w]) for name, value in pipeline.world.items()}
         paddle = find_addresses(model).paddle_geom
         reach = model.geom_size[paddle].min() + model.geom_size[find_addresses(model).ball_geom, 0]
-        slow, fast = np.asarray(pipeline.memory.impact.damping)[w]
+        dampings = np.asarray(pipeline.memory.impact.damping)[w]
         data, jacobian, speed = mujoco.MjData(model), np.zeros((3, model.nv)), 0.0
         data.qpos[:], data.qvel[:] = (np.asarray(x)[w] for x in pipeline.physics[:2])
         for t in range(STEPS):
@@ -118,7 +118,9 @@ def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
             mujoco.mj_jacGeom(model, data, jacobian, None, paddle)
             if data.qpos[8] - data.geom_xpos[paddle, 2] - reach > 0.01:
                 speed = (jacobian @ data.qvel)[2] - data.qvel[8]
-            model.pair_solref[0, 1] = -(slow + (speed - 1.0) / 3.0 * (fast - slow))
+            ends = slice(0, 2) if speed < 2.45 else slice(1, 3)
+            line = np.polyfit(np.array([1.0, 2.45, 4.0])[ends], dampings[ends], 1)
+            model.pair_solref[0, 1] = -np.polyval(line, speed)
             data.ctrl[:] = controls[t][w]
             for _ in range(10):
                 push_by_air(model, data, world["air_drag"], world["air_lift"])
@@ -153,10 +155,27 @@ def test_a_changed_world_keeps_the_slope():
     assert own > 1.05 * damped(flat)
 
 
-@pytest.mark.parametrize("speed", (1.5, 2.45, 3.5))
-def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed):
+def test_a_changed_world_keeps_the_parameters_of_randomize():
+    """They replace the drawn ones; others follow the world."""
+    own = PhysicsParameters(ball_radius=jnp.float32(0.02), contact_damping=jnp.float32(20.0))
+    config = EnvConfig(randomization=SLOPED | {"ball_mass": (0.9, 1.1)})
+    env = BounceBall(config, randomize=lambda key: own)
+    state = env.reset(jax.random.PRNGKey(0))
+    before = state.pipeline_state
+    world = before.world | {"ball_mass": jnp.float32(2.0), "restitution": jnp.float32(0.8)}
+    begun, _ = env.begin_step(
+        state.replace(pipeline_state=env.in_world(before, world)), jnp.zeros(6)
+    )
+    after = begun.pipeline_state.parameters
+    assert (after.ball_radius, after.contact_damping) == (own.ball_radius, own.contact_damping)
+    assert float(after.ball_mass) == pytest.approx(0.0054)
+
+
+@pytest.mark.parametrize("restitution, slope", [(0.88, 0.03), (0.605, 0.1)])
+@pytest.mark.parametrize("speed", (1.5, 2.45, 3.5, 4.5))
+def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed, restitution, slope):
     """On C, in the mean over the phases of the first contact's physics step."""
-    world = {"restitution": jnp.float32(0.88), "restitution_slope": jnp.float32(0.03)}
+    world = {"restitution": jnp.float32(restitution), "restitution_slope": jnp.float32(slope)}
     impact: Impact = first_impact(world, 98696.0)
     given = PhysicsParameters(contact_damping=damping(impact._replace(speed=jnp.float32(speed))))
     model = edited_model(mj_model, given)
@@ -171,5 +190,5 @@ def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed):
         while data.qvel[8] < 0.0 or data.ncon:
             mujoco.mj_step(model, data)
         rebounds.append(data.qvel[8] / speed)
-    expected = 0.88 - 0.03 * (speed - 2.45)
+    expected = restitution - slope * (speed - 2.45)
     assert np.mean(rebounds) == pytest.approx(expected, abs=0.015)

@@ -9,7 +9,7 @@ import pytest
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import REST, Config, Juggle
+from bounce_mjx.tasks.juggle import REST, Config, Juggle, Rewards
 from bounce_mjx.viewers.display import Display
 
 JUGGLE = Juggle(Config())
@@ -136,6 +136,19 @@ def test_the_reward_of_turns_is_greatest_half_a_period_apart() -> None:
         rewards = [turn(delay, flown) for delay in (0.2, 0.4, 0.5, 0.6, 0.8)]
         assert rewards[0] < rewards[1] < rewards[2] > rewards[3] > rewards[4]
         assert rewards[2] == pytest.approx(JUGGLE.config.reward.turn.weight, rel=1e-3)
+
+
+class WithConstant(Rewards):
+    decay: float = 0.5
+    """A setting that is no term."""
+
+
+def test_a_setting_of_the_reward_may_be_no_term() -> None:
+    balls, velocities = (np.asarray(x) for x in JUGGLE.throw(jnp.zeros(0), {"target_height": 0.5}))
+    action, state = jnp.zeros(6), (jnp.array([False, True]), 1.0)
+    now = task.Step(truth(balls, velocities), {"target_height": jnp.float32(0.5)}, action, action)
+    reward = Juggle(Config(reward=WithConstant())).step(state, now).reward
+    assert reward.keys() == Rewards.model_fields.keys()
 
 
 def test_the_policy_sees_the_ball_that_lands_next() -> None:

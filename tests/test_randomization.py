@@ -248,6 +248,10 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
         ({"restitution_slope": (0, 0.02)}, "restitution_slope is given without restitution; give"),
         ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range; give the lower end first"),
         ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
+        (
+            {"restitution": (0.6, 0.9), "restitution_slope": (0, 0.1)},
+            "falls below 0.4 in an impact at 4.5 m/s; start restitution at 0.605, or narrow",
+        ),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
         ({"drag": (0.0, 0.1)}, "unknown key drag; did you mean air_drag?"),
         ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is not a term"),
@@ -277,7 +281,7 @@ def test_off_is_the_program_without_randomisation() -> None:
     assert "shift_right_logical" in on and more > inputs
 
 
-@pytest.mark.parametrize("restitution", [0.72, 0.8, 0.9, 0.96])
+@pytest.mark.parametrize("restitution", [0.4, 0.48, 0.6, 0.72, 0.8, 0.9, 0.96])
 def test_drops_bounce_as_asked(mj_model, restitution: float) -> None:
     """On MuJoCo's C engine: ratio of the speeds after and before an impact on the held paddle,
     without gravity, at several phases of the time step."""

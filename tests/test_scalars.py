@@ -260,6 +260,7 @@ def test_the_control_step_is_one_kernel(monkeypatch, terms):
     pipeline_state = state.env.pipeline_state._replace(physics=physics._replace(qpos=qpos))
     state = state._replace(env=state.env.replace(pipeline_state=pipeline_state))
     action = jax.random.uniform(action_key, (BATCH, 6), minval=-1.5, maxval=1.5)
+    action = action.at[1, 2].set(jnp.nan)
     fresh = jax.jit(lambda key: vector.first_states(env, key, BATCH))(fresh_key)
 
     def step(state, action, fresh):
@@ -267,6 +268,7 @@ def test_the_control_step_is_one_kernel(monkeypatch, terms):
 
     expected = jax.jit(step)(state, action, fresh)
     assert expected[1].truncated.any() and expected[1].terminated.any()
+    assert expected[1].metrics["non_finite"].sum() == 1 and expected[1].terminated[1]
     in_one_kernel = functools.partial(elementwise.in_one_kernel, interpret=True)
     monkeypatch.setattr(vector, "in_one_kernel", in_one_kernel)
     program = jax.jit(lambda *args: step(*args)).trace(state, action, fresh)

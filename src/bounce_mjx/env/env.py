@@ -211,22 +211,17 @@ class Env:
         check_unedited(self.mj_model, self._fingerprint)
         given = self.ranges() if ranges is None else ranges
         ranges = {name: ends for name, ends in given.items() if name in TERMS}
-        world, parameters, memory_rng = {}, PhysicsParameters(), None
+        world, own_parameters, memory_rng = {}, MODEL_PARAMETERS, None
         if ranges or self._needs_sensing:
             rng, world_rng, memory_rng = jax.random.split(rng, 3)
             own_share, shares = self.config.randomization.share, self.config.randomization.shares
             share, shares = (own_share, shares or {}) if share is None else (share, {})
             dtype = jnp.result_type(float)
             world = draw_world(ranges, world_rng, dtype, self.action_size, share, shares)
-            parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             rng, world_rng = jax.random.split(rng)
-            parameters = PhysicsParameters(
-                *(
-                    drawn if own is None else own
-                    for own, drawn in zip(self._randomize(world_rng), parameters, strict=True)
-                )
-            )
+            own_parameters = self._randomize(world_rng)
+        parameters = self._parameters(world, own_parameters)
         commands = self.config.commands
         ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
         # One draw for all numbers: splitting keys for separate draws would cost more than the
@@ -254,6 +249,8 @@ class Env:
         state = state._replace(task=task, command=command)
         if memory_rng is not None:
             memory = self._first_memory(state, truth, memory_rng)
+            if own_parameters.contact_damping is not None:
+                memory = memory._replace(impact=None)
             if "command_interval" in world:
                 memory = memory._replace(
                     command_ranges=jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends)
@@ -319,9 +316,9 @@ class Env:
         return [(ball, *(x[i] for x in thrown)) for i, ball in enumerate(balls)]
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one control step under the action [n], clipped to [-1, 1]."""
+        """Advances one control step under the action [n], clipped to [-1, 1]. A NaN action ends the
+        episode and acts as 0."""
         check_unedited(self.mj_model, self._fingerprint)
-        action = jnp.clip(action, -1.0, 1.0)
         state, control = self.begin_step(state, action)
         before = state.pipeline_state
         physics = self.engine.step(
@@ -330,7 +327,8 @@ class Env:
         return self.finish_step(state, action, physics)
 
     def begin_step(self, state: State, action: jax.Array) -> tuple[State, Control]:
-        """The part of a step before the physics: the control of a clipped action [n]."""
+        """The part of a step before the physics: the control of the action [n] of `step`."""
+        action, _ = _acting(action)
         config, before = self.config, state.pipeline_state
         world, memory = before.world, before.memory
         if memory is None:
@@ -477,11 +475,11 @@ class Env:
         """The part of a step after the physics: the task's, and the observation.
 
         A non-finite physics state ends the episode and is replaced by the previous one, so that
-        nothing non-finite leaves the environment.
+        nothing non-finite leaves the environment. A NaN action ends it too.
 
         Args:
           state: before the step.
-          action: clipped [n].
+          action: [n], as `step` takes it.
           physics: after the step, from any engine.
         """
         before = state.pipeline_state
@@ -496,7 +494,9 @@ class Env:
             physics,
             before.physics,
         )
+        action, is_number = _acting(action)
         action = jnp.where(finite, action, before.last_action)
+        finite &= is_number
 
         truth = self.kinematics(before._replace(physics=physics))
         done = self.task.step(before.task, Step(truth, before.command, action, before.last_action))
@@ -655,12 +655,22 @@ class Env:
 
     def in_world(self, state: EnvState, world: World) -> EnvState:
         """The state with other values of the terms of its world."""
-        memory = state.memory
-        if memory.impact is not None:
+        memory, own = state.memory, MODEL_PARAMETERS
+        if memory is not None and memory.impact is not None:
             damping = self._first_impact(world).damping
             memory = memory._replace(impact=memory.impact._replace(damping=damping))
-        parameters = physics_parameters(world, self.mj_model)
+        if self._randomize is not None:
+            given = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
+            pairs = zip(given, state.parameters, strict=True)
+            own = PhysicsParameters(*(None if x is None else value for x, value in pairs))
+        parameters = self._parameters(world, own)
         return state._replace(world=world, parameters=parameters, memory=memory)
+
+    def _parameters(self, world: World, own: PhysicsParameters) -> PhysicsParameters:
+        """The physics of a drawn world, in which the parameters of `randomize` replace its own."""
+        drawn = physics_parameters(world, self.mj_model)
+        pairs = zip(own, drawn, strict=True)
+        return PhysicsParameters(*(value if x is None else x for x, value in pairs))
 
     def _first_impact(self, world: World) -> Impact | None:
         if "restitution_slope" not in world:
@@ -755,6 +765,12 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+
+
+def _acting(action: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The action [n] that acts, and whether that is the clipped one []: a NaN acts as 0."""
+    is_number = ~jnp.any(jnp.isnan(action))
+    return jnp.where(is_number, jnp.clip(action, -1.0, 1.0), 0.0), is_number
 
 
 def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:

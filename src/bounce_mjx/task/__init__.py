@@ -27,12 +27,20 @@ from bounce_mjx.task.rewards import (
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values
-from bounce_mjx.world.config import ActionConfig, Command, NumBalls, ResetConfig, WorldConfig
+from bounce_mjx.world.config import (
+    PADDLE_HOME,
+    ActionConfig,
+    Command,
+    NumBalls,
+    ResetConfig,
+    WorldConfig,
+)
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 from bounce_mjx.world.randomization import RandomizationConfig
 
 __all__ = [
     "GRAVITY",
+    "PADDLE_HOME",
     "ActionConfig",
     "Command",
     "Curve",

@@ -14,8 +14,6 @@ MAX_SPEED = 0.05
 """Greatest speed of the point, m/s."""
 MIN_RADIUS = 0.01
 """Radius of the point's circle below which the point is slower than `point_speed`, m."""
-HOME = (0.59356, 0.0, 0.0498)
-"""Centre of the paddle of the project's own arm at a reset, m."""
 START_HEIGHT = 0.0255
 """Height of the ball over the paddle's centre at a reset, m: 3 mm above its rest, because the noise
 of the joint angles lifts the paddle by up to 2.5 mm."""
@@ -54,7 +52,10 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, with a rough paddle and pushes, and the settings of balancing."""
 
-    ball_init_pos: tuple[Finite, Finite, Finite] = (*HOME[:2], HOME[2] + START_HEIGHT)
+    ball_init_pos: tuple[Finite, Finite, Finite] = (
+        *task.PADDLE_HOME[:2],
+        task.PADDLE_HOME[2] + START_HEIGHT,
+    )
     """Mean ball position at a reset, m."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.002, ball_position=0.0)
     """The noise of a reset."""

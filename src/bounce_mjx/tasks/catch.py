@@ -17,8 +17,6 @@ MAX_DIRECTION = math.radians(30.0)
 """Greatest angle of a throw to the line from the paddle to the base, rad."""
 AIM_RADIUS = 0.05
 """Greatest distance of the aim from the ball's rest on the paddle, m."""
-HOME = (0.59356, 0.0, 0.0498)
-"""Centre of the paddle of the project's own arm at a reset, m."""
 REST_HEIGHT = 0.0225
 """Height of a resting ball over the paddle's centre, m."""
 REST_SPEED, REST_SECONDS = 0.05, 0.5
@@ -49,7 +47,10 @@ class Config(task.WorldConfig):
 
     episode_seconds: Positive = 3.0
     """Length of an episode before it is truncated, s."""
-    ball_init_pos: tuple[Finite, Finite, Finite] = (*HOME[:2], HOME[2] + REST_HEIGHT)
+    ball_init_pos: tuple[Finite, Finite, Finite] = (
+        *task.PADDLE_HOME[:2],
+        task.PADDLE_HOME[2] + REST_HEIGHT,
+    )
     """Where the ball would rest on the paddle at a reset, m; throws aim near it."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02, ball_position=0.0)
     """The noise of a reset."""

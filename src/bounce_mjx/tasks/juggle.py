@@ -47,7 +47,7 @@ class Config(task.WorldConfig):
 
     num_balls: task.NumBalls = 2
     """Number of balls, 2 or 3."""
-    home: tuple[Finite, Finite, Finite] = (0.59356, 0.0, 0.0498)
+    home: tuple[Finite, Finite, Finite] = task.PADDLE_HOME
     """Home of the paddle, m; the columns stand side by side over it."""
     spacing: Positive = 0.065
     """Distance between columns, m."""
@@ -106,7 +106,8 @@ class Juggle(task.Task):
         return start.truth.ball_velocity[:, 2] > 0.0, jnp.full((), self.config.num_balls - 1.0)
 
     def step(self, state: Any, step: task.Step) -> task.TaskStep:
-        (rose, last), terms = state, self.config.reward
+        (rose, last), reward = state, self.config.reward
+        terms = {name: getattr(reward, name) for name in task.term_names(type(reward))}
         truth, height, count = step.truth, step.command["target_height"], self.config.num_balls
         balls, velocities, home = truth.ball_position, truth.ball_velocity, self.config.home
         flights = task.flight(balls, velocities, home[2] + REST)
@@ -128,7 +129,7 @@ class Juggle(task.Task):
         landing = _next(flights.end, flights.fall)
         return task.TaskStep(
             state=(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), last)),
-            reward={n: t.weight * jnp.mean(jax.vmap(t.value)(errors[n])) for n, t in terms},
+            reward={n: t.weight * jnp.mean(jax.vmap(t.value)(errors[n])) for n, t in terms.items()},
             ended=jnp.any(far | (balls[:, 2] < home[2])) | touched,
             metrics={
                 "hits": jnp.sum(hits),

@@ -53,6 +53,7 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, the point, the ends and the reward."""
 
+    # Not `task.PADDLE_HOME`: the shipped policy was trained here. The next one moves it.
     home: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
     height_range: tuple[Finite, Finite] = (0.4, 0.5)

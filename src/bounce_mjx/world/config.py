@@ -20,8 +20,8 @@ from bounce_mjx.robot.config import RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, entries
 
-PADDLE_HOME = (0.58856, 0.0, 0.05)
-"""Where the project's own arm holds the paddle at a reset, m."""
+PADDLE_HOME = (0.59356, 0.0, 0.0498)
+"""Centre of the paddle of the project's own arm at a reset, m."""
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)]
@@ -237,12 +237,15 @@ class WorldConfig(StrictModel):
         """The settings that depend on where an arm holds the paddle at a reset. A task adds its
         own.
 
+        The ball of the original specification starts 5 mm beside the paddle's centre; another arm's
+        starts 0.4 m over it.
+
         Args:
           paddle: centre of the level paddle at `default_joint_angles`, m.
         """
-        default = cls.model_fields["ball_init_pos"].default
-        moved = zip(default, paddle, PADDLE_HOME, strict=True)
-        return {"ball_init_pos": [round(b + p - h, 4) + 0.0 for b, p, h in moved]}
+        starts = (c.model_fields["ball_init_pos"].default for c in (cls, WorldConfig))
+        moved = zip(*starts, paddle, (0.0, 0.0, 0.4), strict=True)
+        return {"ball_init_pos": [round(b - w + p + h, 4) + 0.0 for b, w, p, h in moved]}
 
     @property
     def num_joints(self) -> int:

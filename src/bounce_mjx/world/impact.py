@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from bounce_mjx.world.randomization import IMPACT_SPEED, World, contact_damping
 
 # Impact speeds between which the damping is linear, m/s.
-_SLOW, _FAST = 1.0, 4.0
+_SLOW, _MIDDLE, _FAST = 1.0, IMPACT_SPEED, 4.0
 # A ball whose gap to the paddle is smaller may touch it: the gap is that of a level paddle, m.
 _NEAR = 0.01
 
@@ -23,7 +23,7 @@ class Impact(NamedTuple):
     speed: jax.Array
     """Speed of approach [] at the last control step before a contact, m/s."""
     damping: jax.Array
-    """Damping [2] of the contact in a slow and in a fast impact, 1/s."""
+    """Damping [3] of the contact in a slow, a medium and a fast impact, 1/s."""
 
 
 def first_impact(world: World, stiffness: float) -> Impact:
@@ -32,7 +32,7 @@ def first_impact(world: World, stiffness: float) -> Impact:
     Args:
       stiffness: of the contact, 1/s^2.
     """
-    speeds = jnp.array([_SLOW, _FAST], world["restitution"].dtype)
+    speeds = jnp.array([_SLOW, _MIDDLE, _FAST], world["restitution"].dtype)
     restitution = world["restitution"] - world["restitution_slope"] * (speeds - IMPACT_SPEED)
     return Impact(jnp.zeros_like(restitution[0]), contact_damping(restitution, stiffness))
 
@@ -51,6 +51,9 @@ def next_impact(impact: Impact, gap: jax.Array, speed: jax.Array) -> Impact:
 
 def damping(impact: Impact) -> jax.Array:
     """Damping [] of the contact, 1/s."""
-    slow, fast = impact.damping[0], impact.damping[1]
-    share = (impact.speed - _SLOW) / (_FAST - _SLOW)
-    return jnp.maximum(slow + share * (fast - slow), 0.0)
+    slow, middle, fast = (impact.damping[i] for i in range(3))
+    faster = impact.speed - _MIDDLE
+    rise = jnp.where(
+        faster < 0.0, (middle - slow) / (_MIDDLE - _SLOW), (fast - middle) / (_FAST - _MIDDLE)
+    )
+    return jnp.maximum(middle + faster * rise, 0.0)

@@ -123,7 +123,8 @@ class PlaygroundBounceBall(MjxEnv):
         physics = PhysicsState(data.qpos, data.qvel, data.act)
         before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
-        ctrl = self.task.servo_targets(physics, jnp.clip(action, -1.0, 1.0), last=data.task.ctrl)
+        acted = after.pipeline_state.last_action
+        ctrl = self.task.servo_targets(physics, acted, last=data.task.ctrl)
         data = data.replace(
             **after.pipeline_state.physics._asdict(),
             time=data.time + self.task.dt,
