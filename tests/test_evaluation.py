@@ -31,7 +31,13 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.gaussian import Gaussian
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.reports.tables import details_line, results_markdown, results_table, seeds_table
+from bounce_mjx.reports.tables import (
+    details_line,
+    results_markdown,
+    results_table,
+    seeds_table,
+    unsolved_line,
+)
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.tasks.registry import find_task
@@ -377,6 +383,18 @@ def test_readme_shows_the_table_as_it_is_printed(env):
     results = [dataclasses.replace(r, value=v) for r, v in zip(report.results, values, strict=True)]
     rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()[1:]
     assert "".join(f"    {row.rstrip()}\n" for row in rows) == table
+
+
+def test_a_policy_that_misses_a_result_gets_advice(env):
+    report = judge(env, statistics())
+    assert unsolved_line(report) == ""
+    results = list(report.results)
+    results[SPEED] = dataclasses.replace(results[SPEED], value=1.62, passed=False)
+    line = unsolved_line(Report(tuple(results), report.details))
+    assert line.startswith("not solved: upward speed 1.62 (0.1 to 1.5); ")
+    assert line.endswith("try --seed or --num-seeds 8")
+    results[SPEED] = dataclasses.replace(results[SPEED], passed=None)
+    assert unsolved_line(Report(tuple(results), report.details)) == ""
 
 
 def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):

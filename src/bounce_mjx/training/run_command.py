@@ -12,7 +12,7 @@ from bounce_mjx.config.command_line import stdout
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, install_command, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
-from bounce_mjx.reports.tables import details_line, results_table, seeds_table
+from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.tasks.registry import is_file
@@ -71,6 +71,8 @@ def print_results(seeds: Sequence[SeedRun], console: Console) -> SeedRun:
         steps = best.progress.best_steps
         console.print(results_table(best.report, f"best checkpoint, {steps:,} steps"))
         say(console, details_line(best.report))
+    if unsolved := unsolved_line(best.report):
+        say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
     say(console, f"time: {spent}")
     label = "run" if len(seeds) == 1 else f"best seed: {best.config.seed}  run"
