@@ -18,6 +18,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 
+import rest_task
 from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
@@ -306,6 +307,26 @@ def test_copies_and_pickles_continue_the_episodes(vectorised, single):
             assert data_equivalence(twin.step(action), expected, exact=True)
             assert data_equivalence(twin.render(), env.render(), exact=True)
             twin.close()
+
+
+def test_a_pickle_brings_the_file_of_its_task_to_another_process(tmp_path, monkeypatch):
+    """As in Ray's workers. A file that has changed since is another task."""
+    source = tmp_path / "my_task.py"
+    shutil.copy(rest_task.__file__, source)
+    env = gymnasium.make(TASK_ID, task=f"{source}:Rest")
+    pickled = pickle.dumps(env)
+    script = """
+import pickle, sys
+env = pickle.load(sys.stdin.buffer).unwrapped
+print(type(env.task.task).__name__, env.task.config.reward)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, input=pickled)
+    assert done.stdout.startswith(b"Rest still=StillReward("), done.stderr
+    source.write_text(source.read_text() + "# Edited.")
+    assert pickle.loads(pickled).spec == env.spec
+    monkeypatch.delitem(sys.modules, type(env.get_wrapper_attr("task").task).__module__)
+    with pytest.raises(UserError, match="is not the one with which the environment was pickled"):
+        pickle.loads(pickled)
 
 
 def test_wrappers_work_on_the_vector(vectorised):
