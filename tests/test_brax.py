@@ -57,8 +57,15 @@ def test_brax_makes_the_environment():
 
 
 def test_unknown_settings_are_refused():
-    with pytest.raises(UserError, match="bounce_ball: unknown key backend"):
-        brax.envs.get_environment("bounce_ball", backend="positional")
+    with pytest.raises(UserError, match="bounce_ball: unknown key debug"):
+        brax.envs.get_environment("bounce_ball", debug=True)
+
+
+def test_an_engine_of_brax_is_not_used():
+    """PureJaxRL's `BraxGymnaxWrapper` names one."""
+    with pytest.warns(UserWarning, match="'positional', but .* its own engine 'fused'"):
+        env = brax.envs.get_environment("bounce_ball", backend="positional")
+    assert env.backend == "fused"
 
 
 def test_the_bare_environment_refuses_randomization_by_brax(env):

@@ -18,9 +18,9 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 
-from bounce_mjx import EnvConfig
+import rest_task
 from bounce_mjx.adapters.gymnasium import batch, environments
-from bounce_mjx.adapters.gymnasium.registration import ENV_ID, EPISODE_STEPS
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
@@ -37,7 +37,7 @@ NOTHING = np.zeros((NUM_ENVS, 6), np.float32)
 
 @pytest.fixture(scope="module")
 def single(opengl):
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array", max_episode_steps=LIMIT)
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array", episode_seconds=0.01 * LIMIT)
     yield env
     env.close()
 
@@ -58,15 +58,21 @@ def make_vec(mode=AutoresetMode.NEXT_STEP, **settings) -> gymnasium.vector.Vecto
 
 
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_a_time_limit_beyond_gymnasiums_is_told(make) -> None:
-    with pytest.warns(UserWarning, match="3000 steps, but .* 2000; pass max_episode_steps=3000"):
-        make(ENV_ID, episode_seconds=30).close()
-
-
-def test_a_longer_time_limit_with_gymnasiums_is_not_told() -> None:
+@pytest.mark.parametrize(
+    "settings, steps",
+    [
+        ({}, 2000),
+        ({"task": "catch"}, 300),
+        ({"control_dt": 0.02}, 1000),
+        ({"episode_seconds": 30}, 3000),
+        ({"episode_seconds": 30, "max_episode_steps": 2500}, 2500),
+    ],
+)
+def test_the_time_limit_is_that_of_the_config(make, settings, steps) -> None:
+    """Gymnasium's wrappers read it from the spec."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        gymnasium.make_vec(ENV_ID, episode_seconds=30, max_episode_steps=3000).close()
+        assert make(TASK_ID, **settings).spec.max_episode_steps == steps
 
 
 def make_sync(mode, wrap=lambda env: env) -> SyncVectorEnv:
@@ -128,10 +134,10 @@ def test_each_task_of_the_package_has_a_name() -> None:
     own = {
         name for name in registered_tasks() if find_task(name).__module__.startswith("bounce_mjx")
     }
-    assert own == {*EPISODE_STEPS, "bounce"}
-    for name in EPISODE_STEPS:
-        spec = gymnasium.spec(f"bounce_mjx/{name.title()}-v0")
-        assert spec.max_episode_steps == find_task(name).Config().episode_steps
+    assert own == {*TASKS, "bounce"}
+    for name in TASKS:
+        env = gymnasium.make(f"bounce_mjx/{name.title()}-v0")
+        assert isinstance(env.get_wrapper_attr("task").task, find_task(name))
     env = gymnasium.make("bounce_mjx/Juggle-v0")
     observation, _ = env.reset(seed=0, options={"target_height": 0.5})
     layout = env.get_wrapper_attr("task").layout
@@ -146,7 +152,6 @@ def test_spaces_and_attributes_equal_the_specification(single, vectorised):
     assert vectorised.single_action_space == action
     assert vectorised.single_observation_space == observation
     assert vectorised.action_space.shape == (NUM_ENVS, 6)
-    assert gymnasium.spec(ENV_ID).max_episode_steps == EnvConfig().episode_steps
     for env in (single, vectorised):
         assert env.unwrapped.mj_model.nu == 6 and env.metadata["render_fps"] == 100
     assert single.get_wrapper_attr("dt") == vectorised.dt == 0.01
@@ -259,6 +264,7 @@ def test_unknown_arguments_are_a_type_error(arguments, sentence):
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"autoreset_mode": "never"}, "autoreset_mode is 'never'; choose one of 'NextStep', 'S"),
         ({"max_episode_steps": 0}, "max_episode_steps is 0, but must be a whole number"),
+        ({"max_episode_steps": 3000}, "lasts 2000 steps, .* give episode_seconds=30 instead"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
         ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
         ({"render_mode": "rgb_array", "width": 0}, "width is 0, but must be a whole number"),
@@ -301,6 +307,26 @@ def test_copies_and_pickles_continue_the_episodes(vectorised, single):
             assert data_equivalence(twin.step(action), expected, exact=True)
             assert data_equivalence(twin.render(), env.render(), exact=True)
             twin.close()
+
+
+def test_a_pickle_brings_the_file_of_its_task_to_another_process(tmp_path, monkeypatch):
+    """As in Ray's workers. A file that has changed since is another task."""
+    source = tmp_path / "my_task.py"
+    shutil.copy(rest_task.__file__, source)
+    env = gymnasium.make(TASK_ID, task=f"{source}:Rest")
+    pickled = pickle.dumps(env)
+    script = """
+import pickle, sys
+env = pickle.load(sys.stdin.buffer).unwrapped
+print(type(env.task.task).__name__, env.task.config.reward)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, input=pickled)
+    assert done.stdout.startswith(b"Rest still=StillReward("), done.stderr
+    source.write_text(source.read_text() + "# Edited.")
+    assert pickle.loads(pickled).spec == env.spec
+    monkeypatch.delitem(sys.modules, type(env.get_wrapper_attr("task").task).__module__)
+    with pytest.raises(UserError, match="is not the one with which the environment was pickled"):
+        pickle.loads(pickled)
 
 
 def test_wrappers_work_on_the_vector(vectorised):

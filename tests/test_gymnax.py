@@ -1,5 +1,6 @@
 """The gymnax interface, and the example of PureJaxRL."""
 
+import functools
 import runpy
 import sys
 import types
@@ -21,23 +22,35 @@ def env() -> PureJaxRLBounceBall:
     return PureJaxRLBounceBall(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
 
 
+@pytest.fixture
+def gymnax(need, monkeypatch):
+    # gymnax imports its own environments, one of which has seaborn's colours.
+    monkeypatch.setitem(sys.modules, "seaborn", types.ModuleType("seaborn"))
+    need("gymnax")
+    return need("gymnax.wrappers")
+
+
 @pytest.mark.slow
 def test_steps_are_those_of_the_task_until_the_time_limit(env):
     """The plain environment is the reference; at the limit the observation is a new episode's, and
-    the last one is in the info."""
-    observation, state = jax.jit(env.reset)(jax.random.key(0))
+    the last one is in the info of gymnax's form. PureJaxRL, which keeps every info, gets none of
+    it."""
+    observation, state = env.reset(jax.random.key(0))
     plain = jax.jit(env.task.reset)(jax.random.key(0))
     np.testing.assert_array_equal(observation, plain.obs)
-    step, plain_step = jax.jit(env.step), jax.jit(env.task.step)
+    plain_step = jax.jit(env.task.step)
+    step = functools.partial(GymnaxBounceBall.step, env)
     assert env.default_params.max_steps_in_episode == LIMIT
     for i in range(LIMIT):
-        action = env.action_space().sample(jax.random.key(i))
-        observation, state, reward, done, info = step(jax.random.key(10 + i), state, action)
+        action = 0.1 * jax.random.normal(jax.random.key(i), (6,))
+        given = jax.random.key(10 + i), state, action
+        *_, done, purejaxrl_info = env.step(*given)
+        observation, state, reward, terminated, truncated, info = step(*given)
         plain = plain_step(plain, action)
         np.testing.assert_allclose(info["final_observation"], plain.obs, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(reward, plain.reward, rtol=1e-5)
-        assert bool(done) == bool(info["truncated"]) == (i == LIMIT - 1)
-        assert not info["terminated"]
+        assert bool(done) == bool(truncated) == (i == LIMIT - 1) and not terminated
+        assert purejaxrl_info == {"terminated": terminated, "truncated": truncated}
     # The target height never changes within an episode.
     assert observation[28] != info["final_observation"][28]
     assert state.time == 0
@@ -47,32 +60,33 @@ def test_steps_are_those_of_the_task_until_the_time_limit(env):
 
 def test_the_parameters_set_the_time_limit_and_a_fall_terminates(env):
     """In the form of gymnax 1.x, whose steps tell the two ends apart."""
-    gymnax_env = GymnaxBounceBall()
-    params = gymnax_env.default_params._replace(max_steps_in_episode=1000)
-    _, state = gymnax_env.reset(jax.random.key(0), params)
+    step = functools.partial(GymnaxBounceBall.step, env)
+    params = env.default_params.replace(max_steps_in_episode=1)
+    _, state = env.reset(jax.random.key(0), params)
+    *_, terminated, truncated, _ = step(jax.random.key(1), state, jnp.zeros(6), params)
+    assert truncated and not terminated
     under = state.env.pipeline_state.physics
     under = under._replace(qpos=under.qpos.at[8].set(0.0))
-    state = state._replace(
+    state = state.replace(
         env=state.env.replace(pipeline_state=state.env.pipeline_state._replace(physics=under))
     )
-    _, _, _, terminated, truncated, _ = gymnax_env.step(
-        jax.random.key(1), state, jnp.zeros(6), params
-    )
+    *_, terminated, truncated, _ = step(jax.random.key(1), state, jnp.zeros(6), params)
     assert terminated and not truncated
 
 
-def test_spaces_and_settings(env):
+def test_spaces_and_settings(env, gymnax):
+    """The spaces are gymnax's own, which its wrappers ask for."""
     assert env.observation_space().shape == (29,) and env.num_actions == 6
+    assert gymnax.FlattenObservationWrapper(env).observation_space(None).shape == (29,)
     actions = jax.vmap(env.action_space().sample)(jax.random.split(jax.random.key(0), 100))
-    assert actions.shape == (100, 6) and np.abs(actions).max() <= 1.0 and np.ptp(actions) > 1.9
+    assert actions.shape == (100, 6) and np.ptp(actions) > 1.9
+    assert env.action_space().contains(actions) and not env.action_space().contains(2.0 * actions)
     with pytest.raises(UserError, match="unknown key target_hight_range"):
         GymnaxBounceBall(target_hight_range=(0.3, 0.4))
 
 
-def test_gymnax_own_wrapper_logs_episodes(need, monkeypatch):
-    # gymnax imports its own environments, one of which has seaborn's colours.
-    monkeypatch.setitem(sys.modules, "seaborn", types.ModuleType("seaborn"))
-    wrapped = need("gymnax.wrappers").LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
+def test_gymnax_own_wrapper_logs_episodes(gymnax):
+    wrapped = gymnax.LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
     _, state = wrapped.reset(jax.random.key(0))
     rewards = []
     for i in range(2):
@@ -80,6 +94,19 @@ def test_gymnax_own_wrapper_logs_episodes(need, monkeypatch):
         rewards.append(float(reward))
     assert truncated and info["returned_episode_lengths"] == 2
     np.testing.assert_allclose(info["returned_episode_returns"], sum(rewards), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_gymnax_own_vector_for_gymnasium_steps(gymnax):
+    """It replaces the environment's functions by batched ones."""
+    envs = gymnax.GymnaxToVectorGymWrapper(GymnaxBounceBall(episode_seconds=0.02), 2)
+    first, _ = envs.reset(seed=0)
+    assert envs.single_observation_space.shape == (29,)
+    for _ in range(2):
+        following, _, _, truncated, info = envs.step(np.zeros((2, 6), np.float32))
+    assert first.shape == following.shape == (2, 29) and truncated.all()
+    # A new episode has another target.
+    assert not np.any(following[:, 28] == info["final_observation"][:, 28])
 
 
 @pytest.mark.slow

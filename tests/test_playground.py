@@ -22,7 +22,9 @@ from mujoco_playground import manipulation, registry, wrapper
 from mujoco_playground._src import mjx_env
 from mujoco_playground.config import manipulation_params
 
+from bounce_mjx.adapters.gymnasium.registration import TASKS
 from bounce_mjx.adapters.playground import PlaygroundBounceBall
+from bounce_mjx.tasks.registry import find_task
 
 ENV_NAME = "BounceBall"
 
@@ -69,6 +71,24 @@ def test_playground_has_its_ppo_parameters():
     assert parameters.batch_size * parameters.num_minibatches == parameters.num_envs
     other = manipulation_params.brax_ppo_config("PandaPickCube", "jax")
     assert other.num_envs != parameters.num_envs
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_playground_has_the_other_tasks(task):
+    """With their time limits, their own PPO parameters, and worlds of their model."""
+    name = f"BounceMjx{task.title()}"
+    assert name in registry.ALL_ENVS
+    env = registry.load(name)
+    assert isinstance(env.task.task, find_task(task))
+    limit = find_task(task).Config().episode_steps
+    assert registry.get_default_config(name).episode_length == limit
+    parameters = manipulation_params.brax_ppo_config(name)
+    bounce = manipulation_params.brax_ppo_config(ENV_NAME)
+    assert parameters.episode_length == limit and parameters.num_timesteps != bounce.num_timesteps
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    model, axes = registry.get_domain_randomizer(name)(env.mjx_model, keys)
+    worlds = wrapper.wrap_for_brax_training(env, randomization_fn=lambda _: (model, axes))
+    assert jax.eval_shape(worlds.reset, keys).obs.shape == (2, env.observation_size)
 
 
 def test_randomization_by_playground_acts_on_the_physics():

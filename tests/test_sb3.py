@@ -87,6 +87,13 @@ def test_attributes_and_methods_reach_single_environments(envs):
         Sb3VecEnv(2, frameskip=2)
 
 
+@pytest.mark.parametrize(
+    "settings, steps", [({"task": "catch"}, 300), ({"episode_seconds": 30}, 3000)]
+)
+def test_the_time_limit_is_that_of_the_config(settings, steps):
+    assert Sb3VecEnv(2, **settings)._batch.episode_steps == steps
+
+
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
 REPLAY_SETTINGS = {"learning_starts": 30, "batch_size": 16}
 

@@ -1,48 +1,42 @@
-"""The environment with the interface of gymnax, which PureJaxRL also uses; gymnax is not needed.
+"""The environment with the interface of gymnax, which PureJaxRL also uses; only the spaces need
+gymnax.
 
 The functions are pure and take one environment: apply `jax.vmap` to batch them.
 """
 
-import dataclasses
-from typing import Any, NamedTuple
+import functools
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
+from bounce_mjx.errors import needed
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 
+if TYPE_CHECKING:
+    from gymnax.environments.spaces import Box
 
-class EnvParams(NamedTuple):
+
+@struct.dataclass
+class EnvParams:
     """Parameters of the environment."""
 
     max_steps_in_episode: int | jax.Array
     """Time limit in control steps."""
 
 
-class EnvState(NamedTuple):
+@struct.dataclass
+class EnvState:
     """State of one environment."""
 
     env: State
     time: jax.Array
     """Control steps since the reset [], int32."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Box:
-    """Arrays of one shape with entries from `low` to `high`."""
-
-    low: float
-    high: float
-    shape: tuple[int, ...]
-    dtype: Any = jnp.float32
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """A uniform draw of a bounded box."""
-        return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
 
 
 class GymnaxBounceBall:
@@ -67,23 +61,25 @@ class GymnaxBounceBall:
         self.num_actions = self.task.action_size
         """Length of the action vector."""
 
-    def action_space(self, params: EnvParams | None = None) -> Box:
+    def action_space(self, params: EnvParams | None = None) -> "Box":
         """The space of the actions."""
-        return Box(-1.0, 1.0, (self.task.action_size,))
+        return _box(1.0, self.task.action_size)
 
-    def observation_space(self, params: EnvParams | None = None) -> Box:
+    def observation_space(self, params: EnvParams | None = None) -> "Box":
         """The space of the observations, which has no limits."""
-        return Box(-jnp.inf, jnp.inf, (self.task.observation_size,))
+        return _box(jnp.inf, self.task.observation_size)
 
+    @functools.partial(jax.jit, static_argnames="self")
     def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, EnvState]:
         """Starts an episode; consumes the key.
 
         Returns:
           The observation [N] and the state.
         """
-        state = self.task.reset(key)
-        return state.obs, EnvState(state, jnp.zeros((), jnp.int32))
+        state = self._start(key)
+        return state.env.obs, state
 
+    @functools.partial(jax.jit, static_argnames="self")
     def step(
         self,
         key: jax.Array,
@@ -98,22 +94,29 @@ class GymnaxBounceBall:
 
         Returns:
           The observation [N] for the next action, the state, the reward [], whether the task ended
-          the episode [], whether only the time limit ended it [], and an info: the metrics of the
-          step and the `final_observation` [N] before any reset.
+          the episode [], whether only the time limit ended it [], and an info: both ends, the
+          `final_observation` [N] before any reset, and the metrics of the step.
         """
         limit = (params or self.default_params).max_steps_in_episode
         stepped = self.task.step(state.env, action)
         time = state.time + 1
         terminated = stepped.done > 0
         truncated = (time >= limit) & ~terminated
-        _, fresh = self.reset(key)
         next_state = jax.tree.map(
             lambda new, old: jnp.where(terminated | truncated, new, old),
-            fresh,
+            self._start(key),
             EnvState(stepped, time),
         )
-        info = stepped.metrics | {"final_observation": stepped.obs}
+        info = stepped.metrics | {
+            "terminated": terminated,
+            "truncated": truncated,
+            "final_observation": stepped.obs,
+        }
         return next_state.env.obs, next_state, stepped.reward, terminated, truncated, info
+
+    def _start(self, key: jax.Array) -> EnvState:
+        # Apart from `reset`, which gymnax's GymnaxToVectorGymWrapper replaces.
+        return EnvState(self.task.reset(key), jnp.zeros((), jnp.int32))
 
 
 class PureJaxRLBounceBall(GymnaxBounceBall):
@@ -126,10 +129,16 @@ class PureJaxRLBounceBall(GymnaxBounceBall):
         action: jax.Array,
         params: EnvParams | None = None,
     ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, dict[str, Any]]:
-        """As in `GymnaxBounceBall`, but with one `done` [] for both ends; the info also holds
-        `terminated` and `truncated`."""
-        observation, state, reward, terminated, truncated, info = super().step(
+        """As in `GymnaxBounceBall`, but with one `done` [] for both ends. The info has only
+        `terminated` and `truncated`, because PureJaxRL keeps that of every step of a training."""
+        observation, state, reward, terminated, truncated, _ = super().step(
             key, state, action, params
         )
-        info |= {"terminated": terminated, "truncated": truncated}
+        info = {"terminated": terminated, "truncated": truncated}
         return observation, state, reward, terminated | truncated, info
+
+
+def _box(limit: float, size: int) -> "Box":
+    with needed("gymnax", "gymnax"):
+        from gymnax.environments.spaces import Box
+    return Box(-limit, limit, (size,))

@@ -15,7 +15,6 @@ with needed("Stable-Baselines3", "bounce_mjx[sb3]"):
 
 from bounce_mjx.adapters.gymnasium.batch import checked_commands
 from bounce_mjx.adapters.gymnasium.environments import TaskEnv, TaskVectorEnv
-from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 
 _SHOWN = 4
 
@@ -31,13 +30,13 @@ class Sb3VecEnv(VecEnv):
     def __init__(
         self,
         num_envs: int = 256,
-        max_episode_steps: int | None = MAX_EPISODE_STEPS,
+        max_episode_steps: int | None = None,
         **settings: Any,
     ):
         """Makes the environments; the first reset compiles them.
 
         Args:
-          max_episode_steps: time limit of an episode in steps.
+          max_episode_steps: a shorter time limit than the config's, in steps.
           settings: other arguments of `TaskVectorEnv`, such as episode_seconds=30. Of pictures, the
             first four environments are tiled.
 

@@ -4,6 +4,7 @@ A task in a file is code, which runs only if the user names the file. Code is kn
 a run's copy of a file that the user has named is the same task.
 """
 
+import copyreg
 import difflib
 import hashlib
 import importlib
@@ -157,7 +158,29 @@ def _from_file(name: str) -> type[Task]:
                 f"the task's file {path} cannot be imported ({type(error).__name__} in "
                 f"line {line}: {shorten(str(error), 300)}); correct it"
             ) from error
-    return _class_in(sys.modules[module_name], name)
+    task = _class_in(sys.modules[module_name], name)
+    if task.__module__ == module_name:
+        copyreg.pickle(task.Config, _pickled)
+    return task
+
+
+def _pickled(config: WorldConfig) -> tuple:
+    """A pickled config names the task's file first, which another process imports before it reads
+    the rest: the settings, and what follows the config in an environment."""
+    task = type(config).task
+    return _unpickled, (task_name(task), task.__module__), config.__getstate__()
+
+
+def _unpickled(name: str, module_name: str) -> WorldConfig:
+    """A config without its settings, of the task in a file."""
+    module = sys.modules.get(module_name)
+    task = find_task(name) if module is None else _class_in(module, name)
+    if task.__module__ != module_name:
+        raise UserError(
+            f"the task's file {source_file(name)} is not the one with which the environment was "
+            "pickled; restore it"
+        )
+    return task.Config.__new__(task.Config)
 
 
 def _class_in(module: types.ModuleType, name: str) -> type[Task]:

@@ -80,6 +80,7 @@ class BraxBounceBall(brax.envs.Env):
         self,
         config: WorldConfig | None = None,
         task: str | type[Task] = DEFAULT,
+        backend: str | None = None,
         **settings: Any,
     ):
         """Makes the environment.
@@ -87,6 +88,7 @@ class BraxBounceBall(brax.envs.Env):
         Args:
           config: all settings; None for the defaults of the task.
           task: its class, its name, or FILE.py:CLASS, if there is no config.
+          backend: one of brax's engines, as brax's environments take it; it has no effect.
           settings: fields of the task's config, such as episode_seconds=30, which replace fields of
             `config`.
 
@@ -98,6 +100,12 @@ class BraxBounceBall(brax.envs.Env):
         self.task = Env(validate(kind, given | settings, ENV_NAME))
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
+        if backend not in (None, self.backend):
+            warnings.warn(
+                f"backend is {backend!r}, but {ENV_NAME} computes with its own engine "
+                f"{self.backend!r}, which the setting physics chooses",
+                stacklevel=2,
+            )
         self._model = _Model(self.mj_model)
         self._base: brax.base.System | None = None
         self._sys: brax.base.System | None = None

@@ -37,9 +37,9 @@ def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
     )
 
 
-def network_settings() -> dict[str, Any]:
-    """Keyword arguments of brax's `make_ppo_networks`, from `configs/default.yaml`."""
-    ppo = load_config(resource_path("configs/default.yaml")).ppo
+def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
+    """Keyword arguments of brax's `make_ppo_networks`, from a config or `configs/default.yaml`."""
+    ppo = (config or load_config(resource_path("configs/default.yaml"))).ppo
     return dict(
         policy_hidden_layer_sizes=ppo.hidden_layers,
         value_hidden_layer_sizes=ppo.hidden_layers,

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.adapters.gymnasium.registration import MAX_EPISODE_STEPS
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
@@ -26,7 +25,6 @@ from bounce_mjx.tasks.registry import task_config
 from bounce_mjx.training.setup import cache_compilations
 from bounce_mjx.world.config import Command, WorldConfig
 
-_NO_LIMIT = 2**31 - 1
 # The process in which a program has run. JAX's threads are lost when this process forks.
 _jax_process: int | None = None
 
@@ -82,26 +80,25 @@ class Batch:
         Args:
           task: its class, or a name as for `find_task`.
           settings: fields of its config.
-          max_episode_steps: time limit of an episode in steps; None or -1 for no limit other than
-            a given `episode_seconds`.
+          max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
+            config's.
 
         Raises:
           UserError: a setting is wrong; if its name is unknown, the error is a TypeError too.
         """
         self.config = _task_config(task, settings)
-        self.num_envs = _whole("num_envs", num_envs, at_least=1)
-        limits = [_NO_LIMIT]
+        self.num_envs = _whole("num_envs", num_envs)
+        self.episode_steps = self.config.episode_steps
+        """Time limit of an episode in steps."""
         if max_episode_steps not in (None, -1):
-            limits.append(_whole("max_episode_steps", max_episode_steps, at_least=1))
-        if "episode_seconds" in settings:
-            limits.append(self.config.episode_steps)
-        self._limit = min(limits)
-        steps, made = self.config.episode_steps, max_episode_steps or MAX_EPISODE_STEPS
-        if "episode_seconds" in settings and 0 < made < steps:
-            gymnasium.logger.warn(
-                f"episode_seconds={self.config.episode_seconds:g} is {steps} steps, but gymnasium "
-                f"ends an episode after {made}; pass max_episode_steps={steps} too"
-            )
+            given = _whole("max_episode_steps", max_episode_steps)
+            if given > self.episode_steps:
+                raise UserError(
+                    f"max_episode_steps is {given}, but an episode lasts {self.episode_steps} "
+                    f"steps, which it can only shorten; give "
+                    f"episode_seconds={given * self.config.control_dt:g} instead"
+                )
+            self.episode_steps = given
         self._episodes: _Episodes | None = None
 
     @property
@@ -165,7 +162,7 @@ class Batch:
         if reset_before is None:
             reset_before = np.zeros(self.num_envs, bool)
         self._episodes, packed = self._programs.step(
-            self._episodes, actions, self._limit, reset_before, reset_after
+            self._episodes, actions, self.episode_steps, reset_before, reset_after
         )
         packed, size = np.asarray(packed), self.task.observation_size
         # Other libraries refuse views with strides.
@@ -358,13 +355,13 @@ def checked_commands(
     }
 
 
-def _whole(name: str, value: Any, at_least: int) -> int:
+def _whole(name: str, value: Any) -> int:
     try:
         number = operator.index(value)
     except TypeError:
         number = None
-    if number is None or not at_least <= number < _NO_LIMIT:
-        raise UserError(f"{name} is {value!r}, but must be a whole number of at least {at_least}")
+    if number is None or number < 1:
+        raise UserError(f"{name} is {value!r}, but must be a whole number of at least 1")
     return number
 
 

@@ -5,6 +5,7 @@ tensors that stay on JAX's device. Keyword arguments are the
 settings of the task's config.
 """
 
+import dataclasses
 import multiprocessing
 import time
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -32,13 +34,11 @@ from bounce_mjx.tasks.registry import DEFAULT
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment.
-
-    `gymnasium.make` ends its episodes after `max_episode_steps` steps, 2,000 by default, also where
-    a given `episode_seconds` is longer. Without it, only a given `episode_seconds` limits them.
-    """
+    """One environment. The config's `episode_seconds` limit its episodes; the argument
+    `max_episode_steps` of `gymnasium.make` can only shorten them."""
 
     metadata = {"render_modes": ["rgb_array"]}
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -68,6 +68,15 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = action_space(self.task)
         self.observation_space = observation_space(self.task)
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made the environment, with its time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec) -> None:
+        self._spec = dataclasses.replace(spec, max_episode_steps=self._batch.episode_steps)
 
     @property
     def task(self) -> Env:
@@ -134,6 +143,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     """
 
     metadata = {"render_modes": ["rgb_array"]}
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -150,7 +160,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         """Makes `num_envs` environments; the other arguments are as in `TaskEnv`.
 
         Args:
-          max_episode_steps: time limit of an episode in steps; `gymnasium.make_vec` gives 2000.
+          max_episode_steps: a shorter time limit than the config's, in steps.
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
         """
@@ -170,7 +180,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._ended = np.zeros(num_envs, bool)
         self._statistics = EpisodeStatistics(num_envs)
 
-    task, dt, mj_model = TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
+    spec, task, dt, mj_model = TaskEnv.spec, TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
 
     def reset(
         self,

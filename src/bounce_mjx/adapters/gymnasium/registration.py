@@ -8,12 +8,9 @@ ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
 """Name of any other one, with the argument `task`."""
-MAX_EPISODE_STEPS = 2000
-"""Steps of their episodes. Constants, because reading a config takes time at each import of
-Gymnasium."""
-EPISODE_STEPS = {"balance": 2000, "catch": 300, "juggle": 2000, "track": 2000}
-"""Steps of an episode of the package's other tasks, which have names such as
-bounce_mjx/Juggle-v0."""
+TASKS = ("balance", "catch", "juggle", "track")
+"""The package's other tasks, which have names such as bounce_mjx/Juggle-v0. A constant, because
+finding tasks takes time at each import of Gymnasium."""
 _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
@@ -34,14 +31,13 @@ def register() -> None:
     """Adds the environments to Gymnasium's registry; their classes are imported on first use."""
     import gymnasium
 
-    environments = dict.fromkeys((ENV_ID, TASK_ID), (MAX_EPISODE_STEPS, {}))
-    for task, steps in EPISODE_STEPS.items():
-        environments[f"bounce_mjx/{task.title()}-v0"] = steps, {"task": task}
-    for name, (steps, arguments) in environments.items():
+    arguments = {ENV_ID: {}, TASK_ID: {}}
+    arguments |= {f"bounce_mjx/{task.title()}-v0": {"task": task} for task in TASKS}
+    for name, given in arguments.items():
+        # Without max_episode_steps, because the environment keeps its config's time limit.
         gymnasium.register(
             name,
             entry_point=f"{_MODULE}:TaskEnv",
             vector_entry_point=f"{_MODULE}:TaskVectorEnv",
-            max_episode_steps=steps,
-            kwargs=arguments,
+            kwargs=given,
         )

@@ -1,4 +1,5 @@
-"""MuJoCo Playground: importing this package registers the environment as "BounceBall".
+"""MuJoCo Playground: importing this package registers the environment as "BounceBall", and those
+of the other tasks, such as "BounceMjxCatch".
 
 `python -m bounce_mjx.adapters.playground --env_name=BounceBall` is Playground's `train-jax-ppo`.
 """

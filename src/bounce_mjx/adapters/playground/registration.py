@@ -1,5 +1,7 @@
-"""The environment in MuJoCo Playground's registry."""
+"""The environments in MuJoCo Playground's registry."""
 
+import functools
+from pathlib import Path
 from typing import Any
 
 from ml_collections import config_dict
@@ -8,59 +10,75 @@ from mujoco_playground.config import manipulation_params
 
 from bounce_mjx.adapters import randomization
 from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
+from bounce_mjx.adapters.gymnasium.registration import TASKS
 from bounce_mjx.adapters.playground.environment import (
     ENV_NAME,
     PlaygroundBounceBall,
     default_config,
 )
 from bounce_mjx.robot.model import load_model
+from bounce_mjx.runs.config import read_preset
+from bounce_mjx.tasks.registry import DEFAULT, task_config
+
+ENVIRONMENTS = {ENV_NAME: DEFAULT} | {f"BounceMjx{task.title()}": task for task in TASKS}
+"""The package's tasks by their names in the registry."""
 
 
 def register() -> None:
-    """Adds the environment, its domain randomisation and its PPO parameters.
+    """Adds the environments, their domain randomisation and their PPO parameters.
 
     Playground's registry has no functions for the last two. It also fetches the robots of its own
-    environments over the network before it loads any environment; this one does not need them.
+    environments over the network before it loads any environment; these do not need them.
     """
     if ENV_NAME in manipulation.ALL_ENVS:
         return
-    manipulation.register_environment(ENV_NAME, PlaygroundBounceBall, default_config)
-    registry.ALL_ENVS = (*registry.ALL_ENVS, ENV_NAME)
+    for name, task in ENVIRONMENTS.items():
+        make = functools.partial(PlaygroundBounceBall, task=task)
+        manipulation.register_environment(name, make, functools.partial(default_config, task))
+    registry.ALL_ENVS = (*registry.ALL_ENVS, *ENVIRONMENTS)
     load, randomizer = manipulation.load, manipulation.get_domain_randomizer
     ppo_parameters = manipulation_params.brax_ppo_config
 
     def load_any(env_name: str, config: Any = None, config_overrides: Any = None) -> Any:
-        if env_name == ENV_NAME:
-            return PlaygroundBounceBall(config or default_config(), config_overrides)
+        if env_name in ENVIRONMENTS:
+            return PlaygroundBounceBall(config, config_overrides, ENVIRONMENTS[env_name])
         return load(env_name, config, config_overrides)
 
     def randomizer_of_any(env_name: str) -> Any:
-        return domain_randomize if env_name == ENV_NAME else randomizer(env_name)
+        if env_name in ENVIRONMENTS:
+            return functools.partial(domain_randomize, task=ENVIRONMENTS[env_name])
+        return randomizer(env_name)
 
     def parameters_of_any(env_name: str, impl: str | None = None) -> config_dict.ConfigDict:
-        return brax_ppo_config() if env_name == ENV_NAME else ppo_parameters(env_name, impl)
+        if env_name in ENVIRONMENTS:
+            return brax_ppo_config(ENVIRONMENTS[env_name])
+        return ppo_parameters(env_name, impl)
 
     manipulation.load, manipulation.get_domain_randomizer = load_any, randomizer_of_any
     manipulation_params.brax_ppo_config = parameters_of_any
 
 
-def domain_randomize(model: Any, rng: Any) -> tuple[Any, Any]:
+def domain_randomize(model: Any, rng: Any, task: str = DEFAULT) -> tuple[Any, Any]:
     """The `randomization_fn` of the shipped robot: `adapters.randomization.DEFAULT`.
 
     Args:
       model: `mjx_model` of the environment.
       rng: keys [B].
+      task: name of the environment's task, which has one ball or two.
     """
-    return randomization.domain_randomize(load_model(None, model.opt.timestep), model, rng)
+    num_balls = task_config(task)().num_balls
+    mj_model = load_model(None, model.opt.timestep, num_balls=num_balls)
+    return randomization.domain_randomize(mj_model, model, rng)
 
 
-def brax_ppo_config() -> config_dict.ConfigDict:
-    """brax's PPO parameters, from the project's tuned settings (`adapters/brax/ppo.py`)."""
+def brax_ppo_config(task: str = DEFAULT) -> config_dict.ConfigDict:
+    """brax's PPO parameters, from the tuned settings of a task (`adapters/brax/ppo.py`)."""
+    config = read_preset(Path("default"), task=task)
     return config_dict.create(
         num_evals=10,
         num_eval_envs=128,
         network_factory=config_dict.create(
-            policy_obs_key="state", value_obs_key="state", **network_settings()
+            policy_obs_key="state", value_obs_key="state", **network_settings(config)
         ),
-        **ppo_settings(),
+        **ppo_settings(config),
     )
