@@ -31,6 +31,8 @@ HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
 _RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+# A change of a joint's range that is told, rad or m.
+_NARROWER = 1e-3
 _SILENCE = threading.Lock()
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
@@ -400,7 +402,7 @@ class _Builder:
                     f"the range {own[0]:g} to {own[1]:g} of {joint_name(model, i)}, but a servo "
                     f"that reaches {least:g} to {greatest:g}; correct its ctrlrange"
                 )
-            if (low, high) != (own[0], own[1]):
+            if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
                 narrowed.append(joint_name(model, i))
             joint.range = (low, high) if high < np.inf else np.zeros(2)
             joint.springdamper = np.zeros(2)
