@@ -470,8 +470,8 @@ STYLES = {
 
 @pytest.mark.parametrize("style", STYLES)
 def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
-    """Limits, inertia, springs and servos are those of the file compiled as it is, to the limit of
-    a paddle without mass; also without the geoms that only pictures need."""
+    """Limits, inertia, springs, servos and the site are those of the file compiled as it is, to the
+    limit of a paddle without mass; also without the geoms that only pictures need."""
     path, names = tmp_path / "arm.xml", "abcde"
     path.write_text(STYLES[style])
     config = RobotConfig.model_validate({"site": "tool", "paddle": {"mass": 1e-12}})
@@ -486,6 +486,12 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
     assert ignored == (not limited[4])
 
     rng = np.random.default_rng(0)
+    place = mujoco.MjData(plain)
+    mujoco.mj_kinematics(plain, place)
+    blade = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, blade)
+    tool = place.site("tool").xpos + place.site("tool").xmat.reshape(3, 3) @ config.paddle.position
+    np.testing.assert_allclose(blade.geom("blocker").xpos, tool, atol=1e-9)
     states = rng.uniform(-0.8, 0.8, (3, 5)), rng.uniform(-1.0, 1.0, (3, 5))
     for qpos, qvel in zip(*states, strict=True):
         accelerations = []
