@@ -147,7 +147,7 @@ def _check_as_alone(
         link, alike = model.jnt_bodyid[i], own.model.jnt_bodyid[j]
         bodies = _welded(model, at.arm_joints, link)
         inertia = _summed(model, here, bodies) - added * (model.geom_bodyid[paddle] in bodies)
-        others = _welded(own.model, own.joints, alike, own.removed)
+        others = _welded(own.model, own.joints, alike, own.gripper)
         found[f"the pose of the link of {name}"] = (
             [*here.xpos[link], *here.xmat[link], *here.xaxis[i]],
             [*alone.xpos[alike], *alone.xmat[alike], *alone.xaxis[j]],
@@ -174,15 +174,15 @@ def _at(model: mujoco.MjModel, joints: Sequence[int], angles: Sequence[float]) -
 
 
 def _welded(
-    model: mujoco.MjModel, joints: Sequence[int], link: int, removed: Sequence[int] = ()
+    model: mujoco.MjModel, joints: Sequence[int], link: int, gripper: Sequence[int] = ()
 ) -> list[int]:
-    """A link's bodies: those without another acting joint between."""
+    """A link's bodies, with no other acting joint between, without the gripper's."""
     acting, bodies = {0, *model.jnt_bodyid[list(joints)].tolist()}, []
     for body in range(1, model.nbody):
         owner = body
         while owner not in acting:
             owner = int(model.body_parentid[owner])
-        if owner == link and not is_below(model, body, removed):
+        if owner == link and not is_below(model, body, gripper):
             bodies.append(body)
     return bodies
 

@@ -56,8 +56,8 @@ class Own(NamedTuple):
     model: mujoco.MjModel
     joints: tuple[int, ...]
     """The acting joints in it."""
-    removed: tuple[int, ...]
-    """The bodies in it that the scene lacks."""
+    gripper: tuple[int, ...]
+    """The bodies in it whose subtrees are the gripper, which the scene lacks."""
 
 
 class Arm(NamedTuple):
@@ -233,7 +233,7 @@ class _Builder:
         self._disable_contacts_and_limits(joints)
         scene = self._attach(holder, position, quaternion)
         self._replace_servos(scene, names)
-        own = Own(model, tuple(joints), (*gripper, *objects))
+        own = Own(model, tuple(joints), tuple(gripper))
         return Arm(scene, names, servos, limits, tuple(self._changes), own)
 
     def _chain(self, end: int) -> list[int]:
