@@ -72,6 +72,19 @@ def test_the_model_without_visuals_moves_the_same():
     np.testing.assert_array_equal(*after)
 
 
+@pytest.mark.parametrize(
+    ("solref", "longest"),
+    [("-98696 -31.4", 0.0025), ("-1e6 -60", 0.0031416 / 4), ("0.02 0.1", 0.0062832 / 4)],
+)
+def test_a_step_that_is_long_for_the_contact_is_refused(solref, longest, tmp_path):
+    """Half a period has four steps or more; with fewer, a ball can gain energy."""
+    path = tmp_path / "robot.xml"
+    path.write_text(XML.replace('solref="-98696 -31.4"', f'solref="{solref}"'))
+    assert load_model(path, longest).opt.timestep == longest
+    with pytest.raises(UserError, match=rf"physics_dt {1.1 * longest:g} s .* to {longest:.3g}"):
+        load_model(path, 1.1 * longest)
+
+
 def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
     """MuJoCo refuses to drop such geoms."""
     text = XML.replace('autolimits="true"', 'inertiafromgeom="true"').replace(' mass="0" ', " ")

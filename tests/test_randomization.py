@@ -313,11 +313,13 @@ JOINTS = np.linspace(0.8, 1.3, 6)
 @pytest.fixture
 def drawn_model(float64):
     """Function (values of terms) -> the model of C, and the undrawn model: both with damping of the
-    joints and a gravity along no axis."""
+    joints, a gravity along no axis, and a force limit of two servos."""
     model = mujoco.MjModel.from_xml_string(
         XML.replace("<joint armature", '<joint damping="3" armature')
     )
     model.opt.gravity[:] = [0.5, -1.0, -9.0]
+    model.actuator_forcelimited[:2] = True
+    model.actuator_forcerange[:2] = [(-6.0, 90.0), (-90.0, 90.0)]
 
     def draw(**world) -> tuple[mujoco.MjModel, mujoco.MjModel]:
         arrays = {name: jnp.asarray(value, float) for name, value in world.items()}
@@ -332,6 +334,8 @@ def test_terms_are_factors_sums_and_values_of_the_model(drawn_model) -> None:
         servo_damping=JOINTS[::-1], torque_limit=10.0 * JOINTS, joint_damping=JOINTS,
         joint_frictionloss=5.0 * JOINTS, armature=2.0 * JOINTS, link_mass=JOINTS,
     )  # fmt: skip
+    # A weak servo does not get stronger.
+    limits = np.minimum(10.0 * JOINTS, [6.0, 90.0, *[np.inf] * 4])
     ball, links = model.body("ball_link").id, [model.body(f"Link{i}").id for i in range(1, 7)]
     for new, old in (
         (drawn.body_mass[ball], 1.2 * model.body_mass[ball]),
@@ -342,7 +346,7 @@ def test_terms_are_factors_sums_and_values_of_the_model(drawn_model) -> None:
         (drawn.actuator_gainprm[:, 0], JOINTS * model.actuator_gainprm[:, 0]),
         (drawn.actuator_biasprm[:, 1], JOINTS * model.actuator_biasprm[:, 1]),
         (drawn.actuator_biasprm[:, 2], JOINTS[::-1] * model.actuator_biasprm[:, 2]),
-        (drawn.actuator_forcerange, np.outer(10.0 * JOINTS, [-1.0, 1.0])),
+        (drawn.actuator_forcerange, np.outer(limits, [-1.0, 1.0])),
         (drawn.dof_damping[:6].ravel(), 3.0 + JOINTS),
         (drawn.dof_frictionloss[:6], 5.0 * JOINTS),
         (drawn.dof_armature[:6], 2.0 * JOINTS * model.dof_armature[:6]),

@@ -21,7 +21,9 @@ from bounce_mjx.commands import view as view_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.physics import fused
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot import adopt as adoption
 from bounce_mjx.robot.adopt import adopt
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
@@ -96,6 +98,12 @@ TENDON = mjcf(
     motors("j1 j2 j3 j4 j5") + '<motor tendon="t"/>',
     '<tendon><fixed name="t"><joint joint="j6" coef="1"/></fixed></tendon>',
 )
+# A rod on a passive joint beside the arm, and a welded flange at its end.
+ROD_ARM = arm(tip='<body name="flange"/>').replace(
+    '<body pos="0 0 0.05"><joint name="j2"',
+    '<body name="rod" pos="0 .1 0"><joint name="rod"/><geom size=".02" mass=".1"/>'
+    '<site name="rod_end"/></body><body pos="0 0 0.05"><joint name="j2"',
+)
 BROKEN = {
     "quadruped": (QUADRUPED, "afoot", "9 driven joints (b1, b2", "one arm"),
     "gripper": (GRIPPER, "tool", "too few joints", "0 (none)"),
@@ -137,6 +145,58 @@ BROKEN = {
         "tool",
         "equality constraint",
         "serial",
+    ),
+    "loop of sites": (
+        mjcf(
+            ROD_ARM,
+            motors(ARM_JOINTS),
+            '<equality><connect site1="rod_end" site2="tool"/></equality>',
+        ),
+        "tool",
+        "equality constraint",
+        "serial",
+    ),
+    "loop to a rigid child": (
+        mjcf(
+            ROD_ARM,
+            motors(ARM_JOINTS),
+            '<equality><connect body1="rod" body2="flange" anchor="0 0 .3"/></equality>',
+        ),
+        "tool",
+        "equality constraint",
+        "serial",
+    ),
+    "joints coupled by a tendon": (
+        mjcf(
+            arm(),
+            motors(ARM_JOINTS),
+            '<tendon><fixed name="belt" stiffness="900"><joint joint="j2" coef="1"/>'
+            '<joint joint="j3" coef="-1"/></fixed></tendon>',
+        ),
+        "tool",
+        "the tendon belt on the arm",
+        "serial",
+    ),
+    "pushes one way": (
+        mjcf(arm(), motors(ARM_JOINTS).replace("/>", ' forcerange="0 87"/>', 1)),
+        "tool",
+        "the forcerange 0 to 87 on j1",
+        "such as -87 to 87",
+    ),
+    "controls outside the range": (
+        mjcf(
+            arm(),
+            motors(ARM_JOINTS[3:]) + '<position joint="j1" kp="900" gear="2" ctrlrange="7 8"/>',
+        ),
+        "tool",
+        "the range -3 to 3 of j1",
+        "reaches 3.5 to 4; correct its ctrlrange",
+    ),
+    "a link below the floor": (
+        mjcf(arm(base="0 0 -.08"), motors(ARM_JOINTS)),
+        "tool",
+        "above the floor",
+        "put the base",
     ),
     "narrow limits": (
         mjcf(arm(limits="-0.1 0.1", tip='<body name="hand"/>'), motors(ARM_JOINTS)),
@@ -397,14 +457,21 @@ STYLES = {
     "damping ratio": styled(servo='dampratio="1"'),
     "rotor": styled(servo='kv="20" armature="0.2" damping="0.3"'),
     "inherited range": styled(servo='kv="20" inheritrange="1"').replace('limited="false"', ""),
+    "turned stand": styled().replace("<worldbody><body>", '<worldbody><body euler="0 30 90">'),
+    "turned stand in a frame": styled()
+    .replace("<worldbody><body>", '<worldbody><frame euler="0 30 0"><body axisangle="1 0 0 40">')
+    .replace("</worldbody>", "</frame></worldbody>"),
+    "turned flange": styled()
+    .replace('<site name="tool"', '<body euler="0 40 20"><geom class="touching"/><site name="tool"')
+    .replace('pos="0 0 0.1"/>', 'pos="0 0 0.1"/></body>', 1),
     "spring and damper": styled().replace('stiffness="3"', 'springdamper="0.5 1"'),
 }
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
-    """Limits, inertia, springs and servos are those of the file compiled as it is, to the limit of
-    a paddle without mass; also without the geoms that only pictures need."""
+    """Limits, inertia, springs, servos and the site are those of the file compiled as it is, to the
+    limit of a paddle without mass; also without the geoms that only pictures need."""
     path, names = tmp_path / "arm.xml", "abcde"
     path.write_text(STYLES[style])
     config = RobotConfig.model_validate({"site": "tool", "paddle": {"mass": 1e-12}})
@@ -419,6 +486,12 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
     assert ignored == (not limited[4])
 
     rng = np.random.default_rng(0)
+    place = mujoco.MjData(plain)
+    mujoco.mj_kinematics(plain, place)
+    blade = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, blade)
+    tool = place.site("tool").xpos + place.site("tool").xmat.reshape(3, 3) @ config.paddle.position
+    np.testing.assert_allclose(blade.geom("blocker").xpos, tool, atol=1e-9)
     states = rng.uniform(-0.8, 0.8, (3, 5)), rng.uniform(-1.0, 1.0, (3, 5))
     for qpos, qvel in zip(*states, strict=True):
         accelerations = []
@@ -431,6 +504,71 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
             mujoco.mj_forward(m, data)
             accelerations.append([data.joint(name).qacc[0] for name in names])
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
+
+
+@pytest.mark.parametrize("field", ["body_quat", "body_ipos", "body_mass", "jnt_axis", "geom_pos"])
+def test_an_arm_that_changes_in_the_scene_is_refused(field, tmp_path) -> None:
+    """As an angle that is read in other units would change it."""
+    (tmp_path / "arm.xml").write_text(STYLES["turned flange"])
+    config = RobotConfig(site="tool")
+    found = build_arm(tmp_path / "arm.xml", config)
+    model, angles = compile_spec(found.spec, tmp_path), 0.1 * np.arange(5)
+    adoption._check_as_alone(found, model, config, angles)
+    at = find_addresses(model)
+    joint = at.arm_joints[2]
+    kinds = {"body": model.jnt_bodyid[joint], "jnt": joint, "geom": at.paddle_geom}
+    getattr(model, field)[kinds[field.split("_")[0]]] += 1e-4
+    with pytest.raises(UserError, match="at the start pose differs by"):
+        adoption._check_as_alone(found, model, config, angles)
+
+
+RANGED = "".join(
+    f'<position joint="j{i}" kp="2000" kv="200" ctrlrange="{span}" gear="{gear}"/>'
+    for i, span, gear in ((1, "-1 1", 1), (2, "-1 2", -2), (3, "-2 2", 2))
+    + tuple((i, "-1 1", 1) for i in (4, 5, 6))
+)
+
+
+@pytest.mark.parametrize("kind", ["kept", "replaced"])
+def test_a_start_pose_is_within_what_the_servos_reach(kind, tmp_path) -> None:
+    servos = RANGED if kind == "kept" else RANGED.replace('kv="200"', 'kv="2"')
+    (tmp_path / "arm.xml").write_text(mjcf(arm(), servos))
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=False)
+    assert found.are_kept == (kind == "kept")
+    assert any("narrowed the ranges" in change for change in found.arm.changes)
+    model = compile_spec(found.arm.spec, tmp_path)
+    low, high = model.jnt_range[list(find_addresses(model).arm_joints)].T
+    np.testing.assert_allclose(low, -np.ones(6))
+    np.testing.assert_allclose(high, [1.0, 0.5, 1.0, 1.0, 1.0, 1.0])
+    own = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    lengths = found.pose.angles * own.actuator_gear[:, 0]
+    assert np.all((lengths > own.actuator_ctrlrange.T[0]) & (lengths < own.actuator_ctrlrange.T[1]))
+
+
+def test_a_base_and_a_marker_that_are_moved_from_outside(tmp_path) -> None:
+    """The base is fixed, and the marker that leads the arm goes with its weld."""
+    base = f'<body name="base" mocap="true" pos="0 0 .1">{arm()}</body>'
+    marker = '<body name="marker" mocap="true" pos="1 0 1"><geom size=".05"/></body>'
+    welded = '<equality><weld body1="marker" body2="hand"/></equality>'
+    text = mjcf(marker + base, motors(ARM_JOINTS), welded).replace(
+        '<site name="tool"', '<body name="hand"/><site name="tool"'
+    )
+    (tmp_path / "arm.xml").write_text(text)
+    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
+    changes = "\n".join(found.arm.changes)
+    assert "fixed the base base" in changes and "loose objects marker" in changes
+    model = compile_spec(found.arm.spec, tmp_path)
+    assert fused.unsupported_feature(model) is None and model.neq == 0
+
+
+def test_an_arm_may_use_the_names_of_the_scene(tmp_path) -> None:
+    text = ARM
+    for own, name in (("j1", "ball_link"), ("j2", "paddle"), ("j3", "ball")):
+        text = text.replace(f'"{own}"', f'"{name}"')
+    (tmp_path / "arm.xml").write_text(text)
+    config = RobotConfig(site="tool", joints=("ball_link", "paddle", "ball", "j4", "j5", "j6"))
+    found = adopt(tmp_path / "arm.xml", config, 0.01, is_mount_given=True)
+    assert len(find_addresses(compile_spec(found.arm.spec, tmp_path)).actuators) == 6
 
 
 def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
@@ -497,6 +635,9 @@ def test_adopting_ends_by_itself_and_view_shows_the_arm(tmp_path, monkeypatch, c
     (command,) = re.findall(r"see it: bounce-mjx view (.+)", capsys.readouterr().out)
     adopt_command.main([*args, "--view"])
     assert shown == [shlex.split(command)]
+    adopt_command.main([*args, "--task", "juggle"])
+    said = capsys.readouterr().out
+    assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2
 
 
 def test_a_missing_package_of_a_robot_names_the_command_of_the_docs(monkeypatch) -> None:
@@ -552,12 +693,16 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
     np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
 
 
+FLAGS = '<flag gravity="disable" damper="disable"/>'
+
+
 def test_changes_are_listed(tmp_path) -> None:
     text = mjcf(arm(), motors(ARM_JOINTS)).replace('damping="0.1"', 'frictionloss="0.2"', 1)
+    text = text.replace("<worldbody>", f"<option>{FLAGS}</option><worldbody>")
     (tmp_path / "arm.xml").write_text(text)
     found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=False)
     changes = "\n".join(found.arm.changes)
-    for words in ("own contacts", "joint limits", "added a paddle"):
+    for words in ("own contacts", "joint limits", "added a paddle", "damper and gravity disabled"):
         assert words in changes
     # Dry friction stays, with limits of MuJoCo's solver that suffice for it.
     model = compile_spec(found.arm.spec, tmp_path / "arm.xml")

@@ -79,14 +79,16 @@ def main(args: Sequence[str]) -> None:
     with writable(out, "choose another --out"):
         write_output(out, f"# {on_one_line(head)}\n{text}")
     console.print(f"config: {out}", markup=False)
-    quoted = shlex.quote(str(out))
-    console.print(f"see it: bounce-mjx view --robot {quoted} --actions zero", markup=False)
-    console.print(f"train it: bounce-mjx train --robot {quoted}", markup=False)
+    named = [] if command.task == DEFAULT else ["--task", command.task]
+    flags = [*named, "--robot", str(out)]
+    shown = [*flags, "--actions", "zero"]
+    console.print(f"see it: bounce-mjx view {shlex.join(shown)}", markup=False)
+    console.print(f"train it: bounce-mjx train {shlex.join(flags)}", markup=False)
     if command.view:
         # The viewers import seconds of libraries.
         from bounce_mjx.commands import view
 
-        view.main(["--robot", str(out), "--actions", "zero"])
+        view.main(shown)
 
 
 def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import raise_solver_limits
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses, to_direct_solref
 
 Array = np.ndarray | jax.Array
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
@@ -240,25 +239,6 @@ def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     solref = mj_model.pair_solref[contact_pair(mj_model)]
     stiffness, damping = to_direct_solref(solref, mj_model.opt.timestep)
     return float(stiffness), float(damping)
-
-
-def to_direct_solref(solref: Array, timestep: float, xp: ModuleType = np) -> tuple[Array, Array]:
-    """k and b of a `solref` [2] in MuJoCo's direct format, `solref="-k -b"`.
-
-    The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
-    documentation, "Modeling", solver parameters).
-
-    Args:
-      timestep: of the physics, s.
-      xp: numpy or jax.numpy, for the arrays.
-    """
-    first, second = solref
-    is_standard = first > 0.0
-    # MuJoCo's lower limit for the time constant is two steps.
-    time_constant = xp.maximum(first, 2.0 * timestep)
-    damping_ratio = xp.where(is_standard, second, 1.0)
-    stiffness = xp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
-    return stiffness, xp.where(is_standard, 2.0 / time_constant, -second)
 
 
 def contact_pair(mj_model: mujoco.MjModel) -> int:

@@ -31,6 +31,8 @@ HIDDEN_GROUP = 3
 _RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
 _RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+# A change of a joint's range that is told, rad or m.
+_NARROWER = 1e-3
 _SILENCE = threading.Lock()
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
@@ -48,6 +50,16 @@ class ServoSettings(NamedTuple):
     """N m, or N; None for no limit."""
 
 
+class Own(NamedTuple):
+    """The user's file compiled alone."""
+
+    model: mujoco.MjModel
+    joints: tuple[int, ...]
+    """The acting joints in it."""
+    gripper: tuple[int, ...]
+    """The bodies in it whose subtrees are the gripper, which the scene lacks."""
+
+
 class Arm(NamedTuple):
     """An arm in the task's scene."""
 
@@ -60,6 +72,7 @@ class Arm(NamedTuple):
     """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
+    own: Own
 
 
 def locate(mjcf: Path) -> Path:
@@ -211,15 +224,17 @@ class _Builder:
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, actuators[j]) for j in joints)
         limits = tuple(_force_limit(model, actuators[j], j) for j in joints)
-        names, holder = self._name(joints, end)
+        names, holder = self._name(joints, end, actuators)
         gripper = self._gripper(chain, joints, actuators)
-        self._check_loops(joints)
+        objects = self._objects(chain)
+        self._check_loops(joints, end, gripper, objects)
         self._freeze(joints, actuators)
-        self._strip(joints, gripper, actuators)
+        self._strip(joints, gripper, objects, actuators)
         self._disable_contacts_and_limits(joints)
         scene = self._attach(holder, position, quaternion)
         self._replace_servos(scene, names)
-        return Arm(scene, names, servos, limits, tuple(self._changes))
+        own = Own(model, tuple(joints), tuple(gripper))
+        return Arm(scene, names, servos, limits, tuple(self._changes), own)
 
     def _chain(self, end: int) -> list[int]:
         """Bodies from the base to the paddle's."""
@@ -274,7 +289,9 @@ class _Builder:
             )
         return actuators
 
-    def _name(self, joints: list[int], end: int) -> tuple[tuple[str, ...], str]:
+    def _name(
+        self, joints: list[int], end: int, actuators: dict[int, list[int]]
+    ) -> tuple[tuple[str, ...], str]:
         """Gives the arm's parts names that the scene does not use; those of the acting joints, and
         of the body that holds the paddle."""
         arm = self._arm
@@ -284,6 +301,8 @@ class _Builder:
                     element.name += "_of_arm"
         for joint in joints:
             arm.joints[joint].name = arm.joints[joint].name or f"joint{joint}"
+            for actuator in actuators[joint]:
+                arm.actuators[actuator].target = arm.joints[joint].name
         holder = arm.bodies[end]
         holder.name = holder.name or "end_effector"
         return tuple(arm.joints[joint].name for joint in joints), holder.name
@@ -307,7 +326,7 @@ class _Builder:
         beside = [
             joint_name(model, j)
             for j in sorted(actuators)
-            if bodies[j] not in chain and not _is_below(model, bodies[j], branches)
+            if bodies[j] not in chain and not is_below(model, bodies[j], branches)
         ]
         if beside:
             raise UserError(
@@ -315,21 +334,35 @@ class _Builder:
                 f"{_listed(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
                 "one arm on a fixed base"
             )
-        return [b for b in branches if any(_is_below(model, body, [b]) for body in bodies)]
+        return [b for b in branches if any(is_below(model, body, [b]) for body in bodies)]
 
-    def _check_loops(self, joints: list[int]) -> None:
-        model, kinds = self._model, mujoco.mjtEq
-        ends = np.stack([model.eq_obj1id, model.eq_obj2id])
-        of_joints = model.eq_type == kinds.mjEQ_JOINT
-        of_bodies = np.isin(model.eq_type, (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD))
-        of_bodies &= model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY
-        coupled = of_joints & np.any(np.isin(ends, joints), axis=0)
-        loops = of_bodies & np.any(np.isin(ends, model.jnt_bodyid[joints]), axis=0)
-        for i in np.flatnonzero(coupled | loops):
-            raise UserError(
-                f"the equality constraint {model.equality(i).name or f'number {i}'} on the arm, so "
-                "it is not a serial chain; remove it, or give a serial arm"
+    def _objects(self, chain: list[int]) -> list[int]:
+        """Bodies with a free joint or moved from outside (mocap), but for the arm's base; they are
+        children of the world."""
+        model = self._model
+        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        moved = {*model.jnt_bodyid[is_free].tolist(), *np.flatnonzero(model.body_mocapid >= 0)}
+        return sorted(int(body) for body in moved if body != chain[0])
+
+    def _check_loops(
+        self, joints: list[int], end: int, gripper: list[int], objects: list[int]
+    ) -> None:
+        """Refuses constraints and tendons that act on the arm, which then is no serial chain."""
+        model = self._model
+        first = int(model.jnt_bodyid[joints[0]])
+        markers = [body for body in objects if model.body_mocapid[body] >= 0]
+        for words, driven, bodies in _couplings(model):
+            # A gripper belongs to the last link. A marker that leads the arm is removed.
+            bodies = [end if is_below(model, body, gripper) else body for body in bodies]
+            moves, is_led = (
+                any(is_below(model, body, above) for body in bodies) for above in ([first], markers)
             )
+            links = {int(model.body_weldid[body]) for body in bodies}
+            if {*driven} & {*joints} or (moves and len(links) > 1 and not is_led):
+                raise UserError(
+                    f"{words} on the arm, so it is not a serial chain; remove it, or give a serial "
+                    "arm"
+                )
 
     def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
         """Gives the spec the numbers of the compiled model.
@@ -346,8 +379,14 @@ class _Builder:
             body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
             body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
             body.fullinertia[0] = np.nan
+            # A body that the scene fuses would be turned by its angles in the scene's units.
+            body.pos, body.quat = model.body_pos[i], model.body_quat[i]
+            body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            if body.frame is not None:
+                body.set_frame(body.parent.add_frame())
         arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
+        narrowed: list[str] = []
         for i in joints:
             joint, dof = parts[i], model.jnt_dofadr[i]
             if np.any(joint.range) and not model.jnt_limited[i]:
@@ -355,7 +394,17 @@ class _Builder:
                     f"ignored the range of {joint_name(model, i)}, which is not limited"
                 )
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.range = model.jnt_range[i] if model.jnt_limited[i] else np.zeros(2)
+            own = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
+            least, greatest = _servo_range(model, actuators[i])
+            low, high = max(own[0], least), min(own[1], greatest)
+            if not low < high:
+                raise UserError(
+                    f"the range {own[0]:g} to {own[1]:g} of {joint_name(model, i)}, but a servo "
+                    f"that reaches {least:g} to {greatest:g}; correct its ctrlrange"
+                )
+            if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
+                narrowed.append(joint_name(model, i))
+            joint.range = (low, high) if high < np.inf else np.zeros(2)
             joint.springdamper = np.zeros(2)
             joint.stiffness[0], joint.damping[0] = model.jnt_stiffness[i], model.dof_damping[dof]
             joint.armature = model.dof_armature[dof]
@@ -368,11 +417,19 @@ class _Builder:
                 drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
                 control = model.actuator_ctrladr[a]
                 drive.inheritrange, drive.ctrlrange = 0.0, model.actuator_ctrlrange[control]
+        if narrowed:
+            self._changes.append(
+                f"narrowed the ranges to what the servos reach: {_listed(narrowed)}"
+            )
 
     def _strip(
-        self, joints: list[int], gripper: list[int], actuators: dict[int, list[int]]
+        self,
+        joints: list[int],
+        gripper: list[int],
+        objects: list[int],
+        actuators: dict[int, list[int]],
     ) -> None:
-        """Removes all but the arm."""
+        """Removes all but the arm, and fixes its base."""
         arm, model = self._arm, self._model
         own = {a for joint in joints for a in actuators[joint]}
         others = [a for i, a in enumerate(arm.actuators) if i not in own]
@@ -386,10 +443,10 @@ class _Builder:
         self._remove("lights and cameras", [*arm.lights, *arm.cameras])
         self._remove("floors", [g for g in arm.geoms if g.type in floors])
         bodies, parts = list(arm.bodies), list(arm.joints)
-        base = model.body_rootid[model.jnt_bodyid[joints[0]]]
-        # A free joint belongs to a child of the world.
-        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-        objects = [int(body) for body in model.jnt_bodyid[is_free] if body != base]
+        base = bodies[model.body_rootid[model.jnt_bodyid[joints[0]]]]
+        if base.mocap:
+            base.mocap = False
+            self._changes.append(f"fixed the base {base.name}, a body that is moved (mocap)")
         for words, removed in (
             ("removed the gripper beyond the last joint: ", gripper),
             ("removed the loose objects ", objects),
@@ -400,7 +457,7 @@ class _Builder:
         fixed = [
             j
             for j, body in enumerate(model.jnt_bodyid)
-            if j not in joints and not _is_below(model, int(body), gripper + objects)
+            if j not in joints and not is_below(model, int(body), gripper + objects)
         ]
         if fixed:
             names = _listed(joint_name(model, j) for j in fixed)
@@ -529,16 +586,8 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
     """The position servo that drives a joint alone; None for other actuators."""
     actuator = actuators[0]
     gear = float(model.actuator_gear[actuator, 0])
-    plain = (
-        len(actuators) == 1
-        and model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
-        and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-        and model.actuator_gainprm[actuator, 0] > 0.0
-        and model.actuator_biasprm[actuator, 0] == 0.0
-        and model.actuator_biasprm[actuator, 1] == -model.actuator_gainprm[actuator, 0]
-    )
-    if not plain:
+    plain = len(actuators) == 1 and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+    if not (plain and _is_position(model, actuator)):
         return None
     joint = int(model.actuator_trnid[actuator, 0])
     return ServoSettings(
@@ -548,6 +597,32 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
     )
 
 
+def _is_position(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's control, or its filtered or integrated one, is a target position."""
+    return bool(
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_gainprm[actuator, 0] > 0.0
+        and model.actuator_biasprm[actuator, 0] == 0.0
+        and model.actuator_biasprm[actuator, 1] == -model.actuator_gainprm[actuator, 0]
+    )
+
+
+def _servo_range(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
+    """Joint positions that the targets of a joint's position servos reach."""
+    least, greatest = -np.inf, np.inf
+    for actuator in filter(lambda a: _is_position(model, a), actuators):
+        control = model.actuator_ctrladr[actuator]
+        limited, span = model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
+        if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            # Its control is a velocity.
+            limited, span = model.actuator_actlimited[actuator], model.actuator_actrange[actuator]
+        if limited:
+            low, high = sorted(span / model.actuator_gear[actuator, 0])
+            least, greatest = max(least, low), min(greatest, high)
+    return float(least), float(greatest)
+
+
 def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> float | None:
     """Largest force of a joint's actuators, None for no limit: by the force range, by the control
     range of a plain motor, or by the joint's own limit."""
@@ -555,17 +630,50 @@ def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> flo
     for actuator in actuators:
         limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
         if model.actuator_forcelimited[actuator]:
-            limit = float(np.min(np.abs(model.actuator_forcerange[actuator])))
+            limit = _both_ways(model.actuator_forcerange[actuator], "forcerange", model, joint)
         is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
         # A <pid> has several controls; the other arrays have one row for each actuator.
         control = model.actuator_ctrladr[actuator]
         if is_motor and model.actuator_ctrllimited[control]:
-            largest = float(np.min(np.abs(model.actuator_ctrlrange[control])))
+            largest = _both_ways(model.actuator_ctrlrange[control], "ctrlrange", model, joint)
             limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
         total = max(total, limit * gear)
     if model.jnt_actfrclimited[joint]:
-        total = min(total, float(np.min(np.abs(model.jnt_actfrcrange[joint]))))
+        span = model.jnt_actfrcrange[joint]
+        total = min(total, _both_ways(span, "actuatorfrcrange", model, joint))
     return total if np.isfinite(total) else None
+
+
+def _both_ways(span: np.ndarray, name: str, model: mujoco.MjModel, joint: int) -> float:
+    """Largest force or control within a range [2] that has both signs."""
+    low, high = map(float, span)
+    if not low < 0.0 < high:
+        raise UserError(
+            f"the {name} {low:g} to {high:g} on {joint_name(model, joint)}, so its actuator pushes "
+            f"one way only; give a range around 0, such as {-max(-low, high):g} to "
+            f"{max(-low, high):g}"
+        )
+    return min(-low, high)
+
+
+def _couplings(model: mujoco.MjModel) -> Iterator[tuple[str, Iterable[int], Iterable[int]]]:
+    """Of each equality constraint and tendon: words, and the joints and bodies that it couples."""
+    for i in range(model.neq):
+        words = f"the equality constraint {model.equality(i).name or f'number {i}'}"
+        ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+        if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
+            yield words, ends, []
+        elif int(model.eq_type[i]) in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+            of_sites = model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE
+            yield words, [], model.site_bodyid[ends].tolist() if of_sites else ends
+    for i in range(model.ntendon):
+        path = slice(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])
+        kinds, ids = model.wrap_type[path], model.wrap_objid[path]
+        sites = ids[kinds == mujoco.mjtWrap.mjWRAP_SITE]
+        geoms = ids[np.isin(kinds, (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER))]
+        bodies = [*model.site_bodyid[sites].tolist(), *model.geom_bodyid[geoms].tolist()]
+        driven = ids[kinds == mujoco.mjtWrap.mjWRAP_JOINT].tolist()
+        yield f"the tendon {model.tendon(i).name or f'number {i}'}", driven, bodies
 
 
 def _joints_of(model: mujoco.MjModel, body: int) -> range:
@@ -573,7 +681,7 @@ def _joints_of(model: mujoco.MjModel, body: int) -> range:
     return range(first, first + int(model.body_jntnum[body]))
 
 
-def _is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
+def is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
     while body and body not in ancestors:
         body = int(model.body_parentid[body])
     return body in ancestors
@@ -597,6 +705,13 @@ def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> str:
         different.append(mujoco.mjtIntegrator(given.integrator).name.removeprefix("mjINT_").lower())
     if not np.allclose(given.gravity, task.gravity, atol=1e-2):
         different.append(f"gravity {np.round(given.gravity, 3).tolist()}")
+    off = [
+        name.removeprefix("mjDSBL_").lower()
+        for name, flag in mujoco.mjtDisableBit.__members__.items()
+        if name.startswith("mjDSBL") and flag.value & given.disableflags & ~task.disableflags
+    ]
+    if off:
+        different.append(f"{' and '.join(off)} disabled")
     if given.density or given.viscosity or np.any(given.wind):
         different.append("a medium")
     return ", ".join(different)

@@ -1,9 +1,11 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +27,9 @@ from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
 from bounce_mjx.robot.setpoints import JointLimits
+
+# With fewer physics steps in half a period of a contact, the ball can gain energy in a bounce.
+_STEPS_OF_A_CONTACT = 4
 
 
 class BallAddresses(NamedTuple):
@@ -117,7 +122,8 @@ def load_model(
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
-        without a position servo, more balls than `num_balls`, or a number that cannot be simulated.
+        without a position servo, more balls than `num_balls`, or a number that cannot be simulated;
+        or half a period of a contact has fewer than four physics steps.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
     add_balls(spec, num_balls)
@@ -135,6 +141,7 @@ def load_model(
     except UserError as error:
         raise named(path, error) from error
     mj_model.opt.timestep = physics_dt
+    _check_step(mj_model)
     return mj_model
 
 
@@ -189,6 +196,41 @@ def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotC
         limited = mj_model.actuator_forcelimited[servo]
         limits[:] = np.clip(limits, -force, force) if limited else (-force, force)
         mj_model.actuator_forcelimited[servo] = True
+
+
+def _check_step(mj_model: mujoco.MjModel) -> None:
+    """Refuses a physics step that is too long for a contact: its ball would gain energy."""
+    step = mj_model.opt.timestep
+    # The engines refuse a solref with one positive number.
+    for solref in mj_model.pair_solref[np.sum(mj_model.pair_solref > 0.0, axis=1) != 1]:
+        stiffness, _ = to_direct_solref(solref, step)
+        half_period = math.pi / math.sqrt(max(stiffness, 1e-9))
+        longest = half_period / _STEPS_OF_A_CONTACT
+        if step > longest * (1.0 + 1e-3):
+            raise UserError(
+                f"physics_dt {step:g} s is too long for a contact whose half period is "
+                f"{half_period:.3g} s, and the ball would gain energy; set physics_dt to "
+                f"{longest:.4g} s or less"
+            )
+
+
+def to_direct_solref(solref: Any, timestep: float, xp: ModuleType = np) -> tuple[Any, Any]:
+    """k and b of a `solref` [2] in MuJoCo's direct format, `solref="-k -b"`.
+
+    The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
+    documentation, "Modeling", solver parameters).
+
+    Args:
+      timestep: of the physics, s.
+      xp: numpy or jax.numpy, for the arrays.
+    """
+    first, second = solref
+    is_standard = first > 0.0
+    # MuJoCo's lower limit for the time constant is two steps.
+    time_constant = xp.maximum(first, 2.0 * timestep)
+    damping_ratio = xp.where(is_standard, second, 1.0)
+    stiffness = xp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
+    return stiffness, xp.where(is_standard, 2.0 / time_constant, -second)
 
 
 def _check_balls(present: int, num_balls: int) -> None:

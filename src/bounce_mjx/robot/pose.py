@@ -29,8 +29,8 @@ _MAX_STEP = 0.4
 # short range it is a tenth.
 _LEAST_MARGIN = 0.1
 _CLEARANCE = 0.09
-# Least height of the lines between the joints, half the thickness of a link, m; the base, within a
-# radius around the first joint, may be lower.
+# Least height of the lines between the joints, half the thickness of a link, m; within a radius
+# around the first joint, at the base, they may be lower, but not below the floor.
 _FLOOR_CLEARANCE = 0.07
 _BASE_RADIUS = 0.2
 # Lowest height of the paddle in the search, m: the links below it stay above the floor.
@@ -285,10 +285,12 @@ class _Search:
         the ball's way."""
         data = self._data
         points = [data.xanchor[j] for j in self._joints] + [data.xpos[self._body]]
-        for start, end in zip(points, points[1:], strict=False):
+        for i, (start, end) in enumerate(zip(points, points[1:], strict=False)):
             samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
             beyond_base = np.linalg.norm(samples - self._base, axis=1) > _BASE_RADIUS
-            if np.any(beyond_base & (samples[:, 2] < _FLOOR_CLEARANCE)):
+            # The first joint may be anywhere along its axis.
+            lowest = np.where(beyond_base, _FLOOR_CLEARANCE, -1e-6 if i else -np.inf)
+            if np.any(samples[:, 2] < lowest):
                 return False
             near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
             beside = (samples[:, 2] > paddle[2] - 0.03) & (samples[:, 2] < paddle[2] + _HEADROOM)

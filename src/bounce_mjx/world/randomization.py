@@ -95,7 +95,7 @@ class RandomizationConfig(StrictModel):
     speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
     "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
     contact_friction: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
-    """Coefficient of sliding friction between ball and paddle."""
+    """Coefficient of sliding friction between ball and paddle, in place of the model's."""
     servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each servo's stiffness."""
     servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
@@ -103,11 +103,11 @@ class RandomizationConfig(StrictModel):
     servo_lag: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
     """Time constant of a first-order lag of the servo targets, s."""
     torque_limit: Annotated[Range | None, Term(None, None, (1e-3, math.inf))] = None
-    """Largest torque of each servo, N m."""
+    """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
     joint_damping: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
     """Viscous damping added to each joint, N m s/rad."""
     joint_frictionloss: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
-    """Dry friction of each joint, N m."""
+    """Dry friction of each joint, N m, in place of the model's."""
     armature: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each joint's rotor inertia."""
     link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
@@ -301,17 +301,19 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     for term, (parameter, model_value) in scaled.items():
         if term in world:
             given[parameter] = world[term] * _array(model_value, world[term])
-    same = {
-        "contact_friction": "contact_friction",
-        "torque_limit": "force_limit",
-        "joint_frictionloss": "frictionloss",
-    }
+    same = {"contact_friction": "contact_friction", "joint_frictionloss": "frictionloss"}
     for term, parameter in same.items():
         if term in world:
             given[parameter] = world[term]
+    if "torque_limit" in world:
+        own = np.where(
+            m.actuator_forcelimited, np.min(np.abs(m.actuator_forcerange), axis=1), np.inf
+        )
+        limit = world["torque_limit"]
+        given["force_limit"] = jnp.minimum(limit, _array(own[servos], limit))
     if "joint_damping" in world:
         added = world["joint_damping"]
-        given["damping"] = added + _array(m.dof_damping.reshape(m.nv, -1)[dofs, 0], added)
+        given["damping"] = added + _array(m.dof_damping[dofs], added)
     if "paddle_offset" in world:
         offset = world["paddle_offset"]
         given["paddle_position"] = offset + _array(m.geom_pos[paddle], offset)

@@ -97,7 +97,7 @@ def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
         and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
         and not np.any(m.body_ipos[ball.body])
         and not np.any(m.geom_pos[ball.geom])
-        and not np.any(m.dof_damping.reshape(m.nv, -1)[ball.qvel,])
+        and not np.any(m.dof_damping[ball.qvel,])
         and not np.any(m.dof_armature[ball.qvel,])
         and not np.any(m.dof_frictionloss[ball.qvel,])
         and not m.jnt_stiffness[m.body_jntadr[ball.body]]
