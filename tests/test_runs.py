@@ -360,6 +360,62 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
     assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
 
 
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch) -> Path:
+    """A working directory on a machine without an accelerator, with a preset of the user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    (tmp_path / "my.yaml").write_text("ppo: {learning_rate: 0.001}")
+    return tmp_path
+
+
+def read_file(folder: Path, text: str) -> TrainConfig:
+    (folder / "given.yaml").write_text(text)
+    return read_preset(Path("given.yaml"))
+
+
+def test_a_file_of_the_user_lies_on_the_preset_of_its_task(presets: Path) -> None:
+    assert read_file(presets, "").ppo == read_preset(Path("cpu")).ppo
+    given = read_file(presets, "ppo: {learning_rate: 0.001}").ppo
+    cpu = read_preset(Path("cpu")).ppo
+    assert given == cpu.model_copy(update={"learning_rate": 0.001}) != cpu
+    assert read_file(presets, "task: track") == read_preset(Path("cpu"), task="track")
+    assert read_file(presets, "base: robust") == read_preset(Path("robust"))
+    alone = read_file(presets, "base: null\nseed: 3")
+    assert alone == TrainConfig(seed=3)
+    with pytest.raises(UserError, match="given.yaml: base is 'nope'; give the name of a preset"):
+        read_file(presets, "base: nope")
+    on_gpu = read_preset(Path("my.yaml"), machine=Path("default"))
+    assert on_gpu.ppo.num_envs == read_preset(Path("default")).ppo.num_envs != cpu.num_envs
+
+
+def test_a_run_keeps_its_settings_as_a_preset(presets: Path) -> None:
+    config = TrainConfig(seed=3, total_steps=1000, log_dir=presets)
+    run = create_run(config)
+    assert load_run_config(run) == read_preset(run / "config.yaml") == config
+    # A setting that a later version adds must not come from the preset.
+    text = (run / "config.yaml").read_text().replace("stop_when_solved: false\n", "")
+    assert not read_file(presets, text).stop_when_solved
+
+
+def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
+    (presets / "more.yaml").write_text("ppo: {learning_rate: 0.002, discount: 0.9}")
+    orders = {
+        "--config my.yaml --config=more.yaml": 0.002,
+        "--config more.yaml --config my.yaml": 0.001,
+    }
+    for flags, rate in orders.items():
+        command = train_command.read_command(flags.split())
+        assert command.ppo.learning_rate == rate and command.ppo.discount == 0.9
+        assert command.ppo.num_envs == read_preset(None).ppo.num_envs
+        cpu, *given = command.config
+        assert cpu == resource_path("configs/cpu.yaml")
+        assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
+    (presets / "more.yaml").write_text("base: robust")
+    with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
+        read_preset([Path("my.yaml"), Path("more.yaml")])
+
+
 def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     """Those of the task, where they differ from those of the group's class."""
     file = tmp_path / "preset.yaml"

@@ -7,6 +7,7 @@ import re
 import sys
 import typing
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import pydantic
@@ -154,7 +155,8 @@ def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> 
                 words.append(flag if value.lower() == "true" else _negated(flag))
                 continue
         types = set(_types(kind))
-        parts = value.split(",") if tuple in types else [value]
+        # The name of a file may have commas.
+        parts = value.split(",") if tuple in types and Path not in types else [value]
         if int in types:
             parts = [str(whole_number(part)) for part in parts]
         if len(parts) > 1 and flag:

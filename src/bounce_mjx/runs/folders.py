@@ -35,7 +35,7 @@ import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
+from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
@@ -113,7 +113,7 @@ def save_config(run: Path, config: TrainConfig) -> None:
 
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
-    head = f"# bounce_mjx {bounce_mjx.__version__}\n"
+    head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
     write_atomically(run / CONFIG_FILE, head + dump_config(config))
 
 

@@ -1,5 +1,6 @@
 """A training that starts with the networks of an earlier one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -17,13 +18,19 @@ from bounce_mjx.runs.reading import policy_shapes, read_networks
 
 
 def warm_config(
-    policy: Path, log_dir: Path, preset: Path | None, task: str | None, world: Path | None
+    policy: Path,
+    log_dir: Path,
+    presets: Sequence[Path],
+    task: str | None,
+    world: Path | None,
+    machine: Path | None,
 ) -> TrainConfig:
     """The config of a training that starts with a policy: its environment and networks, and the
     other settings of a preset.
 
     Args:
       log_dir: folder of the runs among which `latest` is found.
+      presets: see `preset_files`, as for `machine`.
       task: the policy's task as the user names it.
       world: a named world in place of the policy's.
 
@@ -32,7 +39,7 @@ def warm_config(
     """
     checkpoint = _checkpoint(policy, log_dir)
     own = load_run_config(checkpoint.run, task)
-    base = read_preset(preset, task=own.task)
+    base = read_preset(presets, task=own.task, machine=machine)
     networks = {key: getattr(own.ppo, key) for key in ("hidden_layers", "critic_metrics")}
     ppo = base.ppo.model_copy(update=networks)
     start = policy if str(policy) in POLICIES else checkpoint.folder
