@@ -28,6 +28,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs import writing
 from bounce_mjx.runs.config import (
     TrainConfig,
     load_config,
@@ -414,6 +415,13 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
     (presets / "more.yaml").write_text("base: robust")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])
+
+
+def test_a_checkpoint_whose_arrays_went_elsewhere_gets_no_name(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(writing, "_save_arrays", lambda folder, tree: None)
+    with pytest.raises(FileNotFoundError):
+        writing._write_checkpoint(tmp_path / "8", {"policy": {}}, "{}")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from bounce_mjx.errors import UserError
+
 
 def read_regular(path: Path, limit: int) -> bytes:
     """Reads a regular file, or one that a link leads to.
@@ -27,6 +29,21 @@ def read_regular(path: Path, limit: int) -> bytes:
     if len(content) > limit:
         raise ValueError(f"it is longer than {limit} bytes")
     return content
+
+
+def check_name(path: Path) -> None:
+    """Refuses a path that libraries which write names in UTF-8 would take for another one.
+
+    Raises:
+      UserError: a name is not UTF-8, or the locale is not and a name is not ASCII.
+    """
+    with contextlib.suppress(UnicodeEncodeError):
+        if os.fsencode(path) == str(path).encode():
+            return
+    raise UserError(
+        f"the path {path} is not UTF-8, or the locale of this process is not; rename what is not "
+        "ASCII in it, or set LC_ALL=C.UTF-8"
+    )
 
 
 @contextlib.contextmanager

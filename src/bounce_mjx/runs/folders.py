@@ -34,6 +34,7 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
+from bounce_mjx.files import check_name
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
@@ -75,6 +76,7 @@ def create_run(config: TrainConfig) -> Path:
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
+    check_name(config.log_dir.absolute())
     stamp = datetime.datetime.now().strftime(_STAMP)
     try:
         config.log_dir.mkdir(parents=True, exist_ok=True)
@@ -155,6 +157,7 @@ def find_run(path: Path) -> Path:
         if (folder / CONFIG_FILE).is_file():
             if _CONTROL.search(str(folder)):
                 raise UserError(f"{folder} has a control character in its name; rename it")
+            check_name(folder.absolute())
             return folder
     raise UserError(
         f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
