@@ -26,6 +26,7 @@ from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands.main import COMMANDS
 from bounce_mjx.commands.main import main as console_script
+from bounce_mjx.config import command_line
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -513,9 +514,9 @@ def test_an_evaluation_in_a_pipe_says_only_what_is_worth_a_line(
     monkeypatch, compiling: float, seconds: float, said: list[str]
 ) -> None:
     now = 0.0
-    monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
+    monkeypatch.setattr(command_line.time, "monotonic", lambda: now)
     shown = io.StringIO()
-    with eval_command._progress(Console(file=shown)) as progress:
+    with command_line.progress(Console(file=shown), "evaluating", "evaluated") as progress:
         for share in (0.1, 0.3, 0.5, 0.7, 0.9, 1.0):
             now = compiling + share * seconds
             progress(share)

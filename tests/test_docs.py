@@ -386,6 +386,14 @@ def test_packages_import_in_the_order_of_the_map():
     assert order and not against
 
 
+def test_the_site_has_the_files_that_its_pages_link_to(need) -> None:
+    """`mkdocs build --strict` does not see links to files that it leaves out."""
+    config = need("mkdocs.config").load_config(str(CHECKOUT / "mkdocs.yml"))
+    linked = {x for path in PAGES for x in re.findall(r"\]\(\.\./([^)#]+)", content(path))}
+    assert "examples/dribble_task.py" in linked
+    assert not [path for path in linked if config.exclude_docs.match_file(path)]
+
+
 def examples(page: str, language: str) -> list[str]:
     """The code blocks of a page in a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", content(page), re.MULTILINE | re.DOTALL)

@@ -387,6 +387,10 @@ def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
     rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
     assert rows[2 + SPEED].split()[-4:] == ["0.1", "to", "1.5", "-"]
     assert rows[-1].strip() == "upward speed: not judged (targets 0.4 only)"
+    # As of a task that had nothing to measure.
+    results[SPEED] = dataclasses.replace(results[SPEED], bound="0.1 to 1.5", value=None)
+    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
+    assert rows[-1].strip() == "upward speed: not judged"
 
 
 def test_fresh_statistics_fail_without_a_crash(env):

@@ -506,6 +506,20 @@ def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monk
     assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
 
 
+@pytest.mark.slow
+def test_a_run_that_weights_and_biases_refuses_leaves_no_folder(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    refusing = FakeWandb()
+    refusing.init = lambda **_: (_ for _ in ()).throw(ValueError("no account"))
+    monkeypatch.setitem(sys.modules, "wandb", refusing)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(SystemExit):
+        train_command.main([*TINY, "--wandb", "bounce", "--log-dir", str(tmp_path)])
+    assert "--wandb bounce is refused (no account)" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_weights_and_biases_is_optional(monkeypatch, capsys) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit) as exit_info:

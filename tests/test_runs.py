@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import shlex
 import shutil
 import threading
 import types
+import unittest.mock
 from datetime import datetime
 from pathlib import Path
 
@@ -28,7 +30,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs import config as run_configs
-from bounce_mjx.runs import writing
+from bounce_mjx.runs import folders, writing
 from bounce_mjx.runs.config import (
     TrainConfig,
     load_config,
@@ -421,6 +423,14 @@ def test_a_checkpoint_whose_arrays_went_elsewhere_gets_no_name(tmp_path: Path, m
     monkeypatch.setattr(writing, "_save_arrays", lambda folder, tree: None)
     with pytest.raises(FileNotFoundError):
         writing._write_checkpoint(tmp_path / "8", {"policy": {}}, "{}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(folders, "write_atomically", unittest.mock.Mock(side_effect=full))
+    with pytest.raises(UserError, match="cannot be made in .*No space left on device"):
+        create_run(TrainConfig(log_dir=tmp_path))
     assert not list(tmp_path.iterdir())
 
 

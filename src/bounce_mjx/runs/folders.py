@@ -88,8 +88,8 @@ def create_run(config: TrainConfig) -> Path:
                 continue
             try:
                 save_config(folder, config)
-            except UserError:
-                shutil.rmtree(folder)
+            except (UserError, OSError):
+                shutil.rmtree(folder, ignore_errors=True)
                 raise
             return folder
     except OSError as error:

@@ -96,8 +96,7 @@ def read_training(
     elif warm_start:
         from bounce_mjx.training.warm_start import warm_config
 
-        log_dir = path_flag(args, "--log-dir") or runs_folder(find_task(task or DEFAULT))
-        base = warm_config(warm_start, log_dir, configs, task, world, machine)
+        base = warm_config(warm_start, configs, task, world, machine)
     else:
         base = read_preset(configs, robot, task, world, machine)
     start = base

@@ -166,6 +166,8 @@ class _Job:
         self.steps = 0
         self.writers: list[CheckpointWriter] = []
         self.run = folders.find_run(options.resume) if self.resumed else self._create()
+        self.started = False
+        stack.push(self._remove_unstarted)
         hosts.advise(self._advice)
         if hosts.is_leader():
             stack.enter_context(lock_run(self.run))
@@ -221,6 +223,11 @@ class _Job:
         run = str(folders.create_run(self.config)) if hosts.is_leader() else None
         return Path(hosts.text_from_leader(run))
 
+    def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
+        """Removes the folder of a new run whose training did not start."""
+        if error is not None and not (self.started or self.resumed) and hosts.is_leader():
+            shutil.rmtree(self.run, ignore_errors=True)
+
     def _seed_runs(self) -> list[SeedRun]:
         config, seconds = self.config, self.clock.seconds
         if config.num_seeds == 1:
@@ -272,12 +279,13 @@ class _Job:
             if not self.stop.wait_for(compiling):
                 if self.resumed:
                     raise TrainingStopped(f"stopped before anything was trained; {self._go_on}")
-                if hosts.is_leader():
-                    shutil.rmtree(self.run, ignore_errors=True)
                 raise TrainingStopped(
                     f"stopped before anything was trained, so its folder {self.run} is removed"
                 )
             opening = compiling.result()
+            if self.options.wandb is not None:
+                # It may refuse the run.
+                opening.result()
             # A process that finds its programs in the cache waits here for a process that compiles
             # them; otherwise the exchange between devices would time out after 30 s.
             hosts.any_of(False)
@@ -292,6 +300,7 @@ class _Job:
         self.reporter = self.stack.enter_context(
             Reporter(opening.result, self.console, self.config, self.steps, self.options.watcher)
         )
+        self.started = True
         self.clock.lap("compile")
 
     def _compile(self) -> concurrent.futures.Future:

@@ -47,6 +47,8 @@ def run_command(
     console = stdout(quiet=not hosts.is_leader())
     if command.resume is None:
         say(console, f"config: {' on '.join(map(shown_file, reversed(command.config)))}")
+        if command.warm_start is not None:
+            say(console, f"warm start: {command.warm_start}")
     # A later command has to name the task's file again.
     task = f" --task {shlex.quote(command.task)}" if is_file(command.task) else ""
     try:
