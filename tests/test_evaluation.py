@@ -638,6 +638,24 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
 
 
+@pytest.mark.slow
+def test_episodes_are_recorded_on_the_engine_that_is_asked_for(
+    networks, random_policy, monkeypatch
+):
+    monkeypatch.setattr(policy_evaluation, "RECORDED_EPISODES", 4)
+    config = EnvConfig(episode_seconds=0.3, min_ball_height=0.4)
+    fused, mujoco = (
+        policy_evaluation.recorded_episodes(
+            random_policy, config, lambda _: networks, EvaluationOptions(seed=31, physics=physics)
+        )
+        for physics in ("fused", "mujoco")
+    )
+    np.testing.assert_array_equal(mujoco.running, fused.running)
+    assert mujoco.running.any(axis=0).all() and not mujoco.running.all()
+    apart = np.abs(mujoco.joint_angles - fused.joint_angles).max(axis=1)[fused.running]
+    assert 0.0 < apart.max() < 1e-3
+
+
 def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
     """The world and the command of the first episode in evaluations with these options, and the
     reports; without a simulation."""
