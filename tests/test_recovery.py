@@ -189,6 +189,27 @@ def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight
     assert_same_training(run, straight)
 
 
+def test_a_warm_start_has_a_best_checkpoint_though_it_was_killed_before(
+    half: Path, tmp_path: Path, monkeypatch
+) -> None:
+    save = CheckpointWriter.save
+
+    def save_latest(writer: CheckpointWriter, names, *rest, **named) -> None:
+        save(writer, ("latest",), *rest, **named)
+        writer.close()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(CheckpointWriter, "save", save_latest)
+        train(tmp_path, 64, "--warm-start", str(half))
+    (run,) = tmp_path.iterdir()
+    assert latest_checkpoint(run).steps == 0 and not (run / "checkpoints/best").exists()
+    # As if no later policy were better.
+    monkeypatch.setattr(Progress, "improves", lambda *_: False)
+    resume(run)
+    assert best_checkpoint(run).steps == 0
+
+
 @pytest.mark.parametrize("moment", ["while it is written", "between the renamings", "at the end"])
 def test_a_checkpoint_counts_until_the_next_is_complete(
     run: Path, straight: Path, moment: str

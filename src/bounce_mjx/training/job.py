@@ -324,7 +324,8 @@ class _Job:
         for i, member in enumerate(self.members):
             best = member.run / folders.CHECKPOINTS / "best"
             stored = self.steps in folders.stored_checkpoints(best)
-            missing = member.progress.best_steps == self.steps > 0 and not stored
+            progress = member.progress
+            missing = progress.best is not None and progress.best_steps == self.steps and not stored
             if self.resumed and missing:
                 # The process was killed after saving the latest checkpoint and before saving the
                 # best one.
