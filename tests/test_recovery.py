@@ -183,8 +183,11 @@ def test_results_that_are_newer_than_the_checkpoint_do_not_count(run: Path, stra
 def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight: Path) -> None:
     assert best_checkpoint(run).steps == latest_checkpoint(run).steps
     shutil.rmtree(run / "checkpoints/best")
+    # As after a kill in the middle of a write.
+    (run / ".unfinished-0123.json").touch()
     resume(run)
     assert best_checkpoint(run).steps == latest_checkpoint(run).steps
+    assert not list(run.rglob(".unfinished-*"))
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
 

@@ -10,9 +10,10 @@ import re
 import shlex
 import shutil
 import threading
+import time
 import types
 import unittest.mock
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import jax
@@ -148,15 +149,29 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
     counts from the writing of its config."""
     stamps = "2026-01-02_10-00-00", "2026-01-02_10-00-00_2", "2026-01-02_10-00-00_10"
     names = ["zebra", "2026-01-01_10-00-00", *stamps, "apple", "2026-01-04_10-00-00 long"]
-    times = {"zebra": datetime(2025, 12, 31), "apple": datetime(2026, 1, 3)}
+    times = {"zebra": datetime(2025, 12, 31, tzinfo=UTC), "apple": datetime(2026, 1, 3, tzinfo=UTC)}
     for name in sorted(names):
         (tmp_path / name / "checkpoints/best/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
-        time = times.get(name, datetime(2030, 1, 1)).timestamp()
-        os.utime(tmp_path / name / "config.yaml", (time, time))
+        written = times.get(name, datetime(2030, 1, 1, tzinfo=UTC)).timestamp()
+        os.utime(tmp_path / name / "config.yaml", (written, written))
     while names:
         assert newest_run(tmp_path).name == names.pop()
         shutil.rmtree(newest_run(tmp_path))
+
+
+def test_the_newest_run_is_newest_in_every_time_zone(tmp_path: Path, monkeypatch) -> None:
+    """As with a container in UTC on the runs of a machine that is not."""
+    try:
+        for zone in ("XXX-9", "UTC", "XXX+9"):
+            monkeypatch.setenv("TZ", zone)
+            time.tzset()
+            run = create_run(TrainConfig(log_dir=tmp_path))
+            (run / "checkpoints/best/64").mkdir(parents=True)
+            assert newest_run(tmp_path) == run
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from bounce_mjx.errors import UserError
 
+UNFINISHED = ".unfinished-"
+"""Start of the name of a file that is being written."""
+
 
 def read_regular(path: Path, limit: int) -> bytes:
     """Reads a regular file, or one that a link leads to.
@@ -56,7 +59,7 @@ def new_file(path: Path) -> Iterator[Path]:
     Raises:
       OSError: the file cannot be made, or cannot replace the other.
     """
-    new = path.with_name(f".unfinished-{os.urandom(8).hex()}{path.suffix}")
+    new = path.with_name(f"{UNFINISHED}{os.urandom(8).hex()}{path.suffix}")
     # Fails if there is anything with this name, even a link that leads nowhere.
     os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     try:

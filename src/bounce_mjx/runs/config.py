@@ -92,7 +92,7 @@ class TrainConfig(StrictModel):
     """The run with whose policy and value network the training starts, or the name of a policy that
     comes with the package. Its environment and hidden layers take the place of the preset's."""
     log_dir: PlainPath
-    """Folder in which the run creates its own, named by the time."""
+    """Folder in which the run creates its own, named by the time (UTC)."""
 
     def __eq__(self, other: object) -> bool:
         """Equal settings are equal, whichever class of `train_config` has them."""

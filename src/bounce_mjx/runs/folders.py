@@ -1,6 +1,6 @@
 """Folders of runs and checkpoints, and functions that find them.
 
-    runs/<task>/<time stamp>/
+    runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files (`runs.robot`)
         task/                           a copy of the task's file (`runs.task`)
@@ -71,13 +71,14 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 
 
 def create_run(config: TrainConfig) -> Path:
-    """Creates a new run's folder, named after the current time, with the config in it.
+    """Creates a new run's folder, named after the current time (UTC), with the config in it.
 
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
     check_name(config.log_dir.absolute())
-    stamp = datetime.datetime.now().strftime(_STAMP)
+    # Not the local time, which is another one on another machine, and in autumn goes back.
+    stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
     try:
         config.log_dir.mkdir(parents=True, exist_ok=True)
         for copy in itertools.count(1):
@@ -303,8 +304,8 @@ def _started(run: Path) -> tuple[float, int, str]:
     found = re.search(r"(\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d)(?:_(\d+))?", run.name)
     if found is not None:
         with contextlib.suppress(ValueError, OverflowError):
-            time = datetime.datetime.strptime(found[1], _STAMP).timestamp()
-            return time, int(found[2] or 1), run.name
+            time = datetime.datetime.strptime(found[1], _STAMP).replace(tzinfo=datetime.UTC)
+            return time.timestamp(), int(found[2] or 1), run.name
     return os.path.getmtime(run / CONFIG_FILE), 1, run.name
 
 

@@ -22,6 +22,7 @@ import bounce_mjx
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.files import UNFINISHED
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
@@ -250,6 +251,10 @@ class _Job:
 
     def _resume(self) -> None:
         folders.check_links(self.run)
+        if hosts.is_leader():
+            # What a process that was killed was writing.
+            for path in self.run.rglob(f"{UNFINISHED}*"):
+                path.unlink(missing_ok=True)
         latest = folders.latest_checkpoint(self.run)
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
