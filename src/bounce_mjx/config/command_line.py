@@ -167,6 +167,8 @@ def _metavar(field: FieldInfo, spec: PrimitiveConstructorSpec | None) -> str | N
     form = re.sub(r"\[(.+?) \[\1 \.\.\.\]\]", r"\1 ...", form)
     if "," not in form:
         form = form.strip("{}")
+    if tyro.conf.UseAppendAction in field.metadata:
+        form = form.removesuffix(" ...")
     return f"[{form}]" if tyro.conf.Positional in field.metadata else form
 
 
