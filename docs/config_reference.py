@@ -14,9 +14,10 @@ from bounce_mjx.tasks.registry import DEFAULT, find_task
 _HEAD = """# Config reference
 
 Every setting of a training run for the task bounce; [other tasks](write-a-task.md) have other
-keys in `env`. In a YAML file (`--config FILE`, see [training](training.md)) the keys are nested
-groups. A preset overrides the defaults, a robot (`--robot`) the preset, and a command-line flag all
-of them. Unknown keys and values out of range are refused.
+keys in `env`. In a YAML file (`--config FILE`, see [training](training.md#a-file-of-your-own)) the
+keys are nested groups. A preset overrides the defaults, a file of yours the preset, a robot
+(`--robot`) the file, and a command-line flag all of them. Unknown keys and values out of range are
+refused.
 
 Each section lists the keys of one group. A key's flag is its full name without `env.` or `ppo.`
 and with hyphens: `--num-envs` for `ppo.num_envs`, and `--reward.height.weight` for

@@ -26,6 +26,7 @@ from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands.main import COMMANDS
 from bounce_mjx.commands.main import main as console_script
+from bounce_mjx.config import command_line
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -155,6 +156,10 @@ BAD_YAML = {
     "list": (b"- 1\n", "a list", "mapping", "configs/default.yaml"),
     "no YAML": (b"ppo: [1\nseed: {", "cannot be read", "line 2", "configs/default.yaml"),
     "binary": (bytes(range(256)), "cannot be read", "utf-8", "configs/default.yaml"),
+    "key twice": (
+        b"ppo: {num_envs: 8}\nenv: {}\nppo: {discount: 0.9}",
+        "the key ppo appears twice, in lines 1 and 3; join the two",
+    ),
     "unknown key": (b"zzz: 3", "unknown key zzz", "known keys here are", "total_steps"),
     "near miss": (b"ppo: {num_env: 3}", "unknown key ppo.num_env;", "did you mean ppo.num_envs?"),
     "deep near miss": (
@@ -186,6 +191,31 @@ def test_bad_config_file(fails: Fails, tmp_path: Path, case: tuple) -> None:
     text, *words = case
     (tmp_path / "my.yaml").write_bytes(text)
     assert_says(fails(train_command.main, ["--config", "my.yaml"]), ["my.yaml", *words])
+
+
+def test_a_path_that_libraries_would_misspell_is_refused(fails: Fails, tmp_path: Path) -> None:
+    name = os.fsdecode(b"a\xff")
+    shutil.copyfile(resource_path("mjcf/bounce_ball.xml"), tmp_path / f"{name}.xml")
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "config.yaml").write_text("seed: 1")
+    for main, args in (
+        (train_command.main, [*TINY, "--log-dir", name]),
+        (train_command.main, [*TINY, "--mjcf", f"{name}.xml"]),
+        (train_command.main, ["--resume", name]),
+        (eval_command.main, [name]),
+    ):
+        assert_says(fails(main, args), ("a\\udcff", "is not UTF-8", "rename"))
+    code = "import pathlib, bounce_mjx.files; bounce_mjx.files.check_name(pathlib.Path('{}'))"
+    unlike_utf8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    for word, environment, status in (
+        ("caf\\xe9", unlike_utf8, 1),
+        ("cafe", unlike_utf8, 0),
+        ("caf\\xe9", {"PYTHONUTF8": "1"}, 0),
+    ):
+        command = [sys.executable, "-c", code.format(word)]
+        done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True)
+        assert done.returncode == status, done.stderr
+        assert status == 0 or "or the locale of this process is not" in done.stderr
 
 
 def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Path) -> None:
@@ -484,9 +514,9 @@ def test_an_evaluation_in_a_pipe_says_only_what_is_worth_a_line(
     monkeypatch, compiling: float, seconds: float, said: list[str]
 ) -> None:
     now = 0.0
-    monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
+    monkeypatch.setattr(command_line.time, "monotonic", lambda: now)
     shown = io.StringIO()
-    with eval_command._progress(Console(file=shown)) as progress:
+    with command_line.progress(Console(file=shown), "evaluating", "evaluated") as progress:
         for share in (0.1, 0.3, 0.5, 0.7, 0.9, 1.0):
             now = compiling + share * seconds
             progress(share)

@@ -405,6 +405,10 @@ def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
     rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
     assert rows[2 + SPEED].split()[-4:] == ["0.1", "to", "1.5", "-"]
     assert rows[-1].strip() == "upward speed: not judged (targets 0.4 only)"
+    # As of a task that had nothing to measure.
+    results[SPEED] = dataclasses.replace(results[SPEED], bound="0.1 to 1.5", value=None)
+    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
+    assert rows[-1].strip() == "upward speed: not judged"
 
 
 def test_fresh_statistics_fail_without_a_crash(env):
@@ -655,6 +659,24 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     broken = evaluate_on_c(random_policy._replace(params=params), key)
     np.testing.assert_array_equal(broken.steps, 1)
     assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
+
+
+@pytest.mark.slow
+def test_episodes_are_recorded_on_the_engine_that_is_asked_for(
+    networks, random_policy, monkeypatch
+):
+    monkeypatch.setattr(policy_evaluation, "RECORDED_EPISODES", 4)
+    config = EnvConfig(episode_seconds=0.3, min_ball_height=0.4)
+    fused, mujoco = (
+        policy_evaluation.recorded_episodes(
+            random_policy, config, lambda _: networks, EvaluationOptions(seed=31, physics=physics)
+        )
+        for physics in ("fused", "mujoco")
+    )
+    np.testing.assert_array_equal(mujoco.running, fused.running)
+    assert mujoco.running.any(axis=0).all() and not mujoco.running.all()
+    apart = np.abs(mujoco.joint_angles - fused.joint_angles).max(axis=1)[fused.running]
+    assert 0.0 < apart.max() < 1e-3
 
 
 def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):

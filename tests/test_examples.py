@@ -85,6 +85,8 @@ def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeyp
         notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     ).execute()
     shown = [output.data for cell in code for output in cell.outputs if "data" in output]
+    printed = "".join(out.get("text", "") for cell in code for out in cell.outputs)
+    assert "written: first.mp4" in printed and "\x1b" not in printed
     video, table, curves = shown
     assert "data:video/mp4" in video["text/html"] and "image/png" in curves
     runs = [next((tmp_path / "runs" / name).iterdir()) for name in ("first", "calm")]

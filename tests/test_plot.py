@@ -1,6 +1,7 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
+import contextlib
 import dataclasses
 import importlib.util
 import io
@@ -42,6 +43,7 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
+from bounce_mjx.training import log as training_log
 from bounce_mjx.training.log import WandbLog, open_log
 from tiny_runs import TINY
 
@@ -121,6 +123,37 @@ def test_a_label_names_few_settings(tmp_path: Path) -> None:
     ]
     labels = [group.label for group in group_runs(runs)]
     assert labels[1] == "num_envs 64, rollout_length 16, num_epochs 2 … (one seed)"
+
+
+def test_a_label_tells_settings_of_one_name_apart(tmp_path: Path) -> None:
+    logs, runs = {"episode/return": {1: 1.0}}, []
+    for height, position in ((1.0, 2.0), (3.0, 4.0)):
+        weights = {"height": {"weight": height}, "position": {"weight": position}}
+        config = TrainConfig(env={"reward": weights})
+        runs.append(write_run(tmp_path / str(height), config, logs))
+    labels = [group.label for group in group_runs(runs)]
+    assert labels[1] == "position.weight 4.0, height.weight 3.0 (one seed)"
+
+
+def test_a_resumed_run_logs_later_though_the_clock_went_back(tmp_path: Path, monkeypatch) -> None:
+    config = TrainConfig()
+    for seconds, value in ((7200.0, 1.0), (3600.0, 2.0)):
+        monkeypatch.setattr(training_log.time, "time", lambda seconds=seconds: seconds)
+        with contextlib.closing(open_log(tmp_path, first_step=0, config=config)) as log:
+            log.add_scalar("episode/return", value, 64)
+    points = EventAccumulator(str(tmp_path)).Reload().Scalars("episode/return")
+    assert [(point.step, point.value) for point in points] == [(64, 2.0)]
+
+
+def test_a_report_that_cannot_be_written_names_no_flag(
+    trained: Path, tmp_path: Path, capsys
+) -> None:
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / "replay.html").mkdir()
+    with pytest.raises(SystemExit):
+        report_command.main([str(run)])
+    said = capsys.readouterr().err
+    assert "replay.html cannot be written" in said and "--html" not in said
 
 
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
@@ -504,6 +537,20 @@ def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monk
     # A resumed training continues the same run.
     WandbLog(tmp_path, "bounce", config)
     assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
+
+
+@pytest.mark.slow
+def test_a_run_that_weights_and_biases_refuses_leaves_no_folder(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    refusing = FakeWandb()
+    refusing.init = lambda **_: (_ for _ in ()).throw(ValueError("no account"))
+    monkeypatch.setitem(sys.modules, "wandb", refusing)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(SystemExit):
+        train_command.main([*TINY, "--wandb", "bounce", "--log-dir", str(tmp_path)])
+    assert "--wandb bounce is refused (no account)" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_weights_and_biases_is_optional(monkeypatch, capsys) -> None:

@@ -183,10 +183,34 @@ def test_results_that_are_newer_than_the_checkpoint_do_not_count(run: Path, stra
 def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight: Path) -> None:
     assert best_checkpoint(run).steps == latest_checkpoint(run).steps
     shutil.rmtree(run / "checkpoints/best")
+    # As after a kill in the middle of a write.
+    (run / ".unfinished-0123.json").touch()
     resume(run)
     assert best_checkpoint(run).steps == latest_checkpoint(run).steps
+    assert not list(run.rglob(".unfinished-*"))
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
+
+
+def test_a_warm_start_has_a_best_checkpoint_though_it_was_killed_before(
+    half: Path, tmp_path: Path, monkeypatch
+) -> None:
+    save = CheckpointWriter.save
+
+    def save_latest(writer: CheckpointWriter, names, *rest, **named) -> None:
+        save(writer, ("latest",), *rest, **named)
+        writer.close()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(CheckpointWriter, "save", save_latest)
+        train(tmp_path, 64, "--warm-start", str(half))
+    (run,) = tmp_path.iterdir()
+    assert latest_checkpoint(run).steps == 0 and not (run / "checkpoints/best").exists()
+    # As if no later policy were better.
+    monkeypatch.setattr(Progress, "improves", lambda *_: False)
+    resume(run)
+    assert best_checkpoint(run).steps == 0
 
 
 @pytest.mark.parametrize("moment", ["while it is written", "between the renamings", "at the end"])

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -9,8 +10,10 @@ import re
 import shlex
 import shutil
 import threading
+import time
 import types
-from datetime import datetime
+import unittest.mock
+from datetime import UTC, datetime
 from pathlib import Path
 
 import jax
@@ -28,6 +31,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs import folders, writing
 from bounce_mjx.runs.config import (
     TrainConfig,
     load_config,
@@ -145,15 +149,29 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
     counts from the writing of its config."""
     stamps = "2026-01-02_10-00-00", "2026-01-02_10-00-00_2", "2026-01-02_10-00-00_10"
     names = ["zebra", "2026-01-01_10-00-00", *stamps, "apple", "2026-01-04_10-00-00 long"]
-    times = {"zebra": datetime(2025, 12, 31), "apple": datetime(2026, 1, 3)}
+    times = {"zebra": datetime(2025, 12, 31, tzinfo=UTC), "apple": datetime(2026, 1, 3, tzinfo=UTC)}
     for name in sorted(names):
         (tmp_path / name / "checkpoints/best/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
-        time = times.get(name, datetime(2030, 1, 1)).timestamp()
-        os.utime(tmp_path / name / "config.yaml", (time, time))
+        written = times.get(name, datetime(2030, 1, 1, tzinfo=UTC)).timestamp()
+        os.utime(tmp_path / name / "config.yaml", (written, written))
     while names:
         assert newest_run(tmp_path).name == names.pop()
         shutil.rmtree(newest_run(tmp_path))
+
+
+def test_the_newest_run_is_newest_in_every_time_zone(tmp_path: Path, monkeypatch) -> None:
+    """As with a container in UTC on the runs of a machine that is not."""
+    try:
+        for zone in ("XXX-9", "UTC", "XXX+9"):
+            monkeypatch.setenv("TZ", zone)
+            time.tzset()
+            run = create_run(TrainConfig(log_dir=tmp_path))
+            (run / "checkpoints/best/64").mkdir(parents=True)
+            assert newest_run(tmp_path) == run
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
@@ -358,6 +376,77 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
     assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
     assert read_preset(Path("seed")).seed == 3
     assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
+
+
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch) -> Path:
+    """A working directory on a machine without an accelerator, with a preset of the user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    (tmp_path / "my.yaml").write_text("ppo: {learning_rate: 0.001}")
+    return tmp_path
+
+
+def read_file(folder: Path, text: str) -> TrainConfig:
+    (folder / "given.yaml").write_text(text)
+    return read_preset(Path("given.yaml"))
+
+
+def test_a_file_of_the_user_lies_on_the_preset_of_its_task(presets: Path) -> None:
+    assert read_file(presets, "").ppo == read_preset(Path("cpu")).ppo
+    given = read_file(presets, "ppo: {learning_rate: 0.001}").ppo
+    cpu = read_preset(Path("cpu")).ppo
+    assert given == cpu.model_copy(update={"learning_rate": 0.001}) != cpu
+    assert read_file(presets, "task: track") == read_preset(Path("cpu"), task="track")
+    assert read_file(presets, "base: robust") == read_preset(Path("robust"))
+    alone = read_file(presets, "base: null\nseed: 3")
+    assert alone == TrainConfig(seed=3)
+    with pytest.raises(UserError, match="given.yaml: base is 'nope'; give the name of a preset"):
+        read_file(presets, "base: nope")
+    on_gpu = read_preset(Path("my.yaml"), machine=Path("default"))
+    assert on_gpu.ppo.num_envs == read_preset(Path("default")).ppo.num_envs != cpu.num_envs
+
+
+def test_a_run_keeps_its_settings_as_a_preset(presets: Path) -> None:
+    config = TrainConfig(seed=3, total_steps=1000, log_dir=presets)
+    run = create_run(config)
+    assert load_run_config(run) == read_preset(run / "config.yaml") == config
+    # A setting that a later version adds must not come from the preset.
+    text = (run / "config.yaml").read_text().replace("stop_when_solved: false\n", "")
+    assert not read_file(presets, text).stop_when_solved
+
+
+def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
+    (presets / "more.yaml").write_text("ppo: {learning_rate: 0.002, discount: 0.9}")
+    orders = {
+        "--config my.yaml --config=more.yaml": 0.002,
+        "--config more.yaml --config my.yaml": 0.001,
+    }
+    for flags, rate in orders.items():
+        command = train_command.read_command(flags.split())
+        assert command.ppo.learning_rate == rate and command.ppo.discount == 0.9
+        assert command.ppo.num_envs == read_preset(None).ppo.num_envs
+        cpu, *given = command.config
+        assert cpu == resource_path("configs/cpu.yaml")
+        assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
+    (presets / "more.yaml").write_text("base: robust")
+    with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
+        read_preset([Path("my.yaml"), Path("more.yaml")])
+
+
+def test_a_checkpoint_whose_arrays_went_elsewhere_gets_no_name(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(writing, "_save_arrays", lambda folder, tree: None)
+    with pytest.raises(FileNotFoundError):
+        writing._write_checkpoint(tmp_path / "8", {"policy": {}}, "{}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(folders, "write_atomically", unittest.mock.Mock(side_effect=full))
+    with pytest.raises(UserError, match="cannot be made in .*No space left on device"):
+        create_run(TrainConfig(log_dir=tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:

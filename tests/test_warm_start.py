@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -132,6 +133,17 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
 
 def load_run_config_of(name: str):
     return load_run_config(pretrained_checkpoint(name).run)
+
+
+def test_the_latest_run_is_that_of_the_task_wherever_the_new_one_lies(
+    tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs/bounce_ball/2026-01-01_00-00-00"
+    shutil.copytree(pretrained_checkpoint("robust_small").run, run)
+    command = train_command.read_command("--warm-start latest --log-dir new".split())
+    assert command.warm_start == best_checkpoint(run).folder
+    assert command.log_dir == Path("new")
 
 
 MISTAKES = {

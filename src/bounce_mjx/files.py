@@ -8,6 +8,11 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from bounce_mjx.errors import UserError
+
+UNFINISHED = ".unfinished-"
+"""Start of the name of a file that is being written."""
+
 
 def read_regular(path: Path, limit: int) -> bytes:
     """Reads a regular file, or one that a link leads to.
@@ -29,6 +34,21 @@ def read_regular(path: Path, limit: int) -> bytes:
     return content
 
 
+def check_name(path: Path) -> None:
+    """Refuses a path that libraries which write names in UTF-8 would take for another one.
+
+    Raises:
+      UserError: a name is not UTF-8, or the locale is not and a name is not ASCII.
+    """
+    with contextlib.suppress(UnicodeEncodeError):
+        if os.fsencode(path) == str(path).encode():
+            return
+    raise UserError(
+        f"the path {path} is not UTF-8, or the locale of this process is not; rename what is not "
+        "ASCII in it, or set LC_ALL=C.UTF-8"
+    )
+
+
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Yields a new, empty file next to `path`, with its suffix, which replaces it at the end of the
@@ -39,7 +59,7 @@ def new_file(path: Path) -> Iterator[Path]:
     Raises:
       OSError: the file cannot be made, or cannot replace the other.
     """
-    new = path.with_name(f".unfinished-{os.urandom(8).hex()}{path.suffix}")
+    new = path.with_name(f"{UNFINISHED}{os.urandom(8).hex()}{path.suffix}")
     # Fails if there is anything with this name, even a link that leads nowhere.
     os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     try:

@@ -1,18 +1,14 @@
 """Measures the results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
 
-import contextlib
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
-from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.command_line import progress, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -24,9 +20,6 @@ from bounce_mjx.evaluation.config import (
 )
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
-
-# Lines about the progress are left out where less time than this is left.
-_SILENT_SECONDS = 10.0
 
 
 class EvalCommand(WorldCommand, OneActorCommand):
@@ -85,14 +78,14 @@ def main(args: Sequence[str]) -> None:
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
-    with _progress(console) as progress:
+    with progress(console, "evaluating", "evaluated") as shown:
         report, engine, warnings = evaluate_policy(
             policy,
             config.env,
             actor,
             options,
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
-            progress=progress,
+            progress=shown,
         )
     for warning in warnings:
         console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
@@ -116,26 +109,3 @@ def main(args: Sequence[str]) -> None:
         with writable(command.json_file, "give another file with --json"):
             write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
-
-
-@contextlib.contextmanager
-def _progress(console: Console) -> Iterator[Callable[[float], None]]:
-    """A function that shows the share of the evaluation that is done, from 0 to 1: as a bar on a
-    terminal; elsewhere, as a line after each tenth of an evaluation whose rest is slow."""
-    # The first call follows the compilation.
-    said, first, started = 0.0, 0.0, None
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("compiling", total=1.0)
-
-        def show(share: float) -> None:
-            nonlocal said, first, started
-            bar.update(task, completed=share, description="evaluating")
-            if started is None:
-                first, started = share, time.monotonic()
-            spent, left = time.monotonic() - started, 1.0 - share
-            slow = spent * left >= _SILENT_SECONDS * (share - first)
-            if not console.is_terminal and slow and left and share - max(said, first) > 0.0999:
-                said = share
-                console.print(f"{share:.0%} evaluated", highlight=False)
-
-        yield show

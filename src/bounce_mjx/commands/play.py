@@ -156,6 +156,7 @@ def _replay_log(
 
 def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
     """The environment and the policy of a checkpoint."""
+    from bounce_mjx.reports.tables import count_text
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.viewers.controllers import make_policy_controller
@@ -169,5 +170,5 @@ def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) 
 
     title = checkpoint.run.name
     if checkpoint is not MIRROR_LAW:
-        title += f", {checkpoint.steps / 1e6:.1f} M steps"
+        title += f", {count_text(checkpoint.steps)} steps"
     return Shown(config.env, make_controller, title)

@@ -1,5 +1,6 @@
 """Writes the report of a run: `bounce-mjx report [RUN]`."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,7 @@ from rich.console import Console
 
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import parse
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import interruptible
 from bounce_mjx.viewers.options import ViewerOptions
@@ -35,10 +36,13 @@ def main(args: Sequence[str]) -> None:
         from bounce_mjx.viewers.show import show
 
     checkpoint, console = find_checkpoint(named_run(command.run, command.folder)), Console()
+    page = checkpoint.run / REPLAY_FILE
+    if page.is_dir() or not os.access(checkpoint.run, os.W_OK):
+        raise UserError(f"{page} cannot be written; make its folder writable, and its place free")
     config = command.config(checkpoint.run)
     set_up_jax(config.env)
     shown = load_shown(checkpoint, config, console)
     recording = record_checkpoint(checkpoint)
-    show([shown], ViewerOptions(html=checkpoint.run / REPLAY_FILE), commands={}, console=console)
-    path, _ = write_report(checkpoint.run, recording)
-    print(path)
+    show([shown], ViewerOptions(html=page), commands={}, console=console)
+    report, _ = write_report(checkpoint.run, recording)
+    print(report)

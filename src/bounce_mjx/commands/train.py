@@ -79,9 +79,9 @@ def main(args: Sequence[str]) -> None:
             leave(0)
 
 
-def read_command(args: Sequence[str], preset: Path | None = None) -> TrainCommand:
+def read_command(args: Sequence[str], machine: Path | None = None) -> TrainCommand:
     """The command line on top of the preset or of the resumed run's config (`command`)."""
-    return read_training(TrainCommand, args, prog=PROG, preset=preset)
+    return read_training(TrainCommand, args, prog=PROG, machine=machine)
 
 
 def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int] | None:

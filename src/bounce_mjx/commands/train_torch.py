@@ -31,7 +31,7 @@ class TorchTrainCommand(TrainingCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     read = functools.partial(read_training, TorchTrainCommand, args, prog=PROG)
-    command = read(preset=default_preset(has_plugin()))
+    command = read(machine=default_preset(has_plugin()))
     with interruptible_imports():
         from bounce_mjx.runs.folders import latest_checkpoint
         from bounce_mjx.training.job import library_of

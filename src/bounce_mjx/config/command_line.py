@@ -1,18 +1,22 @@
 """Command lines made from config types, with one-sentence errors."""
 
+import contextlib
 import dataclasses
 import difflib
 import itertools
 import re
 import sys
+import time
 import typing
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import pydantic
 import tyro
 from pydantic.fields import FieldInfo
 from rich.console import Console
+from rich.progress import Progress
 
 # tyro's own hook for replacing its error boxes; unstable, so pyproject.toml bounds the version.
 from tyro import _errors as tyro_errors
@@ -32,6 +36,9 @@ from bounce_mjx.errors import UserError
 
 CommandT = TypeVar("CommandT")
 
+# Lines about the progress are left out where less time than this is left.
+_SILENT_SECONDS = 10.0
+
 # Columns: more than any table or line has.
 _NO_WRAP = 100_000
 
@@ -49,6 +56,34 @@ def stdout(**options: Any) -> Console:
     if not console.is_terminal:
         console.width = _NO_WRAP
     return console
+
+
+@contextlib.contextmanager
+def progress(console: Console, doing: str, done: str) -> Iterator[Callable[[float], None]]:
+    """A function that shows the share of a task that is done, from 0 to 1: as a bar on a terminal;
+    elsewhere, as a line after each tenth of a task whose rest is slow.
+
+    Args:
+      doing: what the task does, such as "evaluating".
+      done: what is done with the share, such as "evaluated".
+    """
+    # The first call follows the compilation.
+    said, first, started = 0.0, 0.0, None
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("compiling", total=1.0)
+
+        def show(share: float) -> None:
+            nonlocal said, first, started
+            bar.update(task, completed=share, description=doing)
+            if started is None:
+                first, started = share, time.monotonic()
+            spent, left = time.monotonic() - started, 1.0 - share
+            slow = spent * left >= _SILENT_SECONDS * (share - first)
+            if not console.is_terminal and slow and left and share - max(said, first) > 0.0999:
+                said = share
+                console.print(f"{share:.0%} {done}", highlight=False)
+
+        yield show
 
 
 def parse(
@@ -132,6 +167,8 @@ def _metavar(field: FieldInfo, spec: PrimitiveConstructorSpec | None) -> str | N
     form = re.sub(r"\[(.+?) \[\1 \.\.\.\]\]", r"\1 ...", form)
     if "," not in form:
         form = form.strip("{}")
+    if tyro.conf.UseAppendAction in field.metadata:
+        form = form.removesuffix(" ...")
     return f"[{form}]" if tyro.conf.Positional in field.metadata else form
 
 
@@ -154,7 +191,8 @@ def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> 
                 words.append(flag if value.lower() == "true" else _negated(flag))
                 continue
         types = set(_types(kind))
-        parts = value.split(",") if tuple in types else [value]
+        # The name of a file may have commas.
+        parts = value.split(",") if tuple in types and Path not in types else [value]
         if int in types:
             parts = [str(whole_number(part)) for part in parts]
         if len(parts) > 1 and flag:

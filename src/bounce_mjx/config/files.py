@@ -14,7 +14,8 @@ _MAX_ALIASES = 10
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML whose size multiplies because repeated groups contain repeated groups."""
+    """Refuses YAML in which a key appears twice, or whose size multiplies because repeated groups
+    contain repeated groups."""
 
     _aliases = 0
 
@@ -24,6 +25,18 @@ class _Loader(yaml.SafeLoader):
         self._aliases += is_alias and isinstance(node, yaml.CollectionNode)
         if self._aliases > _MAX_ALIASES:
             raise yaml.YAMLError(f"it repeats a group more than {_MAX_ALIASES} times")
+        return node
+
+    def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        first: dict[Any, yaml.Node] = {}
+        for key, _ in node.value:
+            name = (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else key
+            if (other := first.setdefault(name, key)) is not key:
+                lines = f"{other.start_mark.line + 1} and {key.start_mark.line + 1}"
+                raise yaml.YAMLError(
+                    f"the key {key.value} appears twice, in lines {lines}; join the two"
+                )
         return node
 
 

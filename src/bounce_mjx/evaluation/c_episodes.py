@@ -1,5 +1,6 @@
 """Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
 
+import functools
 import os
 from collections.abc import Callable
 
@@ -11,6 +12,7 @@ from mujoco import rollout
 
 from bounce_mjx.env.env import Env, world_model
 from bounce_mjx.evaluation.episodes import reset_episodes
+from bounce_mjx.evaluation.recording import empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import (
@@ -21,6 +23,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.parameters import contact_pairs
 from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -41,6 +44,19 @@ def make_mujoco_evaluator(
     Args:
       progress: called every 100 control steps with the share of the time limit that is simulated.
     """
+    measure = make_recording_mujoco_evaluator(env, actor, episodes, 0, progress)
+    return lambda policy, key, ranges=None: measure(policy, key, ranges)[0]
+
+
+def make_recording_mujoco_evaluator(
+    env: Env,
+    actor: Actor,
+    episodes: int,
+    recorded: int,
+    progress: Callable[[float], None] | None = None,
+) -> Callable[..., tuple[Statistics, Recording]]:
+    """Like `make_mujoco_evaluator`, but also returns a recording of the first `recorded`
+    episodes."""
     num_threads = os.cpu_count() or 1
 
     @jax.jit
@@ -64,18 +80,22 @@ def make_mujoco_evaluator(
             (control.air_drag, control.air_lift),
         )
 
-    @jax.jit
-    def finish(states, actions, physics, statistics, step):
+    @functools.partial(jax.jit, donate_argnames="recording")
+    def finish(states, actions, physics, statistics, step, recording):
         states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(states, actions, physics)
-        return states, accumulate(env, statistics, states, step)
+        recording = record(env, recording, states, statistics.running, step)
+        return states, accumulate(env, statistics, states, step), recording
 
-    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
+    def evaluate(
+        policy: Policy, key: jax.Array, ranges: Ranges | None = None
+    ) -> tuple[Statistics, Recording]:
         states = start(key, ranges)
         simulated = full_states(env.mj_model, states.pipeline_state.physics)
         ball_velocity = _ball_velocity(env.mj_model)
         models = episode_models(env, states.pipeline_state.parameters)
         data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
         statistics = empty_statistics(env, states)
+        recording = empty_recording(env, states, min(recorded, episodes))
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
                 actions, states, *inputs = decide(policy, states)
@@ -88,14 +108,16 @@ def make_mujoco_evaluator(
                     simulated[:, ball_velocity] += push.reshape(-1, episodes).T
                 simulated = _next_states(pool, models, data, simulated, targets, *air)
                 physics = physics_states(env.mj_model, simulated)
-                states, statistics = finish(states, actions, physics, statistics, step)
+                states, statistics, recording = finish(
+                    states, actions, physics, statistics, step, recording
+                )
                 if step % 100 < 99:
                     continue
                 if not np.any(statistics.running):
                     break
                 if progress is not None:
                     progress((step + 1) / env.config.episode_steps)
-        return statistics
+        return statistics, recording
 
     return evaluate
 

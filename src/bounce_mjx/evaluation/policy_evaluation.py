@@ -7,7 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
+from bounce_mjx.evaluation.c_episodes import (
+    make_mujoco_evaluator,
+    make_recording_mujoco_evaluator,
+)
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
@@ -70,10 +73,11 @@ def recorded_episodes(
     actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
 ) -> Recording:
-    """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`. In
-    place of MuJoCo's C engine, the config's simulates."""
+    """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`."""
     env, _, ranges = _prepared(env_config, options)
-    evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
+    on_c = options.physics == "mujoco"
+    make = make_recording_mujoco_evaluator if on_c else make_recording_evaluator
+    evaluate = make(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
     return jax.device_get(evaluate(policy, jax.random.PRNGKey(options.seed), ranges)[1])
 
 

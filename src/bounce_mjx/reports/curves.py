@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,9 +146,17 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     return steps, values.mean(axis=0), values.std(axis=0)
 
 
+def _short_name(name: str, others: Iterable[str]) -> str:
+    """The last parts of a dotted name, as many as tell it from the others."""
+    parts = name.split(".")
+    ends = (".".join(parts[i:]) for i in reversed(range(len(parts))))
+    alone = (end for end in ends if sum(f".{x}".endswith(f".{end}") for x in others) == 1)
+    return next(alone, name)
+
+
 def _label(differences: dict[str, Any], seeds: Sequence[int]) -> str:
     """The label of a group from the seeds of its runs."""
-    named = [f"{name.split('.')[-1]} {value}" for name, value in differences.items()]
+    named = [f"{_short_name(name, differences)} {value}" for name, value in differences.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
     different = len(set(seeds))
     members = "one seed" if different == 1 else f"{different} seeds"

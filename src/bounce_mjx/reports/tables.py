@@ -42,6 +42,13 @@ def figure_text(value: float | None, spec: str = ".2f") -> str:
     return "-" if value is None else f"{value:{spec}}"
 
 
+def count_text(count: float) -> str:
+    """A large number in short, such as 1.23M, 45k or 678."""
+    if count >= 1e6:
+        return f"{count / 1e6:.2f}M"
+    return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:,.0f}"
+
+
 def short_text(value: float | None) -> str:
     """A measured figure as text with one digit after the point, or two below 10."""
     return figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
@@ -65,7 +72,7 @@ def results_table(report: Report, title: str) -> Table:
     for result in report.results:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
-            table.caption = f"{result.name}: not judged ({condition}"
+            table.caption = f"{result.name}: not judged" + (condition and f" ({condition}")
             table.caption_justify = "left"
         colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
         table.add_row(result.name, result.measured, figure_text(result.value), bound, colour)

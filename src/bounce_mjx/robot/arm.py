@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
+from bounce_mjx.files import check_name
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.limits import check_files
@@ -94,6 +95,7 @@ def locate(mjcf: Path) -> Path:
     if not path.is_file():
         wrong = "is not a file" if path.exists() else "does not exist"
         raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
+    check_name(path)
     return path
 
 

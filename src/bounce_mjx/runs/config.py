@@ -4,6 +4,7 @@ import functools
 import importlib.metadata
 import importlib.util
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -23,7 +24,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.resources import resource_path
+from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_copy
 from bounce_mjx.runs.robot import ROBOT
@@ -41,6 +42,8 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import NamedWorld, read_world
 
 CONFIG_FILE = "config.yaml"
+BASE = "base"
+"""Key of a config file with the name of the preset on which it lies, or null for none."""
 ROBOTS = "configs/robots"
 """Folder of the package with configs of robots."""
 WORLDS = "configs/worlds"
@@ -89,7 +92,7 @@ class TrainConfig(StrictModel):
     """The run with whose policy and value network the training starts, or the name of a policy that
     comes with the package. Its environment and hidden layers take the place of the preset's."""
     log_dir: PlainPath
-    """Folder in which the run creates its own, named by the time."""
+    """Folder in which the run creates its own, named by the time (UTC)."""
 
     def __eq__(self, other: object) -> bool:
         """Equal settings are equal, whichever class of `train_config` has them."""
@@ -157,7 +160,8 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
         is a file that the user has not named.
     """
     path = run / CONFIG_FILE
-    values = _read(path)
+    values = {"task": DEFAULT} | _read(path)
+    values.pop(BASE, None)
     config = validate(train_config(task_of_run(values["task"], run, task)), values, str(path))
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
         check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
@@ -165,12 +169,17 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
 
 
 def load_config(
-    path: Path, robot: Path | None = None, task: str | None = None, world: Path | None = None
+    path: Path | Sequence[Path],
+    robot: Path | None = None,
+    task: str | None = None,
+    world: Path | None = None,
 ) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
     MJCF file starts at the folder of the YAML file.
 
     Args:
+      path: the file, or several, each of which lies on those before it; `base` is for
+        `preset_files`.
       robot: config of a robot, whose keys win over those of the file.
       task: the task as the user names it; by default, the file's.
       world: file of a named world, which replaces that of the file and may have a robot.
@@ -179,8 +188,11 @@ def load_config(
       UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
         its task is a file that the user has not named.
     """
-    values = _read(path)
-    name = task or values["task"]
+    files = [path] if isinstance(path, Path) else path
+    path = " on ".join(map(shown_file, reversed(files)))
+    values = functools.reduce(merged, map(_read, files), {})
+    values.pop(BASE, None)
+    name = task or values.get("task", DEFAULT)
     if task is None and is_file(name):
         raise UserError(
             f"{path} has its task in the file {name}, which is code; name it yourself to run it: "
@@ -198,7 +210,7 @@ def load_config(
         robot = _robot_of(named, world)
     if robot is not None:
         values = merged(values, _robot_for(config_class().env.task, robot))
-    source = str(path) if robot is None else f"{path} with {robot}"
+    source = path if robot is None else f"{path} with {robot}"
     config = validate(config_class, values, source)
     if named is None:
         return config
@@ -242,7 +254,7 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
     """The values of a robot's config for a task. Those of another task are replaced by the task's
     own for an arm with this paddle."""
     values = _read(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
-    name = values.pop("task")
+    name = values.pop("task", DEFAULT)
     its_task = known_task(name) if is_file(name) else find_task(name)
     if its_task is None:
         raise UserError(
@@ -261,33 +273,87 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
 
 
 def read_preset(
-    path: Path | None,
+    path: Path | Sequence[Path] | None,
     robot: Path | None = None,
     task: str | None = None,
     world: Path | None = None,
+    machine: Path | None = None,
 ) -> TrainConfig:
-    """Reads a preset: a YAML file, or the name of a file in configs/; by default, the preset for
-    this machine. A task may have its own preset of that name, in the folder of configs/ that has
-    its name.
+    """Reads the config of the files in `preset_files`.
 
     Args:
+      path: see `preset_files`.
       robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
         in configs/robots/.
-      task: the task as the user names it; by default, the preset's.
+      task: the task as the user names it; by default, the files'.
       world: a named world, which replaces the preset's: a YAML file, or the name of a file in
         configs/worlds/.
+      machine: see `preset_files`.
 
     Raises:
-      UserError: the file is missing or invalid.
+      UserError: a file is missing or invalid.
     """
-    if path is None:
-        path = default_preset(has_accelerator())
-    path = _named(named_file(path, f"configs/{task or DEFAULT}"), "configs", "preset")
+    files = preset_files(path, task, machine)
     robot, world = (
         robot and _named(robot, ROBOTS, "robot"),
         world and _named(world, WORLDS, "world"),
     )
-    return load_config(path, robot, task, world)
+    return load_config(files, robot, task, world)
+
+
+def preset_files(
+    path: Path | Sequence[Path] | None, task: str | None = None, machine: Path | None = None
+) -> list[Path]:
+    """The files of a config, each of which lies on those before it.
+
+    A preset of the package stands alone. A file of the user's lies on the preset for this machine,
+    or on the one that its key `base` names; with `base: null`, as in a run's config, it stands
+    alone.
+
+    Args:
+      path: a YAML file or the name of a file in configs/, or several, each of which lies on those
+        before it; by default, the preset for this machine. A task may have its own preset of a
+        name, in the folder of configs/ that has the task's name.
+      task: the task as the user names it; by default, the files'.
+      machine: name of the preset for this machine, where JAX's devices may not start yet.
+
+    Raises:
+      UserError: a file is missing or invalid, or names a base that is not used.
+    """
+    given = [path] if isinstance(path, Path) else list(path or ())
+    if task is None:
+        own = [_read(file) for file in given if os.path.exists(file)]
+        task = next((values["task"] for values in reversed(own) if "task" in values), DEFAULT)
+    names = f"configs/{task}"
+    files = [_named(named_file(file, names), "configs", "preset") for file in given]
+    bases = {file: values[BASE] for file in files if BASE in (values := _read(file))}
+    if unused := bases.keys() - files[:1]:
+        raise UserError(
+            f"{min(unused)} lies on {files[0]}, so its {BASE} is not used; leave it out, or give "
+            "that file first"
+        )
+    if files and (_is_preset(files[0]) or bases.get(files[0], "") is None):
+        return files
+    base = bases[files[0]] if bases else machine or default_preset(has_accelerator())
+    presets = [resource_path(f"{folder}/{base}.yaml") for folder in (names, "configs")]
+    if not (found := list(filter(os.path.isfile, presets))):
+        raise UserError(
+            f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset in configs/, "
+            "such as cpu, or null"
+        )
+    return [found[0], *files]
+
+
+def shown_file(file: Path) -> str:
+    """A config file for the user's eyes: one of the package's without the package's folder."""
+    package = resource_path("configs").parent
+    return str(file.relative_to(package) if file.is_relative_to(package) else file)
+
+
+def _is_preset(file: Path) -> bool:
+    """Whether a file comes with the package."""
+    folders = (resource_path(name).resolve() for name in ("configs", PRETRAINED))
+    return any(file.resolve().is_relative_to(folder) for folder in folders)
 
 
 def _named(path: Path, folder: str, kind: str) -> Path:
@@ -330,8 +396,8 @@ def has_plugin() -> bool:
 
 
 def _read(path: Path, kind: str = "config file", example: str = _EXAMPLE) -> dict[str, Any]:
-    """The values of a config file (`read_mapping`) with the name of the task, and absolute paths of
-    the MJCF file and of the task's file."""
+    """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
+    task's file."""
     values = read_mapping(path, kind, example)
     name, env = values.get("task", DEFAULT), values.get("env")
     if not isinstance(name, str):
@@ -341,4 +407,4 @@ def _read(path: Path, kind: str = "config file", example: str = _EXAMPLE) -> dic
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):
         values = values | {"env": env | {"mjcf": str(path.parent / mjcf)}}
-    return values | {"task": name}
+    return values | {"task": name} if "task" in values else values

@@ -1,6 +1,6 @@
 """Folders of runs and checkpoints, and functions that find them.
 
-    runs/<task>/<time stamp>/
+    runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files (`runs.robot`)
         task/                           a copy of the task's file (`runs.task`)
@@ -34,8 +34,9 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
+from bounce_mjx.files import check_name
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, runs_folder
+from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
@@ -70,12 +71,14 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 
 
 def create_run(config: TrainConfig) -> Path:
-    """Creates a new run's folder, named after the current time, with the config in it.
+    """Creates a new run's folder, named after the current time (UTC), with the config in it.
 
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
-    stamp = datetime.datetime.now().strftime(_STAMP)
+    check_name(config.log_dir.absolute())
+    # Not the local time, which is another one on another machine, and in autumn goes back.
+    stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
     try:
         config.log_dir.mkdir(parents=True, exist_ok=True)
         for copy in itertools.count(1):
@@ -86,8 +89,8 @@ def create_run(config: TrainConfig) -> Path:
                 continue
             try:
                 save_config(folder, config)
-            except UserError:
-                shutil.rmtree(folder)
+            except (UserError, OSError):
+                shutil.rmtree(folder, ignore_errors=True)
                 raise
             return folder
     except OSError as error:
@@ -113,7 +116,7 @@ def save_config(run: Path, config: TrainConfig) -> None:
 
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
-    head = f"# bounce_mjx {bounce_mjx.__version__}\n"
+    head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
     write_atomically(run / CONFIG_FILE, head + dump_config(config))
 
 
@@ -155,6 +158,7 @@ def find_run(path: Path) -> Path:
         if (folder / CONFIG_FILE).is_file():
             if _CONTROL.search(str(folder)):
                 raise UserError(f"{folder} has a control character in its name; rename it")
+            check_name(folder.absolute())
             return folder
     raise UserError(
         f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
@@ -300,8 +304,8 @@ def _started(run: Path) -> tuple[float, int, str]:
     found = re.search(r"(\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d)(?:_(\d+))?", run.name)
     if found is not None:
         with contextlib.suppress(ValueError, OverflowError):
-            time = datetime.datetime.strptime(found[1], _STAMP).timestamp()
-            return time, int(found[2] or 1), run.name
+            time = datetime.datetime.strptime(found[1], _STAMP).replace(tzinfo=datetime.UTC)
+            return time.timestamp(), int(found[2] or 1), run.name
     return os.path.getmtime(run / CONFIG_FILE), 1, run.name
 
 

@@ -138,7 +138,8 @@ def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
         for name, tree in items.items():
             _save_arrays(unfinished / name, tree)
         (unfinished / RECORD_FILE).write_text(record, encoding="utf-8")
-        for path in unfinished.rglob("*"):
+        # By name: tensorstore may have written the arrays of an item elsewhere.
+        for path in (*(unfinished / name for name in items), *unfinished.rglob("*")):
             sync(path)
         seal(unfinished)
         sync(unfinished)

@@ -14,6 +14,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import (
     TrainConfig,
     load_run_config,
+    preset_files,
     read_preset,
     runs_folder,
     train_config,
@@ -28,10 +29,11 @@ class TrainingCommand(TrainConfig):
 
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
     ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
-    config: Path | None = None
-    """Preset: a YAML file, or the name of one in configs/, such as cpu, robust or finetune;
-    a task's own preset of that name, such as configs/track/cpu.yaml, has priority. The default is
-    default on an accelerator, and cpu on a CPU."""
+    config: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Preset: the name of a YAML file in configs/, such as cpu, robust or finetune; a task's own
+    preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on an
+    accelerator, and cpu on a CPU. A YAML file of yours lies on that default, or on the preset that
+    its key base names. Given again, each file lies on those before it."""
     robot: Path | None = None
     """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
     one in configs/robots/ (ur5e, panda or iiwa)."""
@@ -57,21 +59,22 @@ def read_training(
     args: Sequence[str],
     *,
     prog: str,
-    preset: Path | None = None,
+    machine: Path | None = None,
 ) -> CommandT:
-    """Reads a command line on top of the preset, or of the resumed run's config.
+    """Reads a command line on top of the preset, or of the resumed run's config. Its `config` are
+    the files of that preset, each of which lies on those before it.
 
     Args:
-      preset: the preset if the command line names none; by default, this machine's.
+      machine: name of the preset for this machine, where JAX's devices may not start yet.
 
     Raises:
       UserError: a flag or the preset is wrong, or a flag changes a key of the resumed run that must
         stay the same.
     """
-    config_path, resume = path_flag(args, "--config"), path_flag(args, "--resume")
+    configs, resume = list(map(Path, early_flags(args, "--config"))), path_flag(args, "--resume")
     robot, world = path_flag(args, "--robot"), path_flag(args, "--world")
     task, warm_start = early_flag(args, "--task"), path_flag(args, "--warm-start")
-    for given, flag in ((config_path, "--config"), (robot, "--robot"), (world, "--world")):
+    for given, flag in ((configs, "--config"), (robot, "--robot"), (world, "--world")):
         if given and resume:
             raise UserError(f"{flag} and --resume cannot be combined; a resumed run has its config")
     if warm_start and robot:
@@ -93,15 +96,14 @@ def read_training(
     elif warm_start:
         from bounce_mjx.training.warm_start import warm_config
 
-        log_dir = path_flag(args, "--log-dir") or runs_folder(find_task(task or DEFAULT))
-        base = warm_config(warm_start, log_dir, config_path or preset, task, world)
+        base = warm_config(warm_start, configs, task, world, machine)
     else:
-        base = read_preset(config_path or preset, robot, task, world)
+        base = read_preset(configs, robot, task, world, machine)
     start = base
     if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
         start = base.model_copy(update={"stop_when_solved": False})
     own_class = train_config(base.env.task, command_class)
-    default = own_class(**dict(start), config=config_path, robot=robot, world=world, resume=resume)
+    default = own_class(**dict(start), robot=robot, world=world, resume=resume)
     command = parse(own_class, args, prog=prog, default=default)
     if warm_start and not resume:
         # By its own name, if it was the latest.
@@ -114,7 +116,9 @@ def read_training(
                 f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
                 "start a new run"
             )
-    return command
+        return command
+    files = preset_files(configs, base.task, machine)
+    return command.model_copy(update={"config": tuple(files)})
 
 
 def _is_solved(run: Path) -> bool:
@@ -141,10 +145,15 @@ def early_flag(args: Sequence[str], flag: str) -> str | None:
     """The value of a flag that must be read before the others, in every spelling that the parser
     accepts: with - or _ in the name, and with = or a space before the value. If the flag is
     repeated, the last value counts."""
-    value = None
+    return next(reversed(early_flags(args, flag)), None)
+
+
+def early_flags(args: Sequence[str], flag: str) -> list[str]:
+    """All values of a flag that may be repeated, as for `early_flag`."""
+    values = []
     for i, word in enumerate(args):
         name, equals, given = word.partition("=")
         if name.startswith("--") and name.replace("_", "-") == flag:
             following = args[i + 1] if i + 1 < len(args) else ""
-            value = given if equals else following
-    return value
+            values.append(given if equals else following)
+    return values

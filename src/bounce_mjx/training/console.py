@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.reports.tables import figure_text, results_markdown
+from bounce_mjx.reports.tables import count_text, figure_text, results_markdown
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.trainer import Watcher
@@ -77,7 +77,7 @@ class Reporter:
         for name, last in self._last.items():
             self._last[name] = np.where(np.isfinite(means[name]), means[name], last)
         rate = means["speed/steps_per_second"][0]
-        figures = f"{steps / 1e6:.1f}M steps  {_short(rate)} steps/s"
+        figures = f"{count_text(steps)} steps  {count_text(rate)} steps/s"
         for tag, values in self._last.items():
             form = ".0f" if tag == "episode/return" else ".3g"
             figures += f"  {tag.rpartition('/')[2]} {_mean_and_deviation(values, form)}"
@@ -152,7 +152,7 @@ class Reporter:
         kind = "evaluation"
         if reports[0].screening:
             kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"
-        self.say(f"{kind} at {steps / 1e6:.1f}M steps: {line}")
+        self.say(f"{kind} at {count_text(steps)} steps: {line}")
 
 
 def say(console: Console, line: str) -> None:
@@ -164,7 +164,3 @@ def _mean_and_deviation(values: np.ndarray, form: str) -> str:
     if len(values) == 1:
         return f"{values[0]:{form}}"
     return f"{np.mean(values):{form}} +- {np.std(values):{form}}"
-
-
-def _short(rate: float) -> str:
-    return f"{rate / 1e6:.2f}M" if rate >= 1e6 else f"{rate / 1e3:.0f}k"

@@ -22,6 +22,7 @@ import bounce_mjx
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.files import UNFINISHED
 from bounce_mjx.garbage import no_garbage_collection
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
@@ -166,6 +167,8 @@ class _Job:
         self.steps = 0
         self.writers: list[CheckpointWriter] = []
         self.run = folders.find_run(options.resume) if self.resumed else self._create()
+        self.started = False
+        stack.push(self._remove_unstarted)
         hosts.advise(self._advice)
         if hosts.is_leader():
             stack.enter_context(lock_run(self.run))
@@ -221,6 +224,11 @@ class _Job:
         run = str(folders.create_run(self.config)) if hosts.is_leader() else None
         return Path(hosts.text_from_leader(run))
 
+    def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
+        """Removes the folder of a new run whose training did not start."""
+        if error is not None and not (self.started or self.resumed) and hosts.is_leader():
+            shutil.rmtree(self.run, ignore_errors=True)
+
     def _seed_runs(self) -> list[SeedRun]:
         config, seconds = self.config, self.clock.seconds
         if config.num_seeds == 1:
@@ -243,6 +251,10 @@ class _Job:
 
     def _resume(self) -> None:
         folders.check_links(self.run)
+        if hosts.is_leader():
+            # What a process that was killed was writing.
+            for path in self.run.rglob(f"{UNFINISHED}*"):
+                path.unlink(missing_ok=True)
         latest = folders.latest_checkpoint(self.run)
         check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
@@ -272,12 +284,13 @@ class _Job:
             if not self.stop.wait_for(compiling):
                 if self.resumed:
                     raise TrainingStopped(f"stopped before anything was trained; {self._go_on}")
-                if hosts.is_leader():
-                    shutil.rmtree(self.run, ignore_errors=True)
                 raise TrainingStopped(
                     f"stopped before anything was trained, so its folder {self.run} is removed"
                 )
             opening = compiling.result()
+            if self.options.wandb is not None:
+                # It may refuse the run.
+                opening.result()
             # A process that finds its programs in the cache waits here for a process that compiles
             # them; otherwise the exchange between devices would time out after 30 s.
             hosts.any_of(False)
@@ -292,6 +305,7 @@ class _Job:
         self.reporter = self.stack.enter_context(
             Reporter(opening.result, self.console, self.config, self.steps, self.options.watcher)
         )
+        self.started = True
         self.clock.lap("compile")
 
     def _compile(self) -> concurrent.futures.Future:
@@ -315,7 +329,8 @@ class _Job:
         for i, member in enumerate(self.members):
             best = member.run / folders.CHECKPOINTS / "best"
             stored = self.steps in folders.stored_checkpoints(best)
-            missing = member.progress.best_steps == self.steps > 0 and not stored
+            progress = member.progress
+            missing = progress.best is not None and progress.best_steps == self.steps and not stored
             if self.resumed and missing:
                 # The process was killed after saving the latest checkpoint and before saving the
                 # best one.

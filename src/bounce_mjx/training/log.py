@@ -57,7 +57,13 @@ class TensorBoardLog:
             from tensorboardX.record_writer import masked_crc32c
         self._summary, self._events, self._checksum = summary, event_pb2, masked_crc32c
         run.mkdir(parents=True, exist_ok=True)
-        started = int(time.time())
+        # TensorBoard reads the files in the order of these numbers, and a clock may go back.
+        earlier = [
+            int(n)
+            for path in run.glob("events.out.tfevents.*")
+            if (n := path.name.split(".")[3]).isdecimal()
+        ]
+        started = max([int(time.time()), *(number + 1 for number in earlier)])
         self._path = run / f"events.out.tfevents.{started}.{socket.gethostname()}{suffix}"
         self._waiting, self._flushed = bytearray(), time.monotonic()
         self._add(file_version="brain.Event:2")

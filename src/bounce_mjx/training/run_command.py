@@ -13,7 +13,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, install_command, reason_of
 from bounce_mjx.interrupt import leave, run_interruptible
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, shown_file
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
@@ -45,6 +45,10 @@ def run_command(
             f"{install_command('bounce_mjx[wandb]')}"
         )
     console = stdout(quiet=not hosts.is_leader())
+    if command.resume is None:
+        say(console, f"config: {' on '.join(map(shown_file, reversed(command.config)))}")
+        if command.warm_start is not None:
+            say(console, f"warm start: {command.warm_start}")
     # A later command has to name the task's file again.
     task = f" --task {shlex.quote(command.task)}" if is_file(command.task) else ""
     try:

@@ -1,5 +1,6 @@
 """A training that starts with the networks of an earlier one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -11,28 +12,41 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.resources import POLICIES
-from bounce_mjx.runs.config import TrainConfig, in_world, load_run_config, read_preset
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    in_world,
+    load_run_config,
+    read_preset,
+    runs_folder,
+)
 from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint
 from bounce_mjx.runs.reading import policy_shapes, read_networks
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT, find_task
 
 
 def warm_config(
-    policy: Path, log_dir: Path, preset: Path | None, task: str | None, world: Path | None
+    policy: Path,
+    presets: Sequence[Path],
+    task: str | None,
+    world: Path | None,
+    machine: Path | None,
 ) -> TrainConfig:
     """The config of a training that starts with a policy: its environment and networks, and the
     other settings of a preset.
 
     Args:
-      log_dir: folder of the runs among which `latest` is found.
+      policy: a run or a policy; `latest` is the newest run in the folder of the task's runs.
+      presets: see `preset_files`, as for `machine`.
       task: the policy's task as the user names it.
       world: a named world in place of the policy's.
 
     Raises:
       UserError: the policy, the preset or the world is missing or wrong.
     """
-    checkpoint = _checkpoint(policy, log_dir)
+    checkpoint = _checkpoint(policy, find_task(task or DEFAULT))
     own = load_run_config(checkpoint.run, task)
-    base = read_preset(preset, task=own.task)
+    base = read_preset(presets, task=own.task, machine=machine)
     networks = {key: getattr(own.ppo, key) for key in ("hidden_layers", "critic_metrics")}
     ppo = base.ppo.model_copy(update=networks)
     start = policy if str(policy) in POLICIES else checkpoint.folder
@@ -50,7 +64,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
       UserError: the checkpoint is missing, damaged or without a value network, or its observation
         or hidden layers are not those of the training.
     """
-    checkpoint = _checkpoint(config.warm_start, config.log_dir)
+    checkpoint = _checkpoint(config.warm_start, config.env.task)
     own = load_run_config(checkpoint.run)
     if own.env.layout != config.env.layout or policy_shapes(own) != policy_shapes(config):
         raise UserError(
@@ -79,5 +93,5 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
     return params, seen
 
 
-def _checkpoint(policy: Path, log_dir: Path) -> Checkpoint:
-    return choose_checkpoint(policy, log_dir, Console(quiet=True))
+def _checkpoint(policy: Path, task: type[Task]) -> Checkpoint:
+    return choose_checkpoint(policy, runs_folder(task), Console(quiet=True))

@@ -30,7 +30,7 @@ def write_page(
       UserError: the file cannot be written.
     """
     text = replay(env, recording, fps or _DEFAULT_FPS, names)
-    with writable(path, "give another file with --html"):
+    with writable(path, "make room there, or give another file"):
         write_output(path, text)
 
 

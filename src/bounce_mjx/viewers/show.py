@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
+from bounce_mjx.config.command_line import progress
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
@@ -95,10 +96,11 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
     def present(simulation: Simulation, start: PageStart) -> None:
         with console.status("recording"):
             recording = simulation.record(options.seconds or _RECORDED_SECONDS)
-            if film is not None:
-                film.write(simulation, recording)
             if options.html is not None:
                 write_page(options.html, simulation.env, recording, options.fps, start.names)
+        if film is not None:
+            with progress(console, "drawing", "drawn") as shown:
+                film.write(simulation, recording, shown)
         for path in (options.video, options.html):
             if path is not None:
                 console.out(f"written: {path}", highlight=False)

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -89,8 +89,13 @@ class VideoWriter:
         self._ffmpeg = find_ffmpeg()
         choose_opengl()
 
-    def write(self, simulation: Simulation, recording: EnvFrame) -> None:
+    def write(
+        self, simulation: Simulation, recording: EnvFrame, progress: Callable[[float], None]
+    ) -> None:
         """Writes a recording of the simulation's first environment.
+
+        Args:
+          progress: called with the share that is written.
 
         Raises:
           UserError: the file cannot be written.
@@ -105,9 +110,10 @@ class VideoWriter:
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
                 with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
-                    for picture in self._pictures(simulation.env, frames):
+                    for i, picture in enumerate(self._pictures(simulation.env, frames)):
                         stop.check()
                         encoder.stdin.write(picture.tobytes())
+                        progress((i + 1) / len(frames.time))
                 _, errors = encoder.communicate()
                 if encoder.returncode:
                     reason = " ".join(errors.decode(errors="replace").split())
