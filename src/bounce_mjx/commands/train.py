@@ -9,7 +9,7 @@ from rich.console import Console
 
 from bounce_mjx.config.settings import HostName, whole_number
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, read_training
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
@@ -45,7 +45,7 @@ class TrainCommand(TrainingCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     several_hosts, known_engines = _hosts(args), ()
-    with exit_on_user_error(), interruptible_imports():
+    with exit_on_user_error():
         if several_hosts is None:
             command = read_command(args, default_preset(has_plugin()))
             known_engines = (command.env,)
