@@ -13,6 +13,7 @@ from types import ModuleType
 import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import end_on_ctrl_c
+from bounce_mjx.lazy import spare_opengl
 
 COMMANDS = {
     "train": "train a policy",
@@ -49,6 +50,7 @@ def main(args: Sequence[str] | None = None) -> None:
     # Python looks for garbage after so many new objects. Those of imports and of JAX's programs are
     # hardly ever garbage.
     gc.set_threshold(10_000)
+    spare_opengl()
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
         if name in ("--help", "-h"):
