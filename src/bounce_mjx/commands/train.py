@@ -44,14 +44,12 @@ class TrainCommand(TrainingCommand):
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    several_hosts, known_engines = _hosts(args), ()
+    several_hosts = _hosts(args)
     with exit_on_user_error():
-        if several_hosts is None:
-            command = read_command(args, default_preset(has_plugin()))
-            known_engines = (command.env,)
+        command = read_command(args, default_preset(has_plugin()))
         from bounce_mjx.training.setup import find_devices, set_up_jax
 
-        set_up_jax(*known_engines)
+        set_up_jax(command.env)
         if several_hosts is None:
             # CUDA starts during the imports.
             find_devices()
@@ -63,7 +61,7 @@ def main(args: Sequence[str]) -> None:
         if several_hosts is not None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
-        if several_hosts is not None or has_plugin() != has_accelerator():
+        if has_plugin() != has_accelerator():
             command = read_command(args)
         page = None
         if command.watch and hosts.is_leader():
