@@ -82,7 +82,7 @@ def main(args: Sequence[str]) -> None:
         for path, checkpoints, of_row in zip(command.policies, members, configs, strict=True):
             figures = []
             for checkpoint, config in zip(checkpoints, of_row, strict=True):
-                actor = read_actor(checkpoint, config)
+                _, *actor = read_actor(checkpoint, config)
                 figures.append(measure(*actor, config.env, options, show))
                 done += 1
             task_and_robot = of_row[0].task, robot_name(of_row[0].env)

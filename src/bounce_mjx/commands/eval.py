@@ -74,7 +74,7 @@ def main(args: Sequence[str]) -> None:
         )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
-    policy, actor = read_actor(checkpoint, config)
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     console.out(f"checkpoint: {checkpoint.folder}{steps}", highlight=False)
     options = EvaluationOptions(

@@ -157,8 +157,8 @@ def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) 
     from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
 
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-    policy, actor = read_actor(checkpoint, config)
 
     def make_controller(env: "Env") -> "Controller":
         return make_policy_controller(actor(env), policy)

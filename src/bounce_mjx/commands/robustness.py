@@ -81,7 +81,7 @@ def main(args: Sequence[str]) -> None:
         conditions, version = conditions[: 1 + len(assumed)], ""
         suite = f"twice what {command.world} assumes"
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
-    policy, actor = read_actor(checkpoint, config)
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
     out = command.out or (Path("robustness") if no_run else checkpoint.run)
     # Fails before the measurement if its results could not be written.

@@ -43,7 +43,7 @@ from bounce_mjx.training.trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
-from bounce_mjx.training.warm_start import read_start
+from bounce_mjx.training.warm_start import present_start, read_start
 
 Tree = TypeVar("Tree")
 
@@ -114,6 +114,9 @@ def train(
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
     """
+    if options.resume is None and (present := present_start(config)) != config:
+        was, config = config.warm_start, present
+        say(console, f"{was} was replaced meanwhile: starting from {config.warm_start}")
     hosts.agree(config, options.resume)
     config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:

@@ -1,5 +1,6 @@
 """A training that starts with the networks of an earlier one."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -12,8 +13,8 @@ from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import TrainConfig, in_world, load_run_config, read_preset
-from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint
-from bounce_mjx.runs.reading import policy_shapes, read_networks
+from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint, replacement
+from bounce_mjx.runs.reading import policy_shapes, read_networks, read_newest
 
 
 def warm_config(
@@ -40,6 +41,13 @@ def warm_config(
     return config if world is None else in_world(config, world)[0]
 
 
+def present_start(config: TrainConfig) -> TrainConfig:
+    """The config with the checkpoint that another training has put in the place of `warm_start`
+    since the command line was read."""
+    newer = config.warm_start and replacement(config.warm_start)
+    return config.model_copy(update={"warm_start": newer}) if newer else config
+
+
 def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
     """The networks with which a training starts, and the statistics of their inputs.
 
@@ -57,7 +65,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
         )
-    params, statistics, names = read_networks(checkpoint, own)
+    _, (params, statistics, names) = read_newest(checkpoint, partial(read_networks, config=own))
     size = own.env.layout.size
     wanted = names_of_critic_metrics(config.ppo, env)
     known = np.array([True] * size + [name in names for name in wanted])
