@@ -19,6 +19,7 @@ import yaml
 import bounce_mjx
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.training.setup import set_up_jax
 
 CHECKOUT = Path(__file__).parent.parent
 
@@ -209,6 +210,12 @@ def test_help_of_a_command_names_it(name: str, capsys) -> None:
     assert f"usage: bounce-mjx {name} " in capsys.readouterr().out
 
 
+def test_a_start_without_compilation_is_said(capsys) -> None:
+    with jax.disable_jit():
+        set_up_jax()
+    assert re.fullmatch(r"warning: JAX_DISABLE_JIT .+\n", capsys.readouterr().err)
+
+
 def test_every_command_is_a_module() -> None:
     for name in console_script.COMMANDS:
         assert callable(
@@ -216,10 +223,18 @@ def test_every_command_is_a_module() -> None:
         )
 
 
+@pytest.mark.parametrize("options", [[], ["-OO"]], ids=["", "without docstrings"])
 @pytest.mark.parametrize("module", ["bounce_mjx", "bounce_mjx.eval"])
-def test_the_console_script_is_also_a_module(module: str) -> None:
+def test_the_console_script_is_also_a_module(module: str, options: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", module, *(["eval"] if module == "bounce_mjx" else []), "--help"],
+        [
+            sys.executable,
+            *options,
+            "-m",
+            module,
+            *(["eval"] if module == "bounce_mjx" else []),
+            "--help",
+        ],
         capture_output=True,
         text=True,
         check=True,

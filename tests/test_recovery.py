@@ -484,6 +484,20 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
     assert not list(run.glob(".*"))
 
 
+def test_the_lock_follows_a_run_whose_folder_is_moved(run: Path, tmp_path: Path) -> None:
+    config = load_run_config(run)
+    writer = CheckpointWriter(run, config)
+    with lock_run(run):
+        run.rename(tmp_path / "moved")
+        writer.save(("latest",), STEPS, {"array": np.zeros(3)})
+        assert writer.problem() is None
+        with pytest.raises(UserError, match="is in use"), lock_run(run):
+            pass
+        writer.close()
+    with lock_run(run):
+        pass
+
+
 # Readers
 
 
