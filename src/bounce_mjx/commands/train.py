@@ -8,7 +8,7 @@ from pydantic import Field
 from rich.console import Console
 
 from bounce_mjx.config.settings import HostName, whole_number
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, read_training
@@ -46,10 +46,15 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     several_hosts = _hosts(args)
     with exit_on_user_error():
-        command = read_command(args, default_preset(has_plugin()))
-        from bounce_mjx.training.setup import find_devices, set_up_jax
+        try:
+            command = read_command(args, default_preset(has_plugin()))
+            from bounce_mjx.training.setup import find_devices, set_up_jax
 
-        set_up_jax(command.env)
+            set_up_jax(command.env)
+        except UserError:
+            # The other hosts learn of the mistake below, once they are joined.
+            if several_hosts is None:
+                raise
         if several_hosts is None:
             # CUDA starts during the imports.
             find_devices()
@@ -61,7 +66,7 @@ def main(args: Sequence[str]) -> None:
         if several_hosts is not None:
             # JAX must not be asked for its devices before.
             hosts.join(*several_hosts)
-        if has_plugin() != has_accelerator():
+        if several_hosts is not None or has_plugin() != has_accelerator():
             command = read_command(args)
         page = None
         if command.watch and hosts.is_leader():
