@@ -117,7 +117,8 @@ class CheckpointWriter:
         """Makes the run's folder again if the user has moved or removed it, so that the new state
         is kept, and can be resumed."""
         if not (self._run / CONFIG_FILE).exists():
-            self._run.mkdir(parents=True, exist_ok=True)
+            if not self._run.exists():
+                self._run.mkdir(parents=True)
             # The training's own lock is that of the folder that was moved; if only the config is
             # missing, it still holds.
             with contextlib.suppress(UserError):
