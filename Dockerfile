@@ -1,6 +1,6 @@
 # Image for training on NVIDIA GPUs:
 #   docker build -t bounce_mjx .
-#   docker run --gpus all -v "$PWD/runs:/app/runs" bounce_mjx --stop-when-solved
+#   docker run --init --gpus all -v "$PWD/runs:/app/runs" bounce_mjx --stop-when-solved
 FROM python:3.12-slim
 
 # EGL and a software OpenGL driver, to render videos.

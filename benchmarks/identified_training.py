@@ -40,7 +40,7 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     randomization = RandomizationConfig(**{name: (value, value) for name, value in values.items()})
     env = Env(config.env.model_copy(update={"randomization": randomization}))
     set_up_jax(env.config)
-    policy, actor = read_actor(checkpoint, config)
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     commands = neutral_commands(env.config)
     ranges = env.ranges() | commands
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)

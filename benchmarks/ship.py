@@ -18,7 +18,6 @@ from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
-from bounce_mjx.interrupt import run_interruptible
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
@@ -87,8 +86,7 @@ def ship(
     checkpoint = find_checkpoint(run)
     trained_with = _with_packaged_arm(checkpoint.run, load_run_config(checkpoint.run), name)
     policy = read_policy(checkpoint, trained_with)
-    evaluation = run_interruptible(
-        evaluate_policy,
+    evaluation = evaluate_policy(
         policy,
         trained_with.env,
         networks_of(trained_with.ppo),

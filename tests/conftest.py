@@ -43,9 +43,8 @@ os.environ.pop("UV_RUN_RECURSION_DEPTH", None)
 
 def pytest_configure(config: pytest.Config) -> None:
     # A shell script starts a process in the background with SIGINT ignored, and the processes of
-    # the tests about Ctrl-C would inherit that.
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # the tests about Ctrl-C would inherit that. A command leaves a program's own handler alone.
+    signal.signal(signal.SIGINT, lambda *args: signal.default_int_handler(*args))
     # The workers of pytest-xdist inherit the folder.
     if not hasattr(config, "workerinput"):
         os.environ[CACHE] = tempfile.mkdtemp(prefix="bounce_mjx_tests_")

@@ -3,9 +3,12 @@
 import email.message
 import importlib.metadata
 import os
+import pty
 import re
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -16,6 +19,7 @@ import yaml
 import bounce_mjx
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.training.setup import set_up_jax
 
 CHECKOUT = Path(__file__).parent.parent
 
@@ -31,14 +35,76 @@ def test_help_lists_the_commands(capsys) -> None:
     assert sorted(listed.split("|")) == sorted(console_script.COMMANDS)
 
 
-def test_an_output_that_nobody_reads_is_no_traceback() -> None:
-    """Such as that of `bounce-mjx play --help | head`."""
+def lost_pipe() -> int:
+    """The end of a pipe whose reader has ended, such as head."""
     read, write = os.pipe()
     os.close(read)
-    arguments = [sys.executable, "-m", "bounce_mjx", "doctor"]
-    done = subprocess.run(arguments, stdout=write, stderr=subprocess.PIPE, text=True)
-    os.close(write)
-    assert (done.returncode, done.stderr) == (141, "")
+    return write
+
+
+def lost_terminal() -> int:
+    """A terminal that is closed, as by the end of an ssh connection."""
+    master, slave = pty.openpty()
+    os.close(master)
+    return slave
+
+
+LOST = {
+    "pipe": lost_pipe,
+    "terminal": lost_terminal,
+    "full disk": lambda: os.open("/dev/full", os.O_WRONLY),
+}
+
+
+@pytest.mark.parametrize("lost", LOST.values(), ids=LOST)
+@pytest.mark.parametrize(("args", "status"), [(["doctor"], 0), (["evl"], 2)])
+def test_an_output_that_cannot_be_written_is_dropped(
+    lost: Callable[[], int], args: list[str], status: int
+) -> None:
+    """A mistake is said on stderr."""
+    command = [sys.executable, "-m", "bounce_mjx", *args]
+    output = lost()
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    streams["stderr" if status else "stdout"] = output
+    done = subprocess.run(command, **streams, text=True)
+    os.close(output)
+    assert done.returncode == status
+    assert not done.stderr and not done.stdout
+
+
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-"])
+def test_a_command_may_start_without_its_output(closed: str, tmp_path: Path) -> None:
+    """No file gets the number of the output that is closed."""
+    code = (
+        "from bounce_mjx.commands.main import main; main(['--version'])\n"
+        f"file = open({str(tmp_path / 'file')!r}, 'w')\n"
+        "import os; os.write(1, b'to stdout'); assert file.fileno() > 2"
+    )
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", code]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "file").read_text() == ""
+
+
+def test_a_missing_opengl_library_ends_only_what_draws(tmp_path: Path) -> None:
+    """Without the library, PyOpenGL raises this error when MuJoCo imports it."""
+    (tmp_path / "OpenGL.py").write_text("raise AttributeError('glGetError')")
+    paths = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    code = (
+        "from bounce_mjx.commands.main import main; main(['--version'])\n"
+        "import os, mujoco; print(os.environ['MUJOCO_GL'])\n"
+        "main(['view', '--video', 'a.mp4'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"MUJOCO_GL": "egl", "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.splitlines()[1:] == ["egl"], done.stderr
+    assert done.returncode == 2
+    assert re.fullmatch(r"error: .+ MUJOCO_GL=egl does not work here; .+\n", done.stderr)
 
 
 @pytest.mark.parametrize(
@@ -144,6 +210,12 @@ def test_help_of_a_command_names_it(name: str, capsys) -> None:
     assert f"usage: bounce-mjx {name} " in capsys.readouterr().out
 
 
+def test_a_start_without_compilation_is_said(capsys) -> None:
+    with jax.disable_jit():
+        set_up_jax()
+    assert re.fullmatch(r"warning: JAX_DISABLE_JIT .+\n", capsys.readouterr().err)
+
+
 def test_every_command_is_a_module() -> None:
     for name in console_script.COMMANDS:
         assert callable(
@@ -151,10 +223,18 @@ def test_every_command_is_a_module() -> None:
         )
 
 
+@pytest.mark.parametrize("options", [[], ["-OO"]], ids=["", "without docstrings"])
 @pytest.mark.parametrize("module", ["bounce_mjx", "bounce_mjx.eval"])
-def test_the_console_script_is_also_a_module(module: str) -> None:
+def test_the_console_script_is_also_a_module(module: str, options: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", module, *(["eval"] if module == "bounce_mjx" else []), "--help"],
+        [
+            sys.executable,
+            *options,
+            "-m",
+            module,
+            *(["eval"] if module == "bounce_mjx" else []),
+            "--help",
+        ],
         capture_output=True,
         text=True,
         check=True,
@@ -237,7 +317,8 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: 
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
     )
-    assert done.returncode == 130
+    # A shell reports it as status 130.
+    assert done.returncode == -signal.SIGINT
     assert "Traceback" not in done.stderr, done.stderr
     assert not list(tmp_path.iterdir())
 

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -56,8 +57,19 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("user", [None, "", "--xla_cpu_enable_fast_math=false"])
-def test_the_engine_decides_unless_the_user_does(rk4: Path, monkeypatch, user: str | None) -> None:
+@pytest.mark.parametrize(
+    ("user", "joined"),
+    [
+        (None, OPTION),
+        ("", ""),
+        ("--xla_cpu_enable_fast_math=false", f"--xla_cpu_enable_fast_math=false {OPTION}"),
+        ("--xla_backend_extra_options=a", "--xla_backend_extra_options=a"),
+        ("flags.txt", "flags.txt"),
+    ],
+)
+def test_the_engine_decides_unless_the_user_does(
+    rk4: Path, monkeypatch, user: str | None, joined: str
+) -> None:
     def flags(*configs: EnvConfig) -> str | None:
         monkeypatch.delenv("XLA_FLAGS", raising=False)
         if user is not None:
@@ -68,7 +80,7 @@ def test_the_engine_decides_unless_the_user_does(rk4: Path, monkeypatch, user: s
     fused, chosen = EnvConfig(), EnvConfig(physics="fused")
     mjx, falls_to_mjx = EnvConfig(physics="mjx"), EnvConfig(mjcf=rk4)
     for configs in ((fused,), (chosen,), (fused, chosen)):
-        assert flags(*configs) == (OPTION if user is None else user)
+        assert flags(*configs) == joined
     for configs in ((mjx,), (falls_to_mjx,), (fused, mjx), (chosen, falls_to_mjx)):
         assert flags(*configs) == user
 
@@ -92,6 +104,7 @@ main(sys.argv[1:])
     [
         ("train", True),
         ("train --mjcf {rk4}", False),
+        ("train --coordinator-address 127.0.0.1:{port} --num-processes 1 --process-id 0", True),
         pytest.param("train --config {run}/config.yaml", False, marks=pytest.mark.slow),
         pytest.param("view --html {run}/page.html --mjcf {rk4}", False, marks=pytest.mark.slow),
         pytest.param("play pretrained --html {run}/page.html", True, marks=pytest.mark.slow),
@@ -110,8 +123,11 @@ def test_each_command_decides_before_jax_starts_its_devices(
     config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
     config["env"]["physics"] = "mjx"
     (run / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        words = command.format(rk4=rk4, run=run, port=server.getsockname()[1])
     done = subprocess.run(
-        [sys.executable, "-c", COMMAND, *command.format(rk4=rk4, run=run).split()],
+        [sys.executable, "-c", COMMAND, *words.split()],
         env=without_flags(),
         cwd=tmp_path,
         capture_output=True,

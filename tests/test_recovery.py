@@ -5,6 +5,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 import multiprocessing
 import os
@@ -16,6 +17,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,13 +42,14 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import (
     best_checkpoint,
+    find_checkpoint,
     latest_checkpoint,
     save_config,
     stored_checkpoints,
 )
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_policy, read_record
+from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_actor, read_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
@@ -57,6 +60,7 @@ from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
+from bounce_mjx.training.warm_start import present_start
 from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
 
 
@@ -283,7 +287,11 @@ def resume_command(said: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTERM, signal.SIGINT, signal.SIGHUP],
+    ids=["SIGTERM", "Ctrl-C", "SIGHUP"],
+)
 def test_signal_saves_and_says_how_to_resume(
     tmp_path: Path, straight: Path, number: signal.Signals
 ) -> None:
@@ -306,14 +314,16 @@ def test_signal_saves_and_says_how_to_resume(
 
 
 @pytest.mark.slow
-def test_signal_while_compiling_ends_at_once_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+def test_signal_while_compiling_ends_at_once_and_leaves_nothing(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     # Unusual layers, so that the programs are not in the cache.
     args = [*TINY, "--hidden-layers", 24, 24, "--total-steps", 256, "--log-dir", tmp_path / "runs"]
     with job(tmp_path / "log", *args) as training:
         training.wait_until_said("device:")
-        training.process.send_signal(signal.SIGTERM)
-        assert training.wait() == 0, training.said
-    assert "stopped before anything was trained" in training.said
+        training.process.send_signal(number)
+        assert training.wait() == 130, training.said
     assert "Traceback" not in training.said
     assert not list((tmp_path / "runs").iterdir())
 
@@ -379,7 +389,7 @@ def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
         time.sleep(pause)
         process.send_signal(signal.SIGINT)
         # A launcher that forwards the same Ctrl-C must not turn it into a second one.
-        assert process.wait(TIMEOUT) == (-signal.SIGINT if pause else 0)
+        assert process.wait(TIMEOUT) == (130 if pause else 0)
 
 
 def _train_in_silence(args: list[str]) -> None:
@@ -496,6 +506,61 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
     with lock_run(run):
         pass
     assert not list(run.glob(".*"))
+
+
+def test_the_lock_follows_a_run_whose_folder_is_moved(run: Path, tmp_path: Path) -> None:
+    config = load_run_config(run)
+    writer = CheckpointWriter(run, config)
+    with lock_run(run):
+        run.rename(tmp_path / "moved")
+        writer.save(("latest",), STEPS, {"array": np.zeros(3)})
+        assert writer.problem() is None
+        with pytest.raises(UserError, match="is in use"), lock_run(run):
+            pass
+        writer.close()
+    with lock_run(run):
+        pass
+
+
+# Readers
+
+
+def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: Path) -> None:
+    """The policy that it reads is that of the checkpoint that it names."""
+    config = load_run_config(run)
+    policy = read_policy(latest_checkpoint(run), config)
+    ended = threading.Event()
+
+    def save() -> None:
+        writer = CheckpointWriter(run, config)
+        for steps in itertools.count(STEPS):
+            marked = jax.tree.map(lambda leaf, steps=steps: np.full_like(leaf, steps), policy)
+            writer.save(("latest",), steps, marked)
+            if ended.wait(0.02):
+                return writer.close()
+
+    saver = threading.Thread(target=save)
+    saver.start()
+    try:
+        read = [
+            read_actor(find_checkpoint(run / "checkpoints/latest"), config)[:2] for _ in range(10)
+        ]
+    finally:
+        ended.set()
+        saver.join()
+    assert len({checkpoint.steps for checkpoint, _ in read}) > 1
+    for checkpoint, marked in read:
+        if checkpoint.steps >= STEPS:
+            assert all((leaf == checkpoint.steps).all() for leaf in jax.tree.leaves(marked))
+
+
+def test_a_warm_start_takes_the_next_checkpoint_where_a_training_replaces_one(run: Path) -> None:
+    latest = latest_checkpoint(run).folder
+    start = TrainConfig(warm_start=latest.with_name("64"))
+    assert present_start(start).warm_start == latest
+    for kept in (latest, run, Path("robust"), None):
+        config = start.model_copy(update={"warm_start": kept})
+        assert present_start(config) == config
 
 
 # Paths

@@ -601,7 +601,7 @@ def test_ctrl_c_ends_the_wait_for_other_hosts(tmp_path: Path, joined: bool):
         else:
             wait_for_port(address)
         leader.process.send_signal(signal.SIGINT)
-        assert leader.wait() == 130
+        assert leader.wait() == -signal.SIGINT
     assert leader.said == ""
 
 

@@ -9,10 +9,7 @@ import sys
 from collections.abc import Iterator
 from typing import NoReturn
 
-from bounce_mjx.interrupt import INTERRUPTED, Interrupted, leave
-
-# Status of a process that SIGPIPE ends.
-_BROKEN_PIPE = 128 + 13
+from bounce_mjx.interrupt import leave
 
 
 class UserError(Exception):
@@ -79,9 +76,12 @@ def install_command(*words: str) -> str:
 def exit_on_user_error() -> Iterator[None]:
     """Reports a `UserError`, or a `JAX_PLATFORMS` that JAX refuses, as one sentence on stderr and
     exits with status 2; Ctrl-C exits with status 130. Neither prints a traceback, and nor does an
-    output that cannot encode a path, or whose reader has ended, such as head."""
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")
+    output that cannot encode a path, or that cannot be written any more: see `_Output`."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        # Not where a test or a notebook has put its own stream.
+        if stream is getattr(sys, f"__{name}__"):
+            setattr(sys, name, _lasting(stream))
     try:
         yield
     except UserError as error:
@@ -91,23 +91,35 @@ def exit_on_user_error() -> Iterator[None]:
         if refusal is None:
             raise
         _exit_with(refusal)
-    except Interrupted:
-        leave()
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except BrokenPipeError:
-        sys.exit(_BROKEN_PIPE)
-    finally:
-        _flush()
+        leave()
 
 
-def _flush() -> None:
-    """Writes what is printed. Python would do it at its end, and print a traceback if nobody reads
-    it."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+class _Output(io.FileIO):
+    """Standard output or error, which drops everything from the first bytes that cannot be written:
+    the disk is full, or the reader, such as head, or the terminal is gone."""
+
+    def write(self, data: memoryview) -> int | None:
+        try:
+            return super().write(data)
+        except OSError:
+            # Also for the output of C++.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return len(data)
+
+
+def _lasting(stream: io.TextIOWrapper | None) -> io.TextIOWrapper:
+    """A stream on an `_Output`. None stands for one that was closed at the start, as by `>&-`; the
+    lowest free descriptor is its own."""
+    if stream is None:
+        return open(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8")
+    stream.flush()
+    return io.TextIOWrapper(
+        io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False)),
+        encoding=stream.encoding,
+        errors="backslashreplace" if stream.errors == "strict" else stream.errors,
+        line_buffering=stream.line_buffering or stream.write_through,
+    )
 
 
 def _exit_with(sentence: str) -> NoReturn:

@@ -9,6 +9,7 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import os
 import sys
 import types
 from collections.abc import Callable, Sequence
@@ -32,6 +33,19 @@ def silence_mjx() -> None:
         module.print = lambda *_, **__: None
 
     around_import("mujoco.mjx.warp", before=give_silent_print)
+
+
+def spare_opengl() -> None:
+    """Lets a later import of MuJoCo load no OpenGL library: where the one that MUJOCO_GL names is
+    missing, the import would fail, also in a command that draws nothing (`viewers.offscreen` tries
+    the library where something is drawn)."""
+    named = os.environ.get("MUJOCO_GL")
+    if named is not None:
+        around_import(
+            "mujoco.rendering.classic.gl_context",
+            before=lambda _: os.environ.update(MUJOCO_GL="disabled"),
+            after=lambda _: os.environ.update(MUJOCO_GL=named),
+        )
 
 
 def around_import(name: str, before: Hook | None = None, after: Hook | None = None) -> None:
@@ -81,4 +95,4 @@ if TYPE_CHECKING:
 else:
     jax, jnp, mujoco, np = map(_Lazy, ("jax", "jax.numpy", "mujoco", "numpy"))
 
-__all__ = ["around_import", "jax", "jnp", "mujoco", "np", "silence_mjx"]
+__all__ = ["around_import", "jax", "jnp", "mujoco", "np", "silence_mjx", "spare_opengl"]

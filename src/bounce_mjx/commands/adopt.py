@@ -14,8 +14,6 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import exit_on_user_error, on_one_line
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
@@ -47,16 +45,14 @@ class AdoptCommand(StrictModel):
     """Show the arm afterwards, until Ctrl-C."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(AdoptCommand, args, prog="bounce-mjx adopt")
-    with no_garbage_collection():
-        from bounce_mjx.env.env import Env
-        from bounce_mjx.robot.adopt import adopt
-        from bounce_mjx.runs.files import writable, write_output
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.robot.adopt import adopt
+    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax()
     task = find_task(command.task)

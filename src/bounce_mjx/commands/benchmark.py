@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import ActorCommand
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -19,8 +18,6 @@ from bounce_mjx.evaluation.config import (
     Physics,
     on_engine,
 )
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 
 
 class BenchmarkCommand(ActorCommand):
@@ -39,27 +36,25 @@ class BenchmarkCommand(ActorCommand):
     """Folder for benchmark.json, benchmark.md and benchmark.html."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(BenchmarkCommand, args, prog="bounce-mjx benchmark")
-    with no_garbage_collection():
-        import jax
+    import jax
 
-        import bounce_mjx
-        from bounce_mjx.env.env import Env
-        from bounce_mjx.evaluation.benchmark import measure
-        from bounce_mjx.reports import benchmark as reports
-        from bounce_mjx.reports.tables import robot_name
-        from bounce_mjx.runs.files import to_json, writable, write_output
-        from bounce_mjx.runs.folders import runs_of_row
-        from bounce_mjx.runs.reading import read_actor
-        from bounce_mjx.training.setup import set_up_jax
+    import bounce_mjx
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.evaluation.benchmark import measure
+    from bounce_mjx.reports import benchmark as reports
+    from bounce_mjx.reports.tables import robot_name
+    from bounce_mjx.runs.files import to_json, writable, write_output
+    from bounce_mjx.runs.folders import runs_of_row
+    from bounce_mjx.runs.reading import read_actor
+    from bounce_mjx.training.setup import set_up_jax
 
     if not command.policies:
         raise UserError("no policy is given; give one, such as pretrained")
-    console = Console()
+    console = stdout()
     members = [
         [command.choose(path, console) for path in runs_of_row(path)] for path in command.policies
     ]
@@ -87,7 +82,7 @@ def main(args: Sequence[str]) -> None:
         for path, checkpoints, of_row in zip(command.policies, members, configs, strict=True):
             figures = []
             for checkpoint, config in zip(checkpoints, of_row, strict=True):
-                actor = read_actor(checkpoint, config)
+                _, *actor = read_actor(checkpoint, config)
                 figures.append(measure(*actor, config.env, options, show))
                 done += 1
             task_and_robot = of_row[0].task, robot_name(of_row[0].env)

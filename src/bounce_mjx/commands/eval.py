@@ -18,8 +18,6 @@ from bounce_mjx.evaluation.config import (
     Physics,
     on_engine,
 )
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 
 
 class EvalCommand(WorldCommand, OneActorCommand):
@@ -43,20 +41,18 @@ class EvalCommand(WorldCommand, OneActorCommand):
     """File to write the results to."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
-    with no_garbage_collection():
-        from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
-        from bounce_mjx.evaluation.limits import describe_limits, limit_shares
-        from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_episodes
-        from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-        from bounce_mjx.reports.tables import details_line, results_table
-        from bounce_mjx.runs.files import check_output, to_json, writable, write_output
-        from bounce_mjx.runs.reading import read_actor
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
+    from bounce_mjx.evaluation.limits import describe_limits, limit_shares
+    from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_episodes
+    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+    from bounce_mjx.reports.tables import details_line, results_table
+    from bounce_mjx.runs.files import check_output, to_json, writable, write_output
+    from bounce_mjx.runs.reading import read_actor
+    from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
     console = stdout()
@@ -71,7 +67,7 @@ def main(args: Sequence[str]) -> None:
         )
     commands = given_commands(config.env)
     set_up_jax(on_engine(config.env, command.physics))
-    policy, actor = read_actor(checkpoint, config)
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     console.out(f"checkpoint: {checkpoint.folder}{steps}", highlight=False)
     options = EvaluationOptions(

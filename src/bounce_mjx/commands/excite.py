@@ -8,8 +8,6 @@ from rich.console import Console
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import read_preset
 
 
@@ -32,14 +30,12 @@ class ExciteCommand(StrictModel):
     """CSV file for the log that the simulated arm gives, as a rehearsal of bounce-mjx identify."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(ExciteCommand, args, prog="bounce-mjx excite")
-    with no_garbage_collection():
-        from bounce_mjx.identify.excitation import excite, simulate_arm, to_csv
-        from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.identify.excitation import excite, simulate_arm, to_csv
+    from bounce_mjx.runs.files import writable, write_output
 
     config = read_preset(Path("default"), command.robot).env
     motion = excite(config, command.seconds, command.max_velocity, command.table_height)

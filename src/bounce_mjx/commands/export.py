@@ -8,8 +8,6 @@ from rich.console import Console
 from bounce_mjx.commands.run_options import PolicyCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 
 
 class ExportCommand(PolicyCommand):
@@ -21,18 +19,16 @@ class ExportCommand(PolicyCommand):
     """File for the network alone by jax.export, for the CPU and CUDA: histories in, actions out."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ExportCommand, args, prog="bounce-mjx export")
     if command.onnx is None and command.jax is None:
         raise UserError("there is no file to write; give --onnx FILE or --jax FILE")
-    with no_garbage_collection():
-        from bounce_mjx.deploy.export import export_jax, export_onnx
-        from bounce_mjx.runs.files import check_output, writable, write_output
-        from bounce_mjx.runs.folders import choose_checkpoint
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.deploy.export import export_jax, export_onnx
+    from bounce_mjx.runs.files import check_output, writable, write_output
+    from bounce_mjx.runs.folders import choose_checkpoint
+    from bounce_mjx.training.setup import set_up_jax
 
     files = {"--onnx": (command.onnx, export_onnx), "--jax": (command.jax, export_jax)}
     for flag, (path, _) in files.items():

@@ -13,8 +13,6 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import read_preset
 
 
@@ -36,24 +34,22 @@ class IdentifyCommand(StrictModel):
     """Topics of a bag."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 1 if --check finds another robot, 2 on a mistake."""
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    with no_garbage_collection():
-        from bounce_mjx.identify.bags import Topics
-        from bounce_mjx.identify.reading import read_log
-        from bounce_mjx.identify.stages import identify, joined
-        from bounce_mjx.identify.words import estimates, sentences
-        from bounce_mjx.identify.world import compare, world_of
-        from bounce_mjx.reports.identification import identification_page
-        from bounce_mjx.robot.model import joint_names, load_model
-        from bounce_mjx.runs.files import check_output, writable, write_output
-        from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.world.named import read_world
+    from bounce_mjx.identify.bags import Topics
+    from bounce_mjx.identify.reading import read_log
+    from bounce_mjx.identify.stages import identify, joined
+    from bounce_mjx.identify.words import estimates, sentences
+    from bounce_mjx.identify.world import compare, world_of
+    from bounce_mjx.reports.identification import identification_page
+    from bounce_mjx.robot.model import joint_names, load_model
+    from bounce_mjx.runs.files import check_output, writable, write_output
+    from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.world.named import read_world
 
     known = None if command.check is None else read_world(command.check)
     page = command.out.with_suffix(".html")

@@ -4,6 +4,7 @@
 """
 
 import difflib
+import gc
 import importlib
 import sys
 from collections.abc import Sequence
@@ -11,7 +12,8 @@ from types import ModuleType
 
 import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
+from bounce_mjx.interrupt import end_on_ctrl_c
+from bounce_mjx.lazy import spare_opengl
 
 COMMANDS = {
     "train": "train a policy",
@@ -44,6 +46,11 @@ def main(args: Sequence[str] | None = None) -> None:
 
     Only the chosen command is imported, because each command imports libraries that take seconds.
     """
+    end_on_ctrl_c()
+    # Python looks for garbage after so many new objects. Those of imports and of JAX's programs are
+    # hardly ever garbage.
+    gc.set_threshold(10_000)
+    spare_opengl()
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
         if name in ("--help", "-h"):
@@ -57,9 +64,7 @@ def main(args: Sequence[str] | None = None) -> None:
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
-        with interruptible_imports():
-            module = _import(f"bounce_mjx.commands.{name.replace('-', '_')}")
-        module.main(rest)
+        _import(f"bounce_mjx.commands.{name.replace('-', '_')}").main(rest)
 
 
 def _import(name: str) -> ModuleType:

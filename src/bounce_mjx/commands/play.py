@@ -14,10 +14,9 @@ from bounce_mjx.commands.run_options import (
     WorldCommand,
     parse_with_commands,
 )
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.config import WorldConfig
@@ -58,7 +57,6 @@ class PlayCommand(WorldCommand):
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
@@ -68,11 +66,10 @@ def main(args: Sequence[str]) -> None:
         return
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
-    with no_garbage_collection():
-        from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.viewers.show import show
+    from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers.show import show
 
-    console = Console()
+    console = stdout()
     default = None if command.actions == "policy" else Path(MIRROR)
     if default and command.checkpoints:
         raise UserError(
@@ -122,15 +119,14 @@ def _replay_log(
             "combined with it; omit one of the two"
         )
     page = viewing.html or Path(f"{command.log.stem}_replay.html")
-    with no_garbage_collection():
-        from bounce_mjx.env.env import Env
-        from bounce_mjx.identify.bags import Topics
-        from bounce_mjx.identify.reading import read_log
-        from bounce_mjx.identify.replay import replay_log
-        from bounce_mjx.runs.files import check_output
-        from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.viewers.comparison import recording
-        from bounce_mjx.viewers.page import SUFFIXES, write_page
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.identify.bags import Topics
+    from bounce_mjx.identify.reading import read_log
+    from bounce_mjx.identify.replay import replay_log
+    from bounce_mjx.runs.files import check_output
+    from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers.comparison import recording
+    from bounce_mjx.viewers.page import SUFFIXES, write_page
 
     check_output(page, "--html", SUFFIXES)
     preset = read_preset(Path("default"), command.robot, world=command.world)
@@ -139,7 +135,7 @@ def _replay_log(
         estimates = in_world(preset, command.world)[1].estimates
         kind = "the estimates" if estimates else "the middle of each range"
         shown = f"{kind} of {command.world}"
-    commands, console = given_commands(preset.env), Console(highlight=False)
+    commands, console = given_commands(preset.env), stdout(highlight=False)
     set_up_jax(preset.env)
     env, topics = Env(preset.env), Topics(**command.topics.model_dump())
     log, _ = read_log(command.log, env.mj_model, topics)
@@ -162,8 +158,8 @@ def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) 
     from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
 
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-    policy, actor = read_actor(checkpoint, config)
 
     def make_controller(env: "Env") -> "Controller":
         return make_policy_controller(actor(env), policy)

@@ -10,8 +10,6 @@ from pydantic import Field
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 
 
 class PlotCommand(RunCommand):
@@ -31,18 +29,16 @@ class PlotCommand(RunCommand):
     """File formats of each picture."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
-    with no_garbage_collection():
-        from bounce_mjx.env.env import Env
-        from bounce_mjx.reports import figures
-        from bounce_mjx.reports.curves import group_runs
-        from bounce_mjx.reports.page import record_checkpoint
-        from bounce_mjx.runs.files import writable, write_output
-        from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.reports import figures
+    from bounce_mjx.reports.curves import group_runs
+    from bounce_mjx.reports.page import record_checkpoint
+    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
 
     runs = [named_run(run, command.folder) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]

@@ -11,8 +11,6 @@ from rich.console import Console
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.viewers.options import ViewerOptions
 
 
@@ -23,17 +21,15 @@ class ReportCommand(RunCommand):
     """A run's folder; latest, the default, is the newest run."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ReportCommand, args, prog="bounce-mjx report")
-    with no_garbage_collection():
-        from bounce_mjx.commands.play import load_shown
-        from bounce_mjx.reports.page import REPLAY_FILE, record_checkpoint, write_report
-        from bounce_mjx.runs.folders import find_checkpoint, named_run
-        from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.viewers.show import show
+    from bounce_mjx.commands.play import load_shown
+    from bounce_mjx.reports.page import REPLAY_FILE, record_checkpoint, write_report
+    from bounce_mjx.runs.folders import find_checkpoint, named_run
+    from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers.show import show
 
     checkpoint, console = find_checkpoint(named_run(command.run, command.folder)), Console()
     page = checkpoint.run / REPLAY_FILE

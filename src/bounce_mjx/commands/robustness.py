@@ -17,8 +17,6 @@ from bounce_mjx.evaluation.config import (
     Physics,
     on_engine,
 )
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.resources import POLICIES, resource_path
 
 
@@ -45,27 +43,25 @@ class RobustnessCommand(OneActorCommand):
     for a policy that comes with the package and for the mirror law."""
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
-    with no_garbage_collection():
-        from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
-        from bounce_mjx.evaluation.suite import load_suite, read_suite
-        from bounce_mjx.reports.figures import image
-        from bounce_mjx.reports.robustness import (
-            ROBUSTNESS_FILE,
-            misses,
-            robustness_figure,
-            robustness_table,
-        )
-        from bounce_mjx.runs.config import in_world, named_file
-        from bounce_mjx.runs.files import to_json, writable, write_output
-        from bounce_mjx.runs.folders import MIRROR_LAW
-        from bounce_mjx.runs.reading import read_actor
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
+    from bounce_mjx.evaluation.suite import load_suite, read_suite
+    from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.robustness import (
+        ROBUSTNESS_FILE,
+        misses,
+        robustness_figure,
+        robustness_table,
+    )
+    from bounce_mjx.runs.config import in_world, named_file
+    from bounce_mjx.runs.files import to_json, writable, write_output
+    from bounce_mjx.runs.folders import MIRROR_LAW
+    from bounce_mjx.runs.reading import read_actor
+    from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:
         raise UserError("--assumed needs a named world; give one with --world, or leave it out")
@@ -85,7 +81,7 @@ def main(args: Sequence[str]) -> None:
         conditions, version = conditions[: 1 + len(assumed)], ""
         suite = f"twice what {command.world} assumes"
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
-    policy, actor = read_actor(checkpoint, config)
+    checkpoint, policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
     out = command.out or (Path("robustness") if no_run else checkpoint.run)
     # Fails before the measurement if its results could not be written.

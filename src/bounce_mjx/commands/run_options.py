@@ -169,7 +169,8 @@ def parse_with_commands(
             words.append(word)
     task = early_flag(words, "--task")
     commands = find_task(task or DEFAULT).Config().commands
-    description = command_class.__doc__
+    # Python's option -OO leaves out docstrings.
+    description = command_class.__doc__ or ""
     if commands:
         flags = ", ".join(f"{flag_of(name)} {c.unit.upper()}" for name, c in commands.items())
         description += f" The commands of the task {task or DEFAULT} are flags too: {flags}."

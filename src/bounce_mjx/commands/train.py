@@ -8,8 +8,8 @@ from pydantic import Field
 from rich.console import Console
 
 from bounce_mjx.config.settings import HostName, whole_number
-from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports, leave
+from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, read_training
 from bounce_mjx.training.peers import DEFAULT_TIMEOUT
@@ -44,14 +44,17 @@ class TrainCommand(TrainingCommand):
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    several_hosts, known_engines = _hosts(args), ()
-    with exit_on_user_error(), interruptible_imports():
-        if several_hosts is None:
+    several_hosts = _hosts(args)
+    with exit_on_user_error():
+        try:
             command = read_command(args, default_preset(has_plugin()))
-            known_engines = (command.env,)
-        from bounce_mjx.training.setup import find_devices, set_up_jax
+            from bounce_mjx.training.setup import find_devices, set_up_jax
 
-        set_up_jax(*known_engines)
+            set_up_jax(command.env)
+        except UserError:
+            # The other hosts learn of the mistake below, once they are joined.
+            if several_hosts is None:
+                raise
         if several_hosts is None:
             # CUDA starts during the imports.
             find_devices()

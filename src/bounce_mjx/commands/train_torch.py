@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import interruptible_imports
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import TrainingCommand, read_training
 
@@ -32,11 +31,10 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     read = functools.partial(read_training, TorchTrainCommand, args, prog=PROG)
     command = read(machine=default_preset(has_plugin()))
-    with interruptible_imports():
-        from bounce_mjx.runs.folders import latest_checkpoint
-        from bounce_mjx.training.job import library_of
-        from bounce_mjx.training.run_command import run_command
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.runs.folders import latest_checkpoint
+    from bounce_mjx.training.job import library_of
+    from bounce_mjx.training.run_command import run_command
+    from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax(command.env)
     if has_plugin() != has_accelerator():

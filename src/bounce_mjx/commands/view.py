@@ -6,13 +6,10 @@ from typing import Annotated, Literal
 
 import pydantic
 import tyro
-from rich.console import Console
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import interruptible
 from bounce_mjx.runs.config import read_preset, train_config
 from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.training.command import early_flag, path_flag
@@ -35,7 +32,6 @@ class ViewCommand(StrictModel):
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
 
 
-@interruptible
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
@@ -48,11 +44,10 @@ def main(args: Sequence[str]) -> None:
         prog="bounce-mjx view",
         default=command_class(env=env, robot=robot),
     )
-    with no_garbage_collection():
-        from bounce_mjx.baselines.mirror import MirrorLaw, observing
-        from bounce_mjx.training.setup import set_up_jax
-        from bounce_mjx.viewers import controllers
-        from bounce_mjx.viewers.show import Shown, show
+    from bounce_mjx.baselines.mirror import MirrorLaw, observing
+    from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers import controllers
+    from bounce_mjx.viewers.show import Shown, show
 
     make_controller = {
         "random": controllers.make_random_controller,
@@ -62,4 +57,4 @@ def main(args: Sequence[str]) -> None:
     env = observing(command.env) if command.actions == "mirror" else command.env
     set_up_jax(env)
     shown = Shown(env, make_controller[command.actions], f"{command.actions} actions")
-    show([shown], command.viewing, commands={}, console=Console())
+    show([shown], command.viewing, commands={}, console=stdout())

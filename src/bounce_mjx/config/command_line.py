@@ -45,6 +45,12 @@ _NO_WRAP = 100_000
 _REGISTRY = ConstructorRegistry()
 
 
+class _Console(Console):
+    def show_cursor(self, show: bool = True) -> bool:
+        """Never hides it: a signal may end the process before it is shown again."""
+        return False
+
+
 def stdout(**options: Any) -> Console:
     """The console that a command prints to. Elsewhere than on a terminal, such as in a pipe, it
     neither wraps nor cuts a line.
@@ -52,7 +58,7 @@ def stdout(**options: Any) -> Console:
     Args:
       options: arguments of `rich.console.Console`.
     """
-    console = Console(**options)
+    console = _Console(**options)
     if not console.is_terminal:
         console.width = _NO_WRAP
     return console

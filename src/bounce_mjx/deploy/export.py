@@ -31,7 +31,7 @@ from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
-from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.estimator import filter_constants, upper_face
 from bounce_mjx.world.observation import ObservationConfig
@@ -67,7 +67,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     with needed("onnx", EXTRA):
         import onnx
     config = load_run_config(checkpoint.run)
-    policy = read_policy(checkpoint, config)
+    checkpoint, policy, _ = read_actor(checkpoint, config)
     metadata = policy_metadata(config, checkpoint.steps)
     with jax.enable_x64(False):
         function, inputs = _control_step(config.env, _network(config, policy))
@@ -101,7 +101,7 @@ def export_jax(checkpoint: Checkpoint) -> bytes:
         # JAX serialises with it.
         import flatbuffers  # noqa: F401
     config = load_run_config(checkpoint.run)
-    network = jax.jit(jax.vmap(_network(config, read_policy(checkpoint, config))))
+    network = jax.jit(jax.vmap(_network(config, read_actor(checkpoint, config)[1])))
     (n,) = jax.export.symbolic_shape("n")
     shapes = {
         name: jax.ShapeDtypeStruct((n, *row.shape), row.dtype)

@@ -19,7 +19,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (
     RETURN,
@@ -35,7 +34,7 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_atomically
 from bounce_mjx.runs.folders import POLICY_OF_TASK, Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
-from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task.shown import Recording
 
 REPORT_FILE = "report.html"
@@ -46,10 +45,9 @@ REPLAY_FILE = "replay.html"
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
-    policy = read_policy(checkpoint, config)
+    _, policy, actor = read_actor(checkpoint, config)
     env = Env(config.env)
-    networks = networks_of(config.ppo)(env)
-    evaluate = make_recording_evaluator(env, networks, RECORDED_EPISODES, RECORDED_EPISODES)
+    evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
     return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
 
 

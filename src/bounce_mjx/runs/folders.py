@@ -277,12 +277,23 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
 
 def stored_checkpoints(folder: Path) -> dict[int, Path]:
     """Checkpoints in a folder by their steps."""
+    paths = []
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        # One look, as a training may rename them meanwhile.
+        paths = [folder / entry.name for entry in entries if entry.is_dir()]
     # A checkpoint marked as replaced counts until its successor is in place.
     for suffix in ("", REPLACED):
-        paths = [p for p in folder.glob("*") if p.suffix == suffix and p.is_dir()]
-        if found := {int(p.stem): p for p in paths if p.stem.isdecimal()}:
+        fitting = [path for path in paths if path.suffix == suffix]
+        if found := {int(p.stem): p for p in fitting if p.stem.isdecimal()}:
             return found
     return {}
+
+
+def replacement(folder: Path) -> Path | None:
+    """The checkpoint that a training has put in the place of another one; None if there is none, or
+    the other one is still there."""
+    stored = stored_checkpoints(folder.parent) if folder.stem.isdecimal() else {}
+    return None if folder in stored.values() or not stored else stored[max(stored)]
 
 
 def _best_seed(run: Path) -> Path:

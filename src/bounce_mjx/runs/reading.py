@@ -7,8 +7,9 @@ run's.
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -30,8 +31,10 @@ from bounce_mjx.learning.ppo import Params, TrainingState, names_of_critic_metri
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
-from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint
+from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, replacement
 from bounce_mjx.tasks.registry import is_file
+
+Result = TypeVar("Result")
 
 RECORD_FILE = "run.json"
 NETWORKS = "networks"
@@ -70,13 +73,30 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     return policy
 
 
+def read_newest(
+    checkpoint: Checkpoint, read: Callable[[Checkpoint], Result]
+) -> tuple[Checkpoint, Result]:
+    """Reads a checkpoint, or the next one if a training replaces it meanwhile; also returns which
+    one."""
+    while True:
+        try:
+            return checkpoint, read(checkpoint)
+        except UserError:
+            newest = replacement(checkpoint.folder)
+            if newest is None:
+                raise
+            checkpoint = Checkpoint(checkpoint.run, newest, int(newest.stem))
+
+
 def read_actor(
     checkpoint: Checkpoint, config: TrainConfig
-) -> tuple[Policy | None, Callable[[Env], Actor]]:
-    """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy."""
+) -> tuple[Checkpoint, Policy | None, Callable[[Env], Actor]]:
+    """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy; and
+    the checkpoint that was read (`read_newest`)."""
     if checkpoint is MIRROR_LAW:
-        return None, MirrorLaw
-    return read_policy(checkpoint, config), networks_of(config.ppo)
+        return checkpoint, None, MirrorLaw
+    checkpoint, policy = read_newest(checkpoint, partial(read_policy, config=config))
+    return checkpoint, policy, networks_of(config.ppo)
 
 
 def policy_shapes(config: TrainConfig) -> Policy:

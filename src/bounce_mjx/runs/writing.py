@@ -22,6 +22,7 @@ from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
+from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import NETWORKS, RECORD_FILE, open_array
 
@@ -42,6 +43,7 @@ class CheckpointWriter:
         self._pool = concurrent.futures.ThreadPoolExecutor(1)
         self._writing: concurrent.futures.Future | None = None
         self._problem: str | None = None
+        self._locks = contextlib.ExitStack()
 
     def save(
         self,
@@ -101,6 +103,7 @@ class CheckpointWriter:
     def close(self) -> None:
         """Waits until the save in progress has ended."""
         self._pool.shutdown()
+        self._locks.close()
 
     def _write(self) -> None:
         for name, write in list(self._pending.items()):
@@ -116,6 +119,10 @@ class CheckpointWriter:
         if not (self._run / CONFIG_FILE).exists():
             if not self._run.exists():
                 self._run.mkdir(parents=True)
+            # The training's own lock is that of the folder that was moved; if only the config is
+            # missing, it still holds.
+            with contextlib.suppress(UserError):
+                self._locks.enter_context(lock_run(self._run))
             # The only copy of the robot may have been in the folder.
             with contextlib.suppress(UserError):
                 folders.save_config(self._run, self._run_config)

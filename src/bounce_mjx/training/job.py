@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
@@ -23,8 +23,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.files import UNFINISHED
-from bounce_mjx.garbage import no_garbage_collection
-from bounce_mjx.interrupt import StopRequest
+from bounce_mjx.interrupt import StopRequest, leave
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig
@@ -45,7 +44,7 @@ from bounce_mjx.training.trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
-from bounce_mjx.training.warm_start import read_start
+from bounce_mjx.training.warm_start import present_start, read_start
 
 Tree = TypeVar("Tree")
 
@@ -114,13 +113,15 @@ def train(
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
         another process trains in the run's folder, the hosts have different configs, a device
         failed, the training diverged, or its final state could not be saved.
-      TrainingStopped: SIGINT or SIGTERM came; the state is saved.
+      TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
     """
+    if options.resume is None and (present := present_start(config)) != config:
+        was, config = config.warm_start, present
+        say(console, f"{was} was replaced meanwhile: starting from {config.warm_start}")
     hosts.agree(config, options.resume)
     config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:
-        stop = stack.enter_context(StopRequest())
-        job = _Job(config, console, make_trainer, options, stop, stack)
+        job = _Job(config, console, make_trainer, options, stack)
         try:
             job.compile()
             job.train()
@@ -147,11 +148,9 @@ class _Job:
         console: Console,
         make_trainer: Callable[[TrainConfig, Env], Trainer],
         options: Options,
-        stop: StopRequest,
         stack: contextlib.ExitStack,
     ):
-        self.config, self.console, self.options = config, console, options
-        self.stop, self.stack = stop, stack
+        self.config, self.console, self.options, self.stack = config, console, options, stack
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.resumed = options.resume is not None
@@ -166,6 +165,8 @@ class _Job:
         self.state: Any = None
         self.steps = 0
         self.writers: list[CheckpointWriter] = []
+        # Before, a signal ends the process by its default action.
+        self.stop = stack.enter_context(StopRequest())
         self.run = folders.find_run(options.resume) if self.resumed else self._create()
         self.started = False
         stack.push(self._remove_unstarted)
@@ -279,25 +280,22 @@ class _Job:
         """Compiles the programs that training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
-        with self.console.status("compiling"), no_garbage_collection():
+        with self.console.status("compiling"):
             compiling = self.pool.submit(self._compile)
-            if not self.stop.wait_for(compiling):
-                if self.resumed:
-                    raise TrainingStopped(f"stopped before anything was trained; {self._go_on}")
-                raise TrainingStopped(
-                    f"stopped before anything was trained, so its folder {self.run} is removed"
-                )
-            opening = compiling.result()
-            if self.options.wandb is not None:
-                # It may refuse the run.
-                opening.result()
-            # A process that finds its programs in the cache waits here for a process that compiles
-            # them; otherwise the exchange between devices would time out after 30 s.
-            hosts.any_of(False)
-            self.trainer.start(self.state)
-            self.state = None
-            if self.first is not None:
-                self.trainer.warm_start(*self.first)
+            stopped = not self.stop.wait_for(compiling)
+        if stopped:
+            self._leave_untrained()
+        opening = compiling.result()
+        if self.options.wandb is not None:
+            # It may refuse the run.
+            opening.result()
+        # A process that finds its programs in the cache waits here for a process that compiles
+        # them; otherwise the exchange between devices would time out after 30 s.
+        hosts.any_of(False)
+        self.trainer.start(self.state)
+        self.state = None
+        if self.first is not None:
+            self.trainer.warm_start(*self.first)
         if hosts.is_leader():
             self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
         for writer in self.writers:
@@ -307,6 +305,11 @@ class _Job:
         )
         self.started = True
         self.clock.lap("compile")
+
+    def _leave_untrained(self) -> NoReturn:
+        """Ends the process as Ctrl-C would, without the folder of a new run."""
+        self._remove_unstarted(KeyboardInterrupt)
+        leave()
 
     def _compile(self) -> concurrent.futures.Future:
         """Returns once the training can start, with the future of its logs. The longest program is
@@ -350,6 +353,9 @@ class _Job:
           TrainingStopped: a stop was requested.
         """
         stopping = self._stopping()
+        if stopping and not (self.resumed or self.steps or self._evaluated()):
+            hosts.disconnect()
+            self._leave_untrained()
         if stopping and not self._evaluated():
             self._save(best=[])
         self._wait_until_saved()

@@ -11,7 +11,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, install_command, reason_of
-from bounce_mjx.interrupt import leave, run_interruptible
+from bounce_mjx.interrupt import leave
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig, shown_file
 from bounce_mjx.runs.folders import find_checkpoint
@@ -61,7 +61,7 @@ def run_command(
     best = print_results(seeds, console)
     run = f"{shlex.quote(str(best.run))}{task}"
     if command.report and hosts.is_leader():
-        run_interruptible(leave_report, best, console, f"bounce-mjx report {run}")
+        leave_report(best, console, f"bounce-mjx report {run}")
     say(console, f"measure it: bounce-mjx eval {run}")
     say(console, f"watch it: bounce-mjx play {run}")
 

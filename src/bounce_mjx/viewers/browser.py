@@ -236,5 +236,5 @@ def free_port(host: str, port: int) -> int:
             reason = error.strerror
     raise UserError(
         f"the page cannot be served at --host {host} --port {port} ({reason}); give an address of "
-        "this machine, such as 127.0.0.1, and a free port"
+        "this machine, such as 127.0.0.1, or ::1 if it has only IPv6, and a free port"
     )
