@@ -50,6 +50,10 @@ from bounce_mjx.world.sensing import Sensing
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
+# Two turns of a joint without a range, rad; or m.
+_MAX_ANGLE = 4.0 * np.pi
+# Poses in files are rounded, rad or m.
+_ROUNDING = 1e-3
 
 
 class Memory(NamedTuple):
@@ -127,6 +131,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._check_joints()
+        self._check_heights()
         self._limits = command_limits(config.robot.limits, self.mj_model, self._addresses)
         self._randomize = randomize
         self.layout = self.config.layout
@@ -149,6 +154,28 @@ class Env:
                 f"default_joint_angles has {given} numbers, but {model} has {len(acting)} joints "
                 f"with an actuator ({', '.join(acting)}); give one number for each"
             )
+        ranges = self.mj_model.jnt_range[list(self._addresses.arm_joints)]
+        angles = self.config.default_joint_angles
+        for name, angle, (low, high) in zip(acting, angles, ranges, strict=True):
+            if not low < high:
+                low, high = -_MAX_ANGLE, _MAX_ANGLE
+            if not low - _ROUNDING <= angle <= high + _ROUNDING:
+                raise UserError(
+                    f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
+                    f"{high:.4g}; give radians, or metres for a slide, within the range"
+                )
+
+    def _check_heights(self) -> None:
+        model, data = self.mj_model, mujoco.MjData(self.mj_model)
+        data.qpos[list(self._addresses.arm_qpos)] = self.config.default_joint_angles
+        mujoco.mj_kinematics(model, data)
+        paddle = data.geom_xpos[self._addresses.paddle_geom, 2]
+        for name, height in self.config.heights.items():
+            if height <= paddle:
+                raise UserError(
+                    f"{name} has the height {height:g} m, which is not over the paddle at "
+                    f"{paddle:.4g} m, where default_joint_angles hold it; change one of the two"
+                )
 
     @property
     def dt(self) -> float:
