@@ -3,15 +3,19 @@
 import math
 import re
 
+import numpy as np
 import pytest
 import yaml
 
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.world.config import Command
+from tiny_runs import TINY
 
 WRONG = """
 default_joint_angles: [0, 40, 110, 0, -60, 0]            # degrees
@@ -156,3 +160,71 @@ def test_a_command_is_no_switch() -> None:
     with pytest.raises(UserError, match="target_height is True, but must be a finite number"):
         Command(0.4, 0.6, "m").checked(True, "target_height")
     assert math.isclose(Command(0.4, 0.6, "m").checked("0.5", "target_height"), 0.5)
+
+
+# The first block
+
+
+def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:
+    """Metrics of two seeds and four iterations of 8 environments and 8 steps."""
+    named = {
+        "episode/ended": ended, "task/too_fast": too_fast, "task/non_finite": non_finite,
+        "reward/height": height, "reward/position": -1.0, "fault": fault,
+    }  # fmt: skip
+    return {name: np.broadcast_to(value, (2, 4)) for name, value in named.items()}
+
+
+FIRST = train_config(find_task("bounce"))(ppo={"num_envs": 8, "rollout_length": 8})
+LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    "block, reason",
+    [
+        (first_block(), r"lasts 0\.01 s .* an end of the task bounce .*min_ball_height 0\.05,"),
+        (first_block(too_fast=60.0), r"lasts 0\.01 s .* max_joint_velocity \(6\.28319 rad/s\)"),
+        (first_block(non_finite=64.0), "the physics, which is not finite"),
+        (first_block(ended=7.0), r"lasts 0\.091 s"),
+        (
+            first_block(ended=0.0, height=-1.1e5),
+            "height is -1.1e.05 on average, beyond 10000 after",
+        ),
+        (first_block(ended=0.0, height=NAN), "height is not finite"),
+    ],
+)
+def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str) -> None:
+    assert re.search(reason, fault_of(block, FIRST))
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        first_block(ended=6.0),
+        first_block(ended=0.0, height=0.9e5),
+        # The learning diverged, not the settings: an iteration after the fault counts no more.
+        first_block(ended=0.0, height=NAN, fault=LATE),
+        # Another seed learns.
+        first_block(ended=np.array([[64.0], [1.0]])),
+        first_block(ended=0.0, height=np.array([[np.nan], [1.0]])),
+    ],
+)
+def test_any_other_first_block_is_trained_on(block: dict) -> None:
+    assert fault_of(block, FIRST) is None
+
+
+def test_a_short_time_limit_is_no_fault() -> None:
+    short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
+    assert fault_of(first_block(ended=16.0), short) is None
+
+
+@pytest.mark.slow
+def test_training_refuses_before_it_saves(tmp_path, capsys) -> None:
+    """And says what the policy does not see."""
+    noise = ["--randomization.ball-velocity-noise", "0.1", "0.1"]
+    args = [*TINY, "--log-dir", str(tmp_path), "--max-joint-velocity", "0.001", *noise]
+    with pytest.raises(SystemExit):
+        train_command.main([*args, "--observation.velocity", "differences", "--no-report"])
+    said = capsys.readouterr()
+    assert "the policy does not see what ball_velocity_noise changes" in said.out
+    assert "what ends it is max_joint_velocity (0.001 rad/s)" in said.err
+    assert not [*tmp_path.iterdir()]

@@ -295,7 +295,8 @@ class Env:
             obs=self.observe(state, truth),
             reward=zero,
             done=zero,
-            metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
+            metrics=dict.fromkeys([*metrics, "non_finite", "too_fast"], zero)
+            | self._privileged(world, truth),
         )
 
     def _first_physics(
@@ -530,7 +531,8 @@ class Env:
         too_fast = jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity)
 
         dtype = truth.ball_position.dtype
-        metrics = _metrics(done, dtype) | {"non_finite": (~finite).astype(dtype)}
+        ends = {"non_finite": ~finite, "too_fast": too_fast}
+        metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         after = before._replace(
             physics=physics,
             command=self.task.next_command(done.state, before.command),
