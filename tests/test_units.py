@@ -2,11 +2,14 @@
 
 import math
 import re
+from typing import ClassVar
 
+import jax
 import numpy as np
 import pytest
 import yaml
 
+from bounce_mjx import task
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
@@ -73,9 +76,9 @@ randomization: {restitution: [0.8, true]}                # the same
 """
 
 
-def config(task: str, **env):
-    kind = train_config(find_task(task))
-    return validate(kind, {"task": task, "env": env}, "my.yaml").env
+def config(name: str, **env):
+    kind = train_config(find_task(name))
+    return validate(kind, {"task": name, "env": env}, "my.yaml").env
 
 
 def names(values: dict, prefix: str = "") -> list[str]:
@@ -96,7 +99,7 @@ def test_a_wrong_unit_is_refused_by_name(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "task, env, reason",
+    "name, env, reason",
     [
         (
             "juggle",
@@ -121,9 +124,9 @@ def test_a_wrong_unit_is_refused_by_name(line: str) -> None:
         ("balance", {"ball_init_pos": (0.59, 0.0, 0.02)}, "ball_init_pos has the height 0.02 m"),
     ],
 )
-def test_a_range_of_a_task_is_refused_by_name(task: str, env: dict, reason: str) -> None:
+def test_a_range_of_a_task_is_refused_by_name(name: str, env: dict, reason: str) -> None:
     with pytest.raises(UserError, match="my.yaml|paddle") as caught:
-        Env(config(task, **env))
+        Env(config(name, **env))
     assert reason in str(caught.value)
 
 
@@ -152,14 +155,75 @@ track: {home: [1.5, 0.5, 1], path_size: 0.5}
 
 @pytest.mark.parametrize("case", re.findall(r"^\w[^#]+?\n(?=\w|#|$)", ACCEPTED, re.MULTILINE))
 def test_other_arms_and_balls_are_accepted(case: str) -> None:
-    ((task, env),) = yaml.safe_load(case).items()
-    config(task, **env)
+    ((name, env),) = yaml.safe_load(case).items()
+    config(name, **env)
 
 
 def test_a_command_is_no_switch() -> None:
     with pytest.raises(UserError, match="target_height is True, but must be a finite number"):
         Command(0.4, 0.6, "m").checked(True, "target_height")
     assert math.isclose(Command(0.4, 0.6, "m").checked("0.5", "target_height"), 0.5)
+
+
+# A user's own task
+
+
+class Reward(task.StrictModel):
+    low: task.Gaussian = task.Gaussian()
+    slow: task.Gaussian = task.Gaussian()
+
+
+class Mistyped(task.Task):
+    """A task with the mistakes of `wrong`."""
+
+    wrong: ClassVar[str] = ""
+
+    class Config(task.WorldConfig):
+        reward: Reward = Reward()
+
+        @property
+        def commands(self) -> dict[str, Command]:
+            return {"height": Command(0.4, 0.6, "m")}
+
+    @property
+    def curves(self) -> tuple[task.Curve, ...]:
+        return (task.Curve("task/error", "eror" if self.wrong == "curve" else "error"),)
+
+    def reset(self, start: task.Start) -> tuple[()]:
+        return ()
+
+    def next_command(self, state: tuple[()], command: task.Values) -> task.Values:
+        if self.wrong == "key left out":
+            return {}
+        if self.wrong == "key given":
+            return command | {"hieght": command["height"]}
+        return command | {"height": command["hieght" if self.wrong == "key read" else "height"]}
+
+    def step(self, state: tuple[()], step: task.Step) -> task.TaskStep:
+        low, slow = step.truth.ball_position[2], step.truth.ball_velocity[2]
+        terms = {"term": {"low": low, "slwo": slow}, "term left out": {"low": low}}
+        values = terms.get(self.wrong, {"low": low, "slow": slow})
+        reward = task.weighted_terms(self.config.reward, **values)
+        return task.TaskStep((), reward, low < 0.0, {"error": low})
+
+
+@pytest.mark.parametrize(
+    "wrong, reason",
+    {
+        "curve": "the curve task/error names a metric that there is not, eror; there are: error",
+        "key read": "next_command of the task Mistyped names a command that there is not, hieght",
+        "key given": "next_command of the task Mistyped names a command that there is not, hieght",
+        "key left out": "Mistyped lacks the command height; there are: height",
+        "term": "names a term of the reward that there is not, slwo; there are: low, slow",
+        "term left out": "weighted_terms lacks the term of the reward slow; there are: low, slow",
+    }.items(),
+)
+def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monkeypatch) -> None:
+    env = Env(Mistyped.Config())
+    jax.eval_shape(env.reset, jax.random.key(0))
+    monkeypatch.setattr(Mistyped, "wrong", wrong)
+    with pytest.raises(UserError, match=reason):
+        jax.eval_shape(env.reset, jax.random.key(0))
 
 
 # The first block

@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
 
-_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces|kg|Hz|N m)(?=[.;]| \()")
+_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|kg|Hz|N m)(?=[.;]| \()")
 
 
 def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:

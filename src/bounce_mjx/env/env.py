@@ -32,6 +32,7 @@ from bounce_mjx.robot.model import (
     resting_activations,
 )
 from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
+from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import actuation, impact, noise, sensing
 from bounce_mjx.world.actuation import Actuation
@@ -277,7 +278,7 @@ class Env:
             state = state._replace(setpoint=Setpoint(position, still, still))
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, own))
-        command = self.task.next_command(task, command)
+        command = self._next_command(task, command)
         state = state._replace(task=task, command=command)
         if memory_rng is not None:
             memory = self._first_memory(state, truth, memory_rng)
@@ -290,13 +291,17 @@ class Env:
         # The names alone: no step is computed.
         step = Step(truth, command, no_action, no_action)
         metrics = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
+        metrics = dict.fromkeys([*metrics, "non_finite", "too_fast"], zero)
+        metrics |= self._privileged(world, truth)
+        for curve in self.task.curves:
+            shown = {curve.metric, *({curve.over} - {"steps", "episodes"})}
+            check_names(f"the curve {curve.tag}", "metric", {*metrics} | shown, metrics)
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
             reward=zero,
             done=zero,
-            metrics=dict.fromkeys([*metrics, "non_finite", "too_fast"], zero)
-            | self._privileged(world, truth),
+            metrics=metrics,
         )
 
     def _first_physics(
@@ -535,7 +540,7 @@ class Env:
         metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         after = before._replace(
             physics=physics,
-            command=self.task.next_command(done.state, before.command),
+            command=self._next_command(done.state, before.command),
             task=done.state,
             last_action=action,
         )
@@ -550,6 +555,16 @@ class Env:
             # Wrappers add their own metrics, which a step must keep.
             metrics=state.metrics | metrics | self._privileged(before.world, truth),
         )
+
+    def _next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        named = f"next_command of the task {type(self.task).__name__}"
+        try:
+            following = self.task.next_command(state, command)
+        except KeyError as error:
+            check_names(named, "command", {*command, str(error.args[0])}, command)
+            raise
+        check_names(named, "command", following, command)
+        return following
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
