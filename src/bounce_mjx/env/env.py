@@ -278,7 +278,7 @@ class Env:
             state = state._replace(setpoint=Setpoint(position, still, still))
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, own))
-        command = self._next_command(task, command)
+        command = self._moved(task, command)
         state = state._replace(task=task, command=command)
         if memory_rng is not None:
             memory = self._first_memory(state, truth, memory_rng)
@@ -540,7 +540,7 @@ class Env:
         metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         after = before._replace(
             physics=physics,
-            command=self._next_command(done.state, before.command),
+            command=self._moved(done.state, before.command),
             task=done.state,
             last_action=action,
         )
@@ -556,7 +556,8 @@ class Env:
             metrics=state.metrics | metrics | self._privileged(before.world, truth),
         )
 
-    def _next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def _moved(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The commands that the task moves on, with a sentence for a name that it mistypes."""
         named = f"next_command of the task {type(self.task).__name__}"
         try:
             following = self.task.next_command(state, command)
