@@ -3,13 +3,14 @@
 python docs/config_reference.py > docs/config.md
 """
 
-import re
 from collections.abc import Iterator
 from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.validation import unit_of
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
 
@@ -35,7 +36,15 @@ This page is generated from the types of the settings (`TrainConfig` in
 These rules apply across keys:
 
 - `env.control_dt` is a multiple of `env.physics_dt`, and `env.episode_seconds` is at least as long;
-- `env.target_height_range` is 0 < low ≤ high;
+- a range is [low, high] with low ≤ high;
+- an episode does not end where it starts: `env.ball_init_pos` is over `env.min_ball_height`, less
+  than `env.max_height_above_target` over the lowest target, and within
+  `env.max_horizontal_distance`;
+- the model's joint ranges contain `env.default_joint_angles`, and the ball's start and the target
+  heights are over the paddle there;
+- a setting that would have no effect is refused: `env.robot.*` but its limits without
+  `env.robot.site`, `env.action.max_lead` without `env.action.base: target`,
+  `env.randomization.push_interval` without `push_speed`;
 - `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as
   long as an episode;
 - `ppo.min_learning_rate` is at most the two upper limits;
@@ -43,9 +52,6 @@ These rules apply across keys:
 """
 
 _CONFIG = train_config(find_task(DEFAULT))
-
-# In the description of a key, the unit follows a comma, at the end or before an addition.
-_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|bounces)(?=[.;]| \()")
 
 
 def main() -> None:
@@ -74,11 +80,13 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         if "$ref" in plain:
             continue
         text = " ".join((field.description or "").split())
-        units = _UNIT.findall(text)
+        unit = unit_of(text)
         kind = "" if "enum" in plain else _type(plain)
         is_list = "array" in {option.get("type") for option in plain.get("anyOf", [plain])}
-        value = (", " if is_list else " ").join(part for part in (kind, _range(plain)) if part)
-        value += f" ({units[-1]})" if units else ""
+        terms = [mark for mark in field.metadata if isinstance(mark, Term)]
+        span = "each {:g} to {:g}".format(*terms[0].limits) if terms else _range(plain)
+        value = (", " if is_list else " ").join(part for part in (kind, span) if part)
+        value += f" ({unit})" if unit else ""
         cells = f"`{name}`", value, _default(plain.get("default")), text
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
@@ -135,6 +143,8 @@ def _range(plain: dict[str, Any]) -> str:
         least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
         return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    # pydantic keeps its own names for the bounds behind a validator.
+    signs |= {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
     return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")
 

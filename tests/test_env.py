@@ -388,7 +388,7 @@ def test_reward_is_the_sum_of_its_terms(episodes):
 
 def test_reset_and_step_report_the_same_metrics(episodes, reset):
     task_metrics = {"bounced", "n_bounces", "ball_xy_error", "apex_error"}
-    task_metrics |= {"apex_offset", "non_finite"}
+    task_metrics |= {"apex_offset", "non_finite", "too_fast"}
     names = {f"reward/{name}" for name in REFERENCE_WEIGHTS} | task_metrics
     assert set(reset(jax.random.key(0)).metrics) == names
     assert set(episodes[0][2].metrics) == names

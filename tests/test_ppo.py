@@ -204,7 +204,7 @@ class TwoStates:
         self.hidden = hidden
 
     def _state(self, second, reward, done):
-        names = ("bounced", "ball_xy_error", "apex_error", "non_finite")
+        names = ("bounced", "ball_xy_error", "apex_error", "non_finite", "too_fast")
         metrics = dict.fromkeys(names, jnp.zeros(())) | {"n_bounces": second}
         obs = jnp.ones(2) if self.hidden else jnp.stack([1.0 - second, second])
         return State(second, obs, reward, done, metrics)

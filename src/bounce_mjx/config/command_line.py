@@ -246,8 +246,9 @@ def unknown_argument(word: str, flags: Iterable[str]) -> str:
 
 def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:
     """The first mistake of a validation error, named by its flag."""
-    prefixes = {group.__name__: prefix for group, prefix in _groups(command_class)}
-    return describe(error, command_class, lambda name: flag_of(prefixes[error.title] + name))
+    groups = {group.__name__: (group, prefix) for group, prefix in _groups(command_class)}
+    group, prefix = groups[error.title]
+    return describe(error, group, lambda name: flag_of(prefix + name))
 
 
 def _validation_error() -> pydantic.ValidationError | None:

@@ -1,7 +1,8 @@
 """The types of settings, and the base class of every group of settings.
 
 A group is immutable, and rejects unknown keys and values out of range. The docstring below a field
-gives its unit; it is also the help text of the command line.
+gives its unit; it is also the help text of the command line. The bounds of a quantity with a unit
+are wide, and refuse the same quantity in another unit: millimetres, degrees or milliseconds.
 """
 
 import re
@@ -10,14 +11,56 @@ from typing import Annotated, Any
 
 import pydantic
 from pydantic import Field
+from pydantic_core import PydanticKnownError
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+def _check_number(value: Any) -> Any:
+    """Any value but a switch, which Python counts as 0 or 1."""
+    if isinstance(value, bool):
+        raise PydanticKnownError("float_type")
+    return value
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
+_Number = pydantic.BeforeValidator(_check_number)
+
+Positive = Annotated[float, _Number, Field(gt=0.0, allow_inf_nan=False)]
+
+NonNegative = Annotated[float, _Number, Field(ge=0.0, allow_inf_nan=False)]
+
+Finite = Annotated[float, _Number, Field(allow_inf_nan=False)]
+
+UnitInterval = Annotated[float, _Number, Field(ge=0.0, le=1.0)]
+
+Length = Annotated[Positive, Field(le=10.0)]
+"""m"""
+
+Distance = Annotated[NonNegative, Field(le=10.0)]
+"""m; may be 0."""
+
+Coordinate = Annotated[Finite, Field(ge=-10.0, le=10.0)]
+"""m"""
+
+Speed = Annotated[Positive, Field(le=100.0)]
+"""m/s or rad/s"""
+
+Velocity = Annotated[Finite, Field(ge=-100.0, le=100.0)]
+"""m/s or rad/s"""
+
+Duration = Annotated[Positive, Field(le=3600.0)]
+"""s"""
+
+Friction = Annotated[NonNegative, Field(le=10.0)]
+"""Coefficient of sliding friction."""
+
+
+def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] <= ends[1]:
+        raise ValueError(f"{ends} is not a range; give the lower end first")
+    return ends
+
+
+Ascending = pydantic.AfterValidator(_check_order)
+"""Mark of a range: its lower end comes first."""
 
 
 def _check_path(path: Path) -> Path:
@@ -39,10 +82,12 @@ HostName = Annotated[str, pydantic.AfterValidator(_check_host)]
 
 
 def whole_number(value: Any) -> Any:
-    """A whole number in scientific notation, such as "1e6", as an integer; any other value is
-    returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent need a
-    decimal point.
+    """A whole number in scientific notation, such as "1e6", as an integer; any other value but a
+    switch is returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent
+    need a decimal point.
     """
+    if isinstance(value, bool):
+        raise PydanticKnownError("int_type")
     if isinstance(value, str) and re.fullmatch(r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+", value):
         number = float(value)
         return int(number) if number.is_integer() else value

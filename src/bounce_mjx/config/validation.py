@@ -1,6 +1,7 @@
 """Turns plain values into settings; a mistake is one sentence."""
 
 import difflib
+import re
 import reprlib
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
@@ -11,6 +12,8 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
+
+_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|kg|Hz|N m)(?=[.;]| \()")
 
 
 def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:
@@ -46,8 +49,28 @@ def describe(
     if first["type"] == "value_error":
         reason = first["msg"].removeprefix("Value error, ")
         return ": ".join([*path[-1:], shorten(reason, 500)])
-    given = shorten(_Repr().repr(first["input"]))
-    return f"{spell('.'.join(path))} is {given}, but must {_wanted(error)}"
+    given, unit = shorten(_Repr().repr(first["input"])), ""
+    if first["type"].startswith(("greater_than", "less_than")):
+        unit = f" {unit_of(_text(config_class, path))}".rstrip()
+    return f"{spell('.'.join(path))} is {given}, but must {_wanted(error)}{unit}"
+
+
+def unit_of(text: str) -> str:
+    """The unit in the docstring of a setting, where it follows a comma, at the end or before an
+    addition; empty for a pure number."""
+    units = _UNIT.findall(" ".join(text.split()))
+    return units[-1] if units else ""
+
+
+def _text(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
+    """The docstring of a setting; empty if there is none of this dotted name."""
+    for name in path[:-1]:
+        field = config_class.model_fields.get(name)
+        config_class = getattr(field, "annotation", None)
+        if not (isinstance(config_class, type) and issubclass(config_class, pydantic.BaseModel)):
+            return ""
+    field = config_class.model_fields.get(path[-1]) if path else None
+    return (field and field.description) or ""
 
 
 class _Repr(reprlib.Repr):

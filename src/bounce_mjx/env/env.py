@@ -32,6 +32,7 @@ from bounce_mjx.robot.model import (
     resting_activations,
 )
 from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
+from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import actuation, impact, noise, sensing
 from bounce_mjx.world.actuation import Actuation
@@ -50,6 +51,10 @@ from bounce_mjx.world.sensing import Sensing
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
+# Two turns of a joint without a range, rad; or m.
+_MAX_ANGLE = 4.0 * np.pi
+# Poses in files are rounded, rad or m.
+_ROUNDING = 1e-3
 
 
 class Memory(NamedTuple):
@@ -127,6 +132,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, self.config.physics)
         self._addresses = find_addresses(self.mj_model)
         self._check_joints()
+        self._check_heights()
         self._limits = command_limits(config.robot.limits, self.mj_model, self._addresses)
         self._randomize = randomize
         self.layout = self.config.layout
@@ -149,6 +155,28 @@ class Env:
                 f"default_joint_angles has {given} numbers, but {model} has {len(acting)} joints "
                 f"with an actuator ({', '.join(acting)}); give one number for each"
             )
+        ranges = self.mj_model.jnt_range[list(self._addresses.arm_joints)]
+        angles = self.config.default_joint_angles
+        for name, angle, (low, high) in zip(acting, angles, ranges, strict=True):
+            if not low < high:
+                low, high = -_MAX_ANGLE, _MAX_ANGLE
+            if not low - _ROUNDING <= angle <= high + _ROUNDING:
+                raise UserError(
+                    f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
+                    f"{high:.4g}; give radians, or metres for a slide, within the range"
+                )
+
+    def _check_heights(self) -> None:
+        model, data = self.mj_model, mujoco.MjData(self.mj_model)
+        data.qpos[list(self._addresses.arm_qpos)] = self.config.default_joint_angles
+        mujoco.mj_kinematics(model, data)
+        paddle = data.geom_xpos[self._addresses.paddle_geom, 2]
+        for name, height in self.config.heights.items():
+            if height <= paddle:
+                raise UserError(
+                    f"{name} has the height {height:g} m, which is not over the paddle at "
+                    f"{paddle:.4g} m, where default_joint_angles hold it; change one of the two"
+                )
 
     @property
     def dt(self) -> float:
@@ -245,7 +273,7 @@ class Env:
             state = state._replace(setpoint=Setpoint(position, still, still))
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, own))
-        command = self.task.next_command(task, command)
+        command = self._moved(task, command)
         state = state._replace(task=task, command=command)
         if memory_rng is not None:
             memory = self._first_memory(state, truth, memory_rng)
@@ -260,12 +288,17 @@ class Env:
         # The names alone: no step is computed.
         step = Step(truth, command, no_action, no_action)
         metrics = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
+        metrics = dict.fromkeys([*metrics, "non_finite", "too_fast"], zero)
+        metrics |= self._privileged(world, truth)
+        for curve in self.task.curves:
+            shown = {curve.metric, *({curve.over} - {"steps", "episodes"})}
+            check_names(f"the curve {curve.tag}", "metric", {*metrics} | shown, metrics)
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
             reward=zero,
             done=zero,
-            metrics=dict.fromkeys([*metrics, "non_finite"], zero) | self._privileged(world, truth),
+            metrics=metrics,
         )
 
     def _first_physics(
@@ -503,10 +536,11 @@ class Env:
         too_fast = jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity)
 
         dtype = truth.ball_position.dtype
-        metrics = _metrics(done, dtype) | {"non_finite": (~finite).astype(dtype)}
+        ends = {"non_finite": ~finite, "too_fast": too_fast}
+        metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         after = before._replace(
             physics=physics,
-            command=self.task.next_command(done.state, before.command),
+            command=self._moved(done.state, before.command),
             task=done.state,
             last_action=action,
         )
@@ -521,6 +555,17 @@ class Env:
             # Wrappers add their own metrics, which a step must keep.
             metrics=state.metrics | metrics | self._privileged(before.world, truth),
         )
+
+    def _moved(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The commands that the task moves on, with a sentence for a name that it mistypes."""
+        named = f"next_command of the task {type(self.task).__name__}"
+        try:
+            following = self.task.next_command(state, command)
+        except KeyError as error:
+            check_names(named, "command", {*command, str(error.args[0])}, command)
+            raise
+        check_names(named, "command", following, command)
+        return following
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

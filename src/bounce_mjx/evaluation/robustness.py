@@ -196,7 +196,10 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
                 min(float(np.min(low)) for low, _ in ranges),
                 max(float(np.max(high)) for _, high in ranges),
             )
-    world = env.model_copy(update={"randomization": RandomizationConfig(**spans)})
+    # A program spans what its conditions, which are within the limits, do not: a term that one of
+    # them lacks.
+    drawn = RandomizationConfig().model_copy(update=spans)
+    world = env.model_copy(update={"randomization": drawn})
     return on_engine(world, physics)
 
 

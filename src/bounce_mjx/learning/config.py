@@ -7,6 +7,7 @@ from pydantic import Field
 
 from bounce_mjx.config.settings import (
     Count,
+    Duration,
     NonNegative,
     Positive,
     Steps,
@@ -22,7 +23,7 @@ class PPOConfig(StrictModel):
     """Environments that run in parallel."""
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
-    training_episode_seconds: Positive | None = None
+    training_episode_seconds: Duration | None = None
     """Time limit of training episodes, s; null for the environment's limit. With a shorter
     limit the training sees more resets and more drawn worlds; a time-out is bootstrapped and does
     not count as a termination."""

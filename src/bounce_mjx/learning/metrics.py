@@ -49,6 +49,7 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
         "return": jnp.where(ended, result.episode_return, 0.0),
         "length": jnp.where(ended, result.episode_length, 0),
         "non_finite": result.metrics["non_finite"],
+        "too_fast": result.metrics["too_fast"],
     }
     for curve in curves:
         value = result.metrics[curve.metric]
@@ -82,6 +83,7 @@ def rollout_metrics(steps: Metrics, curves: Sequence[Curve]) -> Metrics:
         "episode/length": total("length") / ended,
         "episode/ended": ended,
         "task/non_finite": total("non_finite"),
+        "task/too_fast": total("too_fast"),
     }
     for curve in curves:
         if curve.over == "steps":

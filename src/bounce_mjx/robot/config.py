@@ -1,49 +1,71 @@
 """Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
 
+import math
 from pathlib import Path
+from typing import Annotated
 
 import pydantic
+from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
+from bounce_mjx.config.settings import (
+    Coordinate,
+    Finite,
+    NonNegative,
+    Positive,
+    Speed,
+    StrictModel,
+)
 
-Vector = tuple[Finite, Finite, Finite]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+HalfSize = Annotated[Positive, Field(le=1.0)]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 
 
 class PaddleConfig(StrictModel):
     """The paddle: a box on a handle."""
 
-    half_size: tuple[Positive, Positive, Positive] = (0.05, 0.065, 0.0035)
+    half_size: tuple[HalfSize, HalfSize, HalfSize] = (0.05, 0.065, 0.0035)
     """Half-sizes of the blade along its own x, y and z, m; z is the direction that must point
     up."""
     position: Vector = (0.0, 0.0, 0.19)
     """Centre of the blade in the frame of the site, m; the handle runs to it from the site."""
     quaternion: Quaternion = (0.7071067811865476, 0.0, -0.7071067811865476, 0.0)
     """Orientation of the blade in the frame of the site: w, x, y, z."""
-    mass: Positive = 0.1
-    """Mass of the blade; the handle has none."""
+    mass: Annotated[Positive, Field(le=20.0)] = 0.1
+    """Mass of the blade, kg; the handle has none."""
 
 
 class BallConfig(StrictModel):
     """The ball."""
 
-    radius: Positive = 0.019
+    radius: Annotated[Positive, Field(le=1.0)] = 0.019
     """Radius, m."""
     mass: Positive = 0.0027
     """Mass, kg."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_density(self):
+        density = self.mass / (4.0 / 3.0 * math.pi * self.radius**3)
+        if not 0.5 <= density <= 25_000.0:
+            raise ValueError(
+                f"a mass of {self.mass:g} kg in a radius of {self.radius:g} m is "
+                f"{density:.3g} kg/m^3, but no ball is lighter than 0.5 or heavier than 25,000; "
+                "check both units"
+            )
+        return self
 
 
 class LimitsConfig(StrictModel):
     """The arm's own limits, one number for each acting joint. Between two actions the servo targets
     then move within the first three (`robot.setpoints`); without them they jump."""
 
-    velocity: tuple[Positive, ...] | None = None
+    velocity: tuple[Speed, ...] | None = None
     """Largest velocity of a joint's command, rad/s; null for no limits of the command."""
-    acceleration: tuple[Positive, ...] | None = None
+    acceleration: tuple[Annotated[Positive, Field(le=1e4)], ...] | None = None
     """Largest acceleration of a joint's command, rad/s^2; needed with velocity."""
-    jerk: tuple[Positive, ...] | None = None
+    jerk: tuple[Annotated[Positive, Field(le=1e6)], ...] | None = None
     """Largest jerk of a joint's command, rad/s^3; null for none."""
-    torque: tuple[Positive, ...] | None = None
+    torque: tuple[Annotated[Positive, Field(le=1e5)], ...] | None = None
     """Largest torque of each servo, N m; null for those of the servos."""
 
     @pydantic.model_validator(mode="after")
@@ -90,6 +112,10 @@ class RobotConfig(StrictModel):
                 "number of each for each acting joint, or none of the three"
             )
         return self
+
+
+OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits"}
+"""Settings that change nothing without a site."""
 
 
 def is_packaged(mjcf: Path) -> bool:

@@ -7,9 +7,11 @@ term is added by a subclass of the group with one more field.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp
 
 
@@ -73,9 +75,27 @@ def weighted_terms(reward: StrictModel, inputs: Any = None, **own: Any) -> dict[
     Args:
       inputs: what the formula of every term takes.
       own: by a term's name, what its formula takes instead.
+
+    Raises:
+      UserError: `own` has a name that is no term, or lacks one although there are no inputs.
     """
     terms = {name: getattr(reward, name) for name in term_names(type(reward))}
+    missing = terms.keys() - own.keys() if own and inputs is None else set()
+    check_names("weighted_terms", "term of the reward", own.keys() | terms.keys() - missing, terms)
     return {name: t.weight * t.value(own.get(name, inputs)) for name, t in terms.items()}
+
+
+def check_names(what: str, kind: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Compares the names that a task's code gives with those that it has.
+
+    Raises:
+      UserError: a name is unknown or missing.
+    """
+    given, known = set(given), set(known)
+    for name in sorted(given ^ known, key=lambda name: (name in known, name)):
+        wrong = f"lacks the {kind}" if name in known else f"names a {kind} that there is not,"
+        names = ", ".join(sorted(known)) or "none"
+        raise UserError(f"{what} {wrong} {shorten(name)}; there are: {names}")
 
 
 def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, NonNegative
+from bounce_mjx.config.settings import Coordinate, Friction
 from bounce_mjx.lazy import jax, jnp
 
 REACH = 0.03
@@ -52,14 +52,14 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, with a rough paddle and pushes, and the settings of balancing."""
 
-    ball_init_pos: tuple[Finite, Finite, Finite] = (
+    ball_init_pos: tuple[Coordinate, Coordinate, Coordinate] = (
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + START_HEIGHT,
     )
     """Mean ball position at a reset, m."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.002, ball_position=0.0)
     """The noise of a reset."""
-    friction: NonNegative | None = 0.3
+    friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
     observation: Observation = Observation()
     """The quantities that the policy sees."""

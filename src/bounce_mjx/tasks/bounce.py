@@ -9,8 +9,16 @@ import math
 from typing import Annotated, Any, NamedTuple
 
 import pydantic
+from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, NonNegative, Positive
+from bounce_mjx.config.settings import (
+    Ascending,
+    Coordinate,
+    Distance,
+    Length,
+    NonNegative,
+    Positive,
+)
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task import (
     Command,
@@ -92,19 +100,19 @@ class BounceObservation(ObservationConfig):
 class BounceConfig(WorldConfig):
     """The world, and the task of bouncing: target heights, bounces, ends and reward."""
 
-    target_height_range: tuple[float, float] = (0.4, 0.6)
+    target_height_range: Annotated[tuple[Length, Length], Ascending] = (0.4, 0.6)
     """Range of the target height, m; equal ends fix it."""
-    bounce_min_velocity: NonNegative = 0.01
+    bounce_min_velocity: Annotated[NonNegative, Field(le=10.0)] = 0.01
     """Vertical velocity above which the ball counts as rising, m/s."""
-    bounce_max_distance: Positive = 0.12
+    bounce_max_distance: Annotated[Positive, Field(le=1.0)] = 0.12
     """Vertical distance between ball and paddle within which a reversal is a bounce, m."""
-    apex_tolerance: NonNegative = 0.1
+    apex_tolerance: Distance = 0.1
     """Distance below the target up to which an apex continues the bounce count, m."""
-    min_ball_height: Finite = 0.05
+    min_ball_height: Coordinate = 0.05
     """The episode ends when the ball is below this height, m."""
-    max_height_above_target: Positive = 1.0
+    max_height_above_target: Length = 1.0
     """The episode ends when the ball is higher than this above the target height, m."""
-    max_horizontal_distance: Positive = 1.5
+    max_horizontal_distance: Annotated[Positive, Field(le=20.0)] = 1.5
     """The episode ends when |x| or |y| of the ball exceeds this, m."""
     observation: BounceObservation = BounceObservation()
     """The quantities that the policy sees."""
@@ -112,13 +120,22 @@ class BounceConfig(WorldConfig):
     """The reward terms."""
 
     @pydantic.model_validator(mode="after")
-    def _check_heights(self):
-        low, high = self.target_height_range
-        if not 0.0 < low <= high < math.inf:
-            raise ValueError(
-                f"target_height_range {self.target_height_range} is not 0 < low <= high; give two "
-                "heights in metres, the lower first"
-            )
+    def _check_start(self):
+        x, y, z = self.ball_init_pos
+        limits = (
+            ("min_ball_height", z > self.min_ball_height),
+            ("max_horizontal_distance", max(abs(x), abs(y)) < self.max_horizontal_distance),
+            (
+                "max_height_above_target",
+                z < self.target_height_range[0] + self.max_height_above_target,
+            ),
+        )
+        for name, holds in limits:
+            if not holds:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} m, so an episode ends where it starts, at "
+                    f"the ball_init_pos {self.ball_init_pos}; change one of the two"
+                )
         return self
 
     @classmethod
@@ -140,6 +157,10 @@ class BounceConfig(WorldConfig):
                 "height_progress": {"base_height": round(base_height, 4)},
             },
         }
+
+    @property
+    def heights(self) -> dict[str, float]:
+        return super().heights | {"target_height_range": self.target_height_range[0]}
 
     @property
     def commands(self) -> dict[str, Command]:

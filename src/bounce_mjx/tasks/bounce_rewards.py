@@ -5,8 +5,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Annotated
 
-from bounce_mjx.config.settings import Finite, NonNegative, Positive, StrictModel
+from pydantic import Field
+
+from bounce_mjx.config.settings import (
+    Coordinate,
+    Distance,
+    Finite,
+    Length,
+    NonNegative,
+    Positive,
+    Speed,
+    StrictModel,
+    Velocity,
+)
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.task import RewardTerm, gaussian, horizontal_distance, safe_sqrt
 
@@ -73,9 +86,9 @@ class PositionReward(RewardTerm):
 
     weight: Finite = 2.0
     """Weight of the term."""
-    vertical_scale: Positive = 0.15
+    vertical_scale: Length = 0.15
     """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
-    base_scale: Positive = 0.1
+    base_scale: Length = 0.1
     """Width of the Gaussian far from the paddle, m."""
     proximity_gain: NonNegative = 3.0
     """Factor by which the Gaussian is wider at the paddle."""
@@ -92,9 +105,9 @@ class OutOfPositionReward(RewardTerm):
     """Weight of the term."""
     magnitude: NonNegative = 2.0
     """Largest penalty."""
-    threshold: NonNegative = 0.05
+    threshold: Distance = 0.05
     """Horizontal error at half the penalty, m."""
-    scale: Positive = 0.03
+    scale: Length = 0.03
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -106,17 +119,17 @@ class VelocityMatchingReward(RewardTerm):
 
     weight: Finite = 2.0
     """Weight of the term."""
-    desired_velocity: Finite = 0.5
+    desired_velocity: Velocity = 0.5
     """Vertical velocity wanted at the target height, m/s."""
-    near_distance: Positive = 0.05
+    near_distance: Length = 0.05
     """Height error below which the current velocity is used, m."""
-    rising_scale: Positive = 0.2
+    rising_scale: Speed = 0.2
     """Width of the sigmoid between falling and rising, m/s."""
-    below_scale: Positive = 0.02
+    below_scale: Length = 0.02
     """Width of the sigmoid between above and below the target, m."""
-    near_scale: Positive = 0.01
+    near_scale: Length = 0.01
     """Width of the Gaussian around the target height, m."""
-    error_scale: Positive = 0.8
+    error_scale: Speed = 0.8
     """Width of the Gaussian of the velocity error, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -144,7 +157,7 @@ class HeightReward(RewardTerm):
 
     weight: Finite = 4.5
     """Weight of the term."""
-    scale: Positive = 0.15
+    scale: Length = 0.15
     """Width of the Gaussian of the height error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -156,7 +169,7 @@ class HeightProgressReward(RewardTerm):
 
     weight: Finite = 1.0
     """Weight of the term."""
-    base_height: Finite = 0.2
+    base_height: Coordinate = 0.2
     """Ball height above which the term grows, m."""
     gain: NonNegative = 2.0
     """Reward for each metre above the base height, 1/m."""
@@ -170,17 +183,17 @@ class ControlledUpwardReward(RewardTerm):
 
     weight: Finite = 1.5
     """Weight of the term."""
-    position_scale: Positive = 0.02
+    position_scale: Length = 0.02
     """Width of the Gaussian of the horizontal error, m."""
-    min_ideal_velocity: NonNegative = 0.5
+    min_ideal_velocity: Annotated[NonNegative, Field(le=100.0)] = 0.5
     """Lower limit of the ideal launch velocity, m/s."""
-    max_ideal_velocity: NonNegative = 3.0
+    max_ideal_velocity: Annotated[NonNegative, Field(le=100.0)] = 3.0
     """Upper limit of the ideal launch velocity, m/s."""
-    velocity_scale: Positive = 0.5
+    velocity_scale: Speed = 0.5
     """Width of the Gaussian of the velocity error, m/s."""
-    rising_scale: Positive = 0.1
+    rising_scale: Speed = 0.1
     """Width of the sigmoid between falling and rising, m/s."""
-    velocity_limit: Positive = 1.5
+    velocity_limit: Speed = 1.5
     """Upward velocity above which the term no longer grows, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -199,7 +212,7 @@ class ConsecutiveBouncesReward(RewardTerm):
     """Weight of the term."""
     gain: NonNegative = 0.5
     """Factor of the logarithm."""
-    position_scale: Positive = 0.05
+    position_scale: Length = 0.05
     """Width of the Gaussian of the horizontal error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -216,7 +229,7 @@ class HighBounceCountReward(RewardTerm):
     """Weight of the term."""
     gain: NonNegative = 0.15
     """Reward per bounce."""
-    position_scale: Positive = 0.05
+    position_scale: Length = 0.05
     """Width of the Gaussian of the horizontal error, m."""
     threshold: Finite = 2.0
     """Number of bounces at half the activation."""
@@ -233,9 +246,9 @@ class AlignmentReward(RewardTerm):
 
     weight: Finite = 0.6
     """Weight of the term."""
-    vertical_scale: Positive = 0.1
+    vertical_scale: Length = 0.1
     """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
-    scale: Positive = 0.03
+    scale: Length = 0.03
     """Width of the Gaussian of the horizontal distance between ball and paddle, m."""
     proximity_gain: NonNegative = 2.0
     """Factor of the proximity weight."""
@@ -256,13 +269,13 @@ class PaddleHomeReward(RewardTerm):
 
     weight: Finite = 1.5
     """Weight of the term."""
-    scale: Positive = 0.05
+    scale: Length = 0.05
     """Width of the Gaussian of the paddle's height error, m."""
     distance_gain: NonNegative = 0.5
     """Extra reward while the ball is far."""
-    distance_threshold: Finite = 0.15
+    distance_threshold: Coordinate = 0.15
     """Vertical distance between ball and paddle at half the extra reward, m."""
-    distance_scale: Positive = 0.03
+    distance_scale: Length = 0.03
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -277,9 +290,9 @@ class ExcessiveUpwardReward(RewardTerm):
     """Weight of the term."""
     magnitude: NonNegative = 1.0
     """Largest penalty."""
-    threshold: Finite = 3.5
+    threshold: Velocity = 3.5
     """Upward velocity at half the penalty, m/s."""
-    scale: Positive = 0.3
+    scale: Speed = 0.3
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -296,9 +309,9 @@ class DownwardVelocityReward(RewardTerm):
     """Slope of the clipped factor, s/m."""
     limit: NonNegative = 0.5
     """Upper limit of the clipped factor."""
-    threshold: Finite = 0.2
+    threshold: Velocity = 0.2
     """Downward speed at half the activation, m/s."""
-    scale: Positive = 0.2
+    scale: Speed = 0.2
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -313,7 +326,7 @@ class PaddleHeightViolationReward(RewardTerm):
     """Weight of the term."""
     gain: NonNegative = 20.0
     """Penalty for each metre beyond the tolerance, 1/m."""
-    tolerance: NonNegative = 0.1
+    tolerance: Distance = 0.1
     """Height error of the paddle that costs nothing, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -343,13 +356,13 @@ class JointVelocityReward(RewardTerm):
 class BounceReward(StrictModel):
     """The reward terms: each has a weight and the constants of its formula."""
 
-    target_x: Finite = 0.58856
+    target_x: Coordinate = 0.58856
     """Target point of the ball, x, m."""
-    target_y: Finite = 0.0
+    target_y: Coordinate = 0.0
     """Target point of the ball, y, m."""
-    paddle_home_height: Finite = 0.05
+    paddle_home_height: Coordinate = 0.05
     """Home height of the paddle, m."""
-    gravity: Positive = 9.81
+    gravity: Annotated[Positive, Field(le=100.0)] = 9.81
     """Gravity in the ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
     position: PositionReward = PositionReward()
     out_of_position: OutOfPositionReward = OutOfPositionReward()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import pydantic
+
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, NonNegative, Positive
+from bounce_mjx.config.settings import Coordinate, Duration, Friction
 from bounce_mjx.lazy import jax, jnp
 
 SPEEDS, FLIGHTS = (1.0, 2.0), (0.6, 0.7)
@@ -45,16 +47,16 @@ class Rewards(task.StrictModel):
 class Config(task.WorldConfig):
     """The world, with a rough paddle and a thrown ball, and the settings of catching."""
 
-    episode_seconds: Positive = 3.0
+    episode_seconds: Duration = 3.0
     """Length of an episode before it is truncated, s."""
-    ball_init_pos: tuple[Finite, Finite, Finite] = (
+    ball_init_pos: tuple[Coordinate, Coordinate, Coordinate] = (
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + REST_HEIGHT,
     )
     """Where the ball would rest on the paddle at a reset, m; throws aim near it."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02, ball_position=0.0)
     """The noise of a reset."""
-    friction: NonNegative | None = 0.3
+    friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
@@ -64,6 +66,16 @@ class Config(task.WorldConfig):
     """The quantities that the policy sees: what a robot with a camera measures."""
     reward: Rewards = Rewards()
     """The reward terms."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_throws(self):
+        distance = math.hypot(*self.ball_init_pos[:2])
+        if distance + AIM_RADIUS > MAX_DISTANCE:
+            raise ValueError(
+                f"ball_init_pos is {distance:.3g} m from the base, but a throw starts farther out, "
+                f"at most {MAX_DISTANCE:g} m from it; give at most {MAX_DISTANCE - AIM_RADIUS:g} m"
+            )
+        return self
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:

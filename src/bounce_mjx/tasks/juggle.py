@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+from pydantic import Field
+
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, Positive
+from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
 
 REST, FLOWN = 0.0225, 0.125
@@ -13,6 +15,9 @@ REST, FLOWN = 0.0225, 0.125
 the last ball has flown at a reset."""
 SETTLING, MAX_HEIGHT_ERROR = 2.0, 0.1
 """Time since the height was commanded after which apexes count, s; and how near they are, m."""
+LEAST_HEIGHT = 0.1
+"""Least height of the apexes over home, m: a lower flight has no time."""
+Height = Annotated[Finite, Field(ge=LEAST_HEIGHT, le=10.0)]
 
 
 class Rewards(task.StrictModel):
@@ -47,13 +52,13 @@ class Config(task.WorldConfig):
 
     num_balls: task.NumBalls = 2
     """Number of balls, 2 or 3."""
-    home: tuple[Finite, Finite, Finite] = task.PADDLE_HOME
+    home: tuple[Coordinate, Coordinate, Coordinate] = task.PADDLE_HOME
     """Home of the paddle, m; the columns stand side by side over it."""
-    spacing: Positive = 0.065
+    spacing: Annotated[Positive, Field(le=1.0)] = 0.065
     """Distance between columns, m."""
-    height_range: tuple[Finite, Finite] = (0.35, 0.55)
+    height_range: Annotated[tuple[Height, Height], Ascending] = (0.35, 0.55)
     """Range of the target height over home, m."""
-    max_distance: Positive = 0.7
+    max_distance: Length = 0.7
     """The episode ends when a ball is this far from the top of its column, m; or when two touch."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
@@ -67,10 +72,14 @@ class Config(task.WorldConfig):
         return super().settings_at(paddle) | {"home": paddle}
 
     @property
+    def heights(self) -> dict[str, float]:
+        return {"height_range": self.home[2] + self.height_range[0]}
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The height of the apexes."""
         low, high = (self.home[2] + height for height in self.height_range)
-        return {"target_height": task.Command(low, high, "m", least=self.home[2] + 0.1)}
+        return {"target_height": task.Command(low, high, "m", least=self.home[2] + LEAST_HEIGHT)}
 
     def columns(self, height: Any) -> list[tuple[Any, Any, Any]]:
         """The commanded apex of each ball, m."""

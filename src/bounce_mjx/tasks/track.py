@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Any
 
+from pydantic import Field
+
 from bounce_mjx import task
-from bounce_mjx.config.settings import Finite, Positive
+from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks import paths
 from bounce_mjx.world.config import ActionConfig
@@ -20,6 +22,9 @@ BANDS = {"slow error": (0.0, 0.1, 1.5), "fast error": (0.25, 0.3, 3.0)}
 MAX_STEP_ERROR, MAX_HEIGHT_ERROR = 0.03, 0.1
 JUMP_SPEED, JUMP_ACCELERATION = 1.0, 3.0
 """A point that is faster (m/s) or accelerates more (m/s^2) has jumped."""
+Height = Annotated[Finite, Field(ge=0.1, le=10.0)]
+"""Over home, m; the point sways around it, and stays above a resting ball."""
+PointSpeed = Annotated[Finite, Field(ge=0.0, le=JUMP_SPEED)]
 
 
 class Rewards(task.StrictModel):
@@ -54,15 +59,15 @@ class Config(task.WorldConfig):
     """The world, the point, the ends and the reward."""
 
     # Not `task.PADDLE_HOME`: the shipped policy was trained here. The next one moves it.
-    home: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.05)
+    home: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
-    height_range: tuple[Finite, Finite] = (0.4, 0.5)
+    height_range: Annotated[tuple[Height, Height], Ascending] = (0.4, 0.5)
     """Range of the target height over home, around which it sways, m."""
-    speed_range: tuple[Finite, Finite] = (0.05, 0.3)
+    speed_range: Annotated[tuple[PointSpeed, PointSpeed], Ascending] = (0.05, 0.3)
     """Range of the point's greatest speed, m/s."""
-    path_size: Positive = 0.12
+    path_size: Annotated[Positive, Field(le=1.0)] = 0.12
     """Radius of the circle, half the length of the line and of the figure of eight, m."""
-    max_distance: Positive = 0.7
+    max_distance: Length = 0.7
     """The episode ends when the ball is this far from the point, or lower than home, m."""
     action: ActionConfig = ActionConfig(base="target")
     observation: Observation = Observation()
@@ -73,6 +78,10 @@ class Config(task.WorldConfig):
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
+
+    @property
+    def heights(self) -> dict[str, float]:
+        return super().heights | {"height_range": self.home[2] + self.height_range[0]}
 
     @property
     def commands(self) -> dict[str, task.Command]:

@@ -35,6 +35,7 @@ from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import hosts
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog, open_log
 from bounce_mjx.training.trainer import (
     JAX,
@@ -185,6 +186,8 @@ class _Job:
         say(console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
         for warning in self.env.engine.warnings:
             say(console, f"warning: {warning}")
+        for term in config.env.unseen_noise:
+            say(console, f"warning: the policy does not see what {term} changes")
         library = "" if self.trainer.library == JAX else f"library: {self.trainer.library}  "
         say(console, f"device: {self.device}  {library}run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
@@ -461,6 +464,10 @@ class _Job:
             self.reporter.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
+        if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
+            if hosts.is_leader() and self._latest() is None:
+                shutil.rmtree(self.run, ignore_errors=True)
+            raise UserError(f"these settings cannot be trained: {wrong}")
         faults = metrics.pop("fault")
         done = faults.shape[1] * self.config.ppo.batch_steps
         self.steps += done

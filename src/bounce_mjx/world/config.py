@@ -8,15 +8,19 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import (
+    Coordinate,
+    Duration,
     Finite,
+    Friction,
     NonNegative,
     PlainPath,
     Positive,
+    Speed,
     StrictModel,
     whole_number,
 )
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.robot.config import RobotConfig, is_packaged
+from bounce_mjx.robot.config import OF_SITE, RobotConfig, is_packaged
 from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, entries
 
@@ -57,7 +61,7 @@ class Command(NamedTuple):
           UserError: it is not a number within the limits.
         """
         try:
-            number = float(value)
+            number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
             number = math.nan
         if math.isfinite(number) and self.least <= number <= self.greatest:
@@ -75,7 +79,7 @@ class ActionConfig(StrictModel):
     base: Literal["measured", "target"] = "measured"
     """measured: the measured joint angle. target: the last servo target, with which a joint reaches
     its full speed despite latency."""
-    max_lead: Positive = 0.15
+    max_lead: Annotated[Positive, Field(le=3.0)] = 0.15
     """Largest distance of the last target from the measured angle, rad; for the base target."""
 
 
@@ -83,11 +87,11 @@ class ResetConfig(StrictModel):
     """The noise of a reset, to which the terms `joint_start` and `ball_start` of the randomisation
     add."""
 
-    joint_angles: NonNegative = 0.1
+    joint_angles: Annotated[NonNegative, Field(le=3.0)] = 0.1
     """Half-width of the uniform noise of the joint angles, rad."""
-    joint_velocities: NonNegative = 0.01
+    joint_velocities: Annotated[NonNegative, Field(le=10.0)] = 0.01
     """Half-width of the uniform noise of the joint velocities, rad/s."""
-    ball_position: NonNegative = 0.01
+    ball_position: Annotated[NonNegative, Field(le=1.0)] = 0.01
     """Half-width of the uniform noise of each ball coordinate, m."""
 
 
@@ -113,16 +117,16 @@ class WorldConfig(StrictModel):
     installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
-    physics_dt: Positive = 0.001
+    physics_dt: Annotated[Positive, Field(le=0.1)] = 0.001
     """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
-    control_dt: Positive = 0.01
+    control_dt: Annotated[Positive, Field(le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
-    episode_seconds: Positive = 20.0
+    episode_seconds: Duration = 20.0
     """Length of an episode before it is truncated, s."""
-    friction: NonNegative | None = None
+    friction: Friction | None = None
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
     the project's own robot."""
-    action_scale: Positive = 0.02
+    action_scale: Annotated[Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
     action: ActionConfig = ActionConfig()
     """What an action adds to."""
@@ -132,11 +136,11 @@ class WorldConfig(StrictModel):
     """Position of each acting joint at a reset, before noise, rad."""
     num_balls: NumBalls = 1
     """Number of balls; those that the MJCF lacks are copies of its first one."""
-    ball_init_pos: tuple[Finite, Finite, Finite] = (0.58856, 0.0, 0.45)
+    ball_init_pos: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.45)
     """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
     reset: ResetConfig = ResetConfig()
     """The noise of a reset."""
-    max_joint_velocity: Positive = 2.0 * math.pi
+    max_joint_velocity: Speed = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
@@ -213,6 +217,20 @@ class WorldConfig(StrictModel):
         return self
 
     @pydantic.model_validator(mode="after")
+    def _check_effects(self):
+        """A setting that has no effect is a mistake. A run's own config has all defaults."""
+        unused = {f"robot.{name}": "robot.site" for name in OF_SITE} if not self.robot.site else {}
+        if self.action.base == "measured":
+            unused["action.max_lead"] = "the action.base target"
+        for key, needed in unused.items():
+            group, name = (getattr(self, key.split(".")[0]), key.split(".")[1])
+            if getattr(group, name) != type(group).model_fields[name].default:
+                raise ValueError(
+                    f"{key} has no effect without {needed}; set that too, or leave {key} out"
+                )
+        return self
+
+    @pydantic.model_validator(mode="after")
     def _check_servo_lead(self):
         if self.observation.servo_lead and self.action.base != "target":
             raise ValueError(
@@ -261,6 +279,26 @@ class WorldConfig(StrictModel):
     def commands(self) -> dict[str, Command]:
         """The commands of the policy, by name; a task's config has its own."""
         return {}
+
+    @property
+    def unseen_noise(self) -> tuple[str, ...]:
+        """Terms of the randomisation that change measurements which the policy does not see."""
+        seen, terms = self.observation, self.randomization.terms
+        if seen.seen("task"):
+            return ()
+        velocity = seen.ball_velocity and seen.velocity == "measured"
+        unseen = {
+            "joint_velocity_": seen.joint_velocities,
+            "ball_velocity_": velocity,
+            "ball_position_": seen.ball_position or (seen.ball_velocity and not velocity),
+        }
+        return tuple(t for t in terms if any(t.startswith(p) and not s for p, s in unseen.items()))
+
+    @property
+    def heights(self) -> dict[str, float]:
+        """The heights that are over the paddle at a reset, by their settings, m; a task has its
+        own."""
+        return {"ball_init_pos": self.ball_init_pos[2]}
 
     @property
     def num_substeps(self) -> int:

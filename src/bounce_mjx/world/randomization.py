@@ -16,6 +16,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
+from bounce_mjx.config.validation import unit_of
 from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import jax, jnp, mujoco, np
 
@@ -60,9 +61,7 @@ class Term(NamedTuple):
         return (num_joints,) if self.size is None else self.size
 
 
-_ANY = (-math.inf, math.inf)
 _FACTOR = (1e-3, 1e3)
-_NOT_NEGATIVE = (0.0, math.inf)
 
 IMPACT_SPEED = 2.45
 """Speed of the impact that the restitution is of if it has a slope, m/s."""
@@ -84,74 +83,74 @@ class RandomizationConfig(StrictModel):
     hollow balls on flat surfaces")."""
     ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
+    ball_radius: Annotated[Range | None, Term((), 1.0, (0.1, 10.0))] = None
     """Factor of the ball's radius."""
-    air_drag: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    air_drag: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
-    air_lift: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    air_lift: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
     velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
     speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
     "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
-    contact_friction: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    contact_friction: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
     servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each servo's stiffness."""
     servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each servo's damping."""
-    servo_lag: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    servo_lag: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, math.inf))] = None
+    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, 1e5))] = None
     """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
+    joint_damping: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4))] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Range | None, Term(None, 0.0, _NOT_NEGATIVE)] = None
+    joint_frictionloss: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4))] = None
     """Dry friction of each joint, N m, in place of the model's."""
     armature: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each joint's rotor inertia."""
     link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
     """Factor of each link's mass."""
-    paddle_offset: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
+    paddle_offset: Annotated[Range | None, Term((3,), 0.0, (-0.5, 0.5))] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Range | None, Term((2,), 0.0, _ANY)] = None
+    paddle_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0))] = None
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, _ANY)] = None
+    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0))] = None
     """Rotation of gravity about the world's x and y axis, rad."""
-    action_latency: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    action_latency: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Time from an action to its servo targets, s."""
-    ball_latency: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    ball_latency: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Time from a camera image of the ball to its use, s."""
     camera_rate: Annotated[Range | None, Term((), None, (1.0, 1e4))] = None
     """Camera images of the ball per second, Hz; each is used until the next one arrives. Without a
     rate there is an image at every control step."""
     frame_drop: Annotated[Range | None, Term((), 0.0, (0.0, 0.99))] = None
     """Probability that a camera image is lost."""
-    ball_position_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    ball_position_noise: Annotated[Range | None, Term((), 0.0, (0.0, 0.5))] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
+    ball_position_bias: Annotated[Range | None, Term((3,), 0.0, (-0.5, 0.5))] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
-    ball_velocity_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    ball_velocity_noise: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
-    ball_velocity_bias: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
+    ball_velocity_bias: Annotated[Range | None, Term((3,), 0.0, (-10.0, 10.0))] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    joint_angle_noise: Annotated[Range | None, Term((), 0.0, (0.0, 0.5))] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
+    encoder_bias: Annotated[Range | None, Term(None, 0.0, (-0.5, 0.5))] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    joint_velocity_noise: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
+    joint_velocity_bias: Annotated[Range | None, Term(None, 0.0, (-10.0, 10.0))] = None
     """Error of each measured joint velocity, constant in an episode, rad/s."""
-    push_speed: Annotated[Range | None, Term((), 0.0, _NOT_NEGATIVE)] = None
+    push_speed: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Range | None, Term((), None, (0.01, math.inf))] = None
+    push_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Range | None, Term((), None, (0.01, math.inf))] = None
+    command_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
     """Time between two draws of the task's commands within an episode, s."""
-    ball_start: Annotated[Range | None, Term((3,), 0.0, _ANY)] = None
+    ball_start: Annotated[Range | None, Term((3,), 0.0, (-1.0, 1.0))] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
-    joint_start: Annotated[Range | None, Term(None, 0.0, _ANY)] = None
+    joint_start: Annotated[Range | None, Term(None, 0.0, (-3.0, 3.0))] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
@@ -174,8 +173,11 @@ class RandomizationConfig(StrictModel):
             )
         if self.restitution_slope is not None and self.restitution is None:
             raise ValueError("restitution_slope is given without restitution; give both")
+        if self.push_interval is not None and self.push_speed is None:
+            raise ValueError("push_interval is given without push_speed; give both, or neither")
         for name in self.terms:
             ends, (size, _, (least, greatest)) = getattr(self, name), TERMS[name]
+            unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
             counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
             if len(counts) > 1 or (size is not None and not counts <= {0, *size}):
                 each = "joint" if size is None else f"of {sum(size)} axes"
@@ -190,7 +192,8 @@ class RandomizationConfig(StrictModel):
                     )
                 if low < least or high > greatest:
                     raise ValueError(
-                        f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}; narrow the range"
+                        f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}{unit}; narrow "
+                        "the range"
                     )
         return self
 

@@ -1,0 +1,294 @@
+"""Settings in a wrong unit, without an effect, or that no episode survives: one sentence each."""
+
+import math
+import re
+from typing import ClassVar
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from bounce_mjx import task
+from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs.config import train_config
+from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.training.first_block import fault_of
+from bounce_mjx.world.config import Command
+from tiny_runs import TINY
+
+WRONG = """
+default_joint_angles: [0, 40, 110, 0, -60, 0]            # degrees
+ball_init_pos: [588.56, 0, 450]                          # mm
+ball_init_pos: [58.856, 0, 45]                           # cm
+target_height_range: [400, 600]                          # mm
+target_height_range: [40, 60]                            # cm
+target_height_range: [0.02, 0.04]                        # over the floor, not over the paddle
+action_scale: 1.15                                       # degrees
+action: {base: target, max_lead: 8.6}                    # degrees
+control_dt: 10                                           # ms
+control_dt: 100                                          # Hz
+episode_seconds: 20000                                   # ms
+max_joint_velocity: 360                                  # degrees a second
+min_ball_height: 50                                      # mm
+min_ball_height: 5                                       # cm
+max_horizontal_distance: 0.15                            # less than the paddle's own distance
+max_horizontal_distance: 1500                            # mm
+max_height_above_target: 1000                            # mm
+bounce_max_distance: 120                                 # mm
+reset: {joint_angles: 5.7}                               # degrees
+reset: {ball_position: 10}                               # mm
+reward: {height: {scale: 150}}                           # mm
+reward: {target_x: 588.56}                               # mm
+reward: {velocity_matching: {desired_velocity: 500}}     # mm/s
+randomization: {action_latency: [20, 40]}                # ms
+randomization: {ball_latency: [8, 30]}                   # ms
+randomization: {servo_lag: [5, 10]}                      # ms
+randomization: {paddle_tilt: [-3, 3]}                    # degrees
+randomization: {gravity_tilt: [-2, 2]}                   # degrees
+randomization: {paddle_offset: [-5, 5]}                  # mm
+randomization: {encoder_bias: [-1, 1]}                   # degrees
+randomization: {joint_start: [-5, 5]}                    # degrees
+randomization: {ball_start: [-30, 30]}                   # mm
+randomization: {ball_radius: [19, 20]}                   # mm, where a factor is due
+randomization: {ball_position_noise: [1, 2]}             # mm
+randomization: {ball_position_bias: [-5, 5]}             # mm
+randomization: {push_speed: [100, 200]}                  # mm/s
+randomization: {push_speed: [0.1, 0.2], push_interval: [2000, 3000]}  # ms
+randomization: {command_interval: [2000, 3000]}          # ms
+robot: {paddle: {half_size: [0.2, 0.2, 0.01], mass: 5}}  # does nothing without robot.site
+robot: {joints: [nope]}                                  # the same
+robot: {site: s, paddle: {half_size: [50, 65, 3.5]}}     # mm
+robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
+robot: {site: s, paddle: {mass: 100}}                    # g
+robot: {site: s, ball: {radius: 19}}                     # mm
+robot: {site: s, ball: {mass: 2.7}}                      # g
+robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
+action: {max_lead: 0.3}                                  # does nothing with the base measured
+randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
+max_joint_velocity: true                                 # a switch is no number
+ball_init_pos: [true, 0, 0.45]                           # the same
+num_balls: true                                          # the same
+randomization: {restitution: [0.8, true]}                # the same
+"""
+
+
+def config(name: str, **env):
+    kind = train_config(find_task(name))
+    return validate(kind, {"task": name, "env": env}, "my.yaml").env
+
+
+def names(values: dict, prefix: str = "") -> list[str]:
+    """The keys of nested settings without a group, and the groups of such keys."""
+    inner = [names(v, f"{prefix}{k}.") for k, v in values.items() if isinstance(v, dict)]
+    leaves = [k for k, v in values.items() if not isinstance(v, dict)]
+    return [*leaves, *[prefix.rstrip(".")] * bool(leaves and prefix), *sum(inner, [])]
+
+
+@pytest.mark.parametrize("line", WRONG.strip().splitlines(), ids=lambda line: line.split("#")[0])
+def test_a_wrong_unit_is_refused_by_name(line: str) -> None:
+    values = yaml.safe_load(line)
+    with pytest.raises(UserError) as caught:
+        Env(config("bounce", **values))
+    message = str(caught.value)
+    assert any(name in message for name in names(values)), message
+    assert "\n" not in message and len(message) < 300
+
+
+@pytest.mark.parametrize(
+    "name, env, reason",
+    [
+        (
+            "juggle",
+            {"height_range": (0, 0)},
+            "height_range is 0, but must be greater than or equal to 0.1 m",
+        ),
+        ("juggle", {"height_range": (0.5, 0.4)}, "height_range: (0.5, 0.4) is not a range"),
+        ("juggle", {"height_range": (350, 550)}, "height_range is 350"),
+        (
+            "juggle",
+            {"home": (0.6, 0.0, -0.5)},
+            "height_range has the height -0.15 m, which is not over",
+        ),
+        ("track", {"height_range": (0.0, 0.4)}, "height_range is 0.0"),
+        ("track", {"height_range": (0.5, 0.4)}, "height_range: (0.5, 0.4) is not a range"),
+        ("track", {"height_range": (400, 500)}, "height_range is 400"),
+        ("track", {"speed_range": (-0.1, 0.3)}, "speed_range is -0.1"),
+        ("track", {"speed_range": (50, 300)}, "speed_range is 50"),
+        ("track", {"path_size": 120}, "path_size is 120"),
+        ("catch", {"ball_init_pos": (2.1, 0.0, 0.0723)}, "ball_init_pos is 2.1 m from the base"),
+        ("catch", {"ball_init_pos": (-1.5, 1.5, 0.0723)}, "ball_init_pos is 2.12 m from the base"),
+        ("balance", {"ball_init_pos": (0.59, 0.0, 0.02)}, "ball_init_pos has the height 0.02 m"),
+    ],
+)
+def test_a_range_of_a_task_is_refused_by_name(name: str, env: dict, reason: str) -> None:
+    with pytest.raises(UserError, match="my.yaml|paddle") as caught:
+        Env(config(name, **env))
+    assert reason in str(caught.value)
+
+
+ACCEPTED = """
+# a 3 m gantry
+bounce: {default_joint_angles: [3, -3, 1.5], ball_init_pos: [3, -3, 2], min_ball_height: 1.5,
+  target_height_range: [2, 2.5], max_horizontal_distance: 4, action_scale: 0.1}
+# a small arm
+bounce: {ball_init_pos: [0.12, 0, 0.2], target_height_range: [0.15, 0.25], min_ball_height: 0.02,
+  max_horizontal_distance: 0.3, action_scale: 0.1, max_joint_velocity: 12}
+# balls: golf, tennis, basketball, steel, balloon
+bounce: {robot: {site: s, ball: {radius: 0.0214, mass: 0.0459}}}
+bounce: {robot: {site: s, ball: {radius: 0.033, mass: 0.058}}}
+bounce: {robot: {site: s, ball: {radius: 0.12, mass: 0.62}}}
+bounce: {robot: {site: s, ball: {radius: 0.01, mass: 0.033}}}
+bounce: {robot: {site: s, ball: {radius: 0.15, mass: 0.02}}}
+bounce: {randomization: {ball_radius: [1.1, 6.3], ball_mass: [0.5, 230]}}
+# a slow robot with a slow camera, and a fast one
+bounce: {randomization: {action_latency: [0.1, 0.3], camera_rate: [15, 30]}}
+bounce: {physics_dt: 0.0005, control_dt: 0.001}
+# high throws, and a path far from the base
+juggle: {height_range: [1, 3], max_distance: 4}
+track: {home: [1.5, 0.5, 1], path_size: 0.5}
+"""
+
+
+@pytest.mark.parametrize("case", re.findall(r"^\w[^#]+?\n(?=\w|#|$)", ACCEPTED, re.MULTILINE))
+def test_other_arms_and_balls_are_accepted(case: str) -> None:
+    ((name, env),) = yaml.safe_load(case).items()
+    config(name, **env)
+
+
+def test_a_command_is_no_switch() -> None:
+    with pytest.raises(UserError, match="target_height is True, but must be a finite number"):
+        Command(0.4, 0.6, "m").checked(True, "target_height")
+    assert math.isclose(Command(0.4, 0.6, "m").checked("0.5", "target_height"), 0.5)
+
+
+# A user's own task
+
+
+class Reward(task.StrictModel):
+    low: task.Gaussian = task.Gaussian()
+    slow: task.Gaussian = task.Gaussian()
+
+
+class Mistyped(task.Task):
+    """A task with the mistakes of `wrong`."""
+
+    wrong: ClassVar[str] = ""
+
+    class Config(task.WorldConfig):
+        reward: Reward = Reward()
+
+        @property
+        def commands(self) -> dict[str, Command]:
+            return {"height": Command(0.4, 0.6, "m")}
+
+    @property
+    def curves(self) -> tuple[task.Curve, ...]:
+        return (task.Curve("task/error", "eror" if self.wrong == "curve" else "error"),)
+
+    def reset(self, start: task.Start) -> tuple[()]:
+        return ()
+
+    def next_command(self, state: tuple[()], command: task.Values) -> task.Values:
+        if self.wrong == "key left out":
+            return {}
+        if self.wrong == "key given":
+            return command | {"hieght": command["height"]}
+        return command | {"height": command["hieght" if self.wrong == "key read" else "height"]}
+
+    def step(self, state: tuple[()], step: task.Step) -> task.TaskStep:
+        low, slow = step.truth.ball_position[2], step.truth.ball_velocity[2]
+        terms = {"term": {"low": low, "slwo": slow}, "term left out": {"low": low}}
+        values = terms.get(self.wrong, {"low": low, "slow": slow})
+        reward = task.weighted_terms(self.config.reward, **values)
+        return task.TaskStep((), reward, low < 0.0, {"error": low})
+
+
+@pytest.mark.parametrize(
+    "wrong, reason",
+    {
+        "curve": "the curve task/error names a metric that there is not, eror; there are: error",
+        "key read": "next_command of the task Mistyped names a command that there is not, hieght",
+        "key given": "next_command of the task Mistyped names a command that there is not, hieght",
+        "key left out": "Mistyped lacks the command height; there are: height",
+        "term": "names a term of the reward that there is not, slwo; there are: low, slow",
+        "term left out": "weighted_terms lacks the term of the reward slow; there are: low, slow",
+    }.items(),
+)
+def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monkeypatch) -> None:
+    env = Env(Mistyped.Config())
+    jax.eval_shape(env.reset, jax.random.key(0))
+    monkeypatch.setattr(Mistyped, "wrong", wrong)
+    with pytest.raises(UserError, match=reason):
+        jax.eval_shape(env.reset, jax.random.key(0))
+
+
+# The first block
+
+
+def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:
+    """Metrics of two seeds and four iterations of 8 environments and 8 steps."""
+    named = {
+        "episode/ended": ended, "task/too_fast": too_fast, "task/non_finite": non_finite,
+        "reward/height": height, "reward/position": -1.0, "fault": fault,
+    }  # fmt: skip
+    return {name: np.broadcast_to(value, (2, 4)) for name, value in named.items()}
+
+
+FIRST = train_config(find_task("bounce"))(ppo={"num_envs": 8, "rollout_length": 8})
+LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    "block, reason",
+    [
+        (first_block(), r"lasts 0\.01 s .* an end of the task bounce .*min_ball_height 0\.05,"),
+        (first_block(too_fast=60.0), r"lasts 0\.01 s .* max_joint_velocity \(6\.28319 rad/s\)"),
+        (first_block(non_finite=64.0), "the physics, which is not finite"),
+        (first_block(ended=7.0), r"lasts 0\.091 s"),
+        (
+            first_block(ended=0.0, height=-1.1e5),
+            "height is -1.1e.05 on average, beyond 10000 after",
+        ),
+        (first_block(ended=0.0, height=NAN), "height is not finite"),
+    ],
+)
+def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str) -> None:
+    assert re.search(reason, fault_of(block, FIRST))
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        first_block(ended=6.0),
+        first_block(ended=0.0, height=0.9e5),
+        # The learning diverged, not the settings: an iteration after the fault counts no more.
+        first_block(ended=0.0, height=NAN, fault=LATE),
+        # Another seed learns.
+        first_block(ended=np.array([[64.0], [1.0]])),
+        first_block(ended=0.0, height=np.array([[np.nan], [1.0]])),
+    ],
+)
+def test_any_other_first_block_is_trained_on(block: dict) -> None:
+    assert fault_of(block, FIRST) is None
+
+
+def test_a_short_time_limit_is_no_fault() -> None:
+    short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
+    assert fault_of(first_block(ended=16.0), short) is None
+
+
+@pytest.mark.slow
+def test_training_refuses_before_it_saves(tmp_path, capsys) -> None:
+    """And says what the policy does not see."""
+    noise = ["--randomization.ball-velocity-noise", "0.1", "0.1"]
+    args = [*TINY, "--log-dir", str(tmp_path), "--max-joint-velocity", "0.001", *noise]
+    with pytest.raises(SystemExit):
+        train_command.main([*args, "--observation.velocity", "differences", "--no-report"])
+    said = capsys.readouterr()
+    assert "the policy does not see what ball_velocity_noise changes" in said.out
+    assert "what ends it is max_joint_velocity (0.001 rad/s)" in said.err
+    assert not [*tmp_path.iterdir()]
