@@ -289,10 +289,10 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
         width = 2.0 * 1.5 * 1.96 * 0.1 * layout.deviation[places[name]]
         np.testing.assert_allclose(high - low, width, rtol=2e-2)
         np.testing.assert_allclose(_known(config, log, {})[1][places[name]], 0.5 * (low + high))
-    assert compare(read_world(path), found, log, NAMES) == []
+    assert compare(read_world(path), found, NAMES) == []
     other = vector.copy()
     other[places["paddle_tilt"]] = 0.04, -0.08
-    changed = compare(read_world(path), found._replace(fit=fit._replace(vector=other)), log, NAMES)
+    changed = compare(read_world(path), found._replace(fit=fit._replace(vector=other)), NAMES)
     assert [line.split(" is ")[0] for line in changed] == ["paddle_tilt x", "paddle_tilt y"]
 
 
@@ -342,11 +342,11 @@ def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     # Gain and mass cannot be told apart by such a log, and the file says so.
     assert "randomization.link_mass" in world.assumed
     assert any("link_mass" in sentence for sentence in sentences(found, NAMES))
-    assert compare(world, found, log, NAMES) == []
+    assert compare(world, found, NAMES) == []
     values = yaml.safe_load(path.read_text(encoding="utf-8"))
     values["env"]["randomization"]["action_latency"] = [high + 0.01, high + 0.02]
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
-    (changed,) = compare(read_world(path), found, log, NAMES)
+    (changed,) = compare(read_world(path), found, NAMES)
     assert changed.startswith("action_latency is ") and " now, outside " in changed
 
 

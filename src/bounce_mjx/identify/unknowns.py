@@ -30,6 +30,8 @@ class Unknown(NamedTuple):
     own: bool = False
     """Whether each joint's entry moves, nearly, that joint alone: one simulation then serves the
     angles of all."""
+    usual: float | None = None
+    """Deviation of a right value, if the prior covers mistakes too."""
 
 
 _JOINTS = None
@@ -39,7 +41,9 @@ ARM = {
     "servo_lag": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
     "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, True),
     "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, True),
-    "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, True),
+    "joint_frictionloss": Unknown(
+        1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, own=True
+    ),
     "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
     "gravity_tilt": Unknown(0.0, 0.03, 4e-3, "rad", "flight", 2),
@@ -50,7 +54,8 @@ BALL = {
     "restitution": Unknown(0.85, 0.08, 0.02, "", "bounce", limits=(0.6, 0.98)),
     "paddle_tilt": Unknown(0.0, 0.02, 8e-3, "rad", "bounce", 2),
     "paddle_offset": Unknown(0.0, 0.006, 8e-3, "m", "bounce", 3),
-    "ball_position_bias": Unknown(0.0, 0.012, 2e-3, "m", "bounce", 3),
+    # The offset of the camera's frame, which nobody may have measured, is a part of it.
+    "ball_position_bias": Unknown(0.0, 0.1, 2e-3, "m", "bounce", 3, usual=0.012),
     "contact_friction": Unknown(0.3, 0.3, 0.05, "", "bounce", limits=(0.0, np.inf)),
 }
 CAMERA_ROTATION = "camera_rotation"

@@ -35,6 +35,25 @@ _MOTIONS = {
     "ball_latency": "bounces at several target heights show it",
     "restitution": "more bounces show it",
 }
+# Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
+_SURPRISING = 3.0
+_MISTAKES = {
+    "ball_position_bias": "the frame of the ball's position, whose origin is the robot's base in "
+    "metres, x forward and z up, or swapped columns",
+    "gravity_tilt": "the axes of the ball's frame, which swapped columns turn too, or the base",
+    "air_drag": "the unit of ball_time or of the ball's position",
+    "ball_latency": "the unit or the clock of ball_time",
+    "restitution": "the unit of ball_time, or another ball or paddle than the model's",
+    "paddle_tilt": "the axes of the ball's frame, or how the paddle is mounted",
+    "paddle_offset": "the frame of the ball's position, or how the paddle is mounted",
+    CAMERA_ROTATION: "the axes of the ball's frame, which swapped columns turn too",
+    "action_latency": "the clock of the servo targets",
+    "encoder_bias": "a joint's zero, the unit of the angles, swapped columns, or the ball's frame",
+}
+_OF_JOINTS = "another arm than --robot's, swapped columns of joints, or the frame of the ball"
+# Share of an estimate's variance that is that of others, beyond which they are told apart by their
+# priors alone.
+_TOLD_BY_PRIOR = 0.5
 
 
 class Estimate(NamedTuple):
@@ -53,7 +72,8 @@ class Estimate(NamedTuple):
 
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
-    """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them."""
+    """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
+    `ball_latency` is the time from the exposure to the arrival."""
     layout, width = found.layout, _WIDTH * found.deviation * misfit(found)
     world = layout.world(found.fit.vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.unknowns])
@@ -63,6 +83,9 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
         place = layout.slices()[name]
         low[place], high[place] = ends
         alone[place] = np.inf
+    late = layout.slices().get("ball_latency", slice(0, 0))
+    for array in (values, low, high):
+        array[late] += found.stamp_age
     seen = found.deviation < _UNSEEN * layout.deviation
     units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
     labels = layout.labels(joint_names)
@@ -122,8 +145,46 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "not in free flight; their pictures do not count."
         )
     if not np.any(found.windows.has_ball):
-        said.append("The log shows no bounce, so only the arm was identified.")
-    return said + _unseen(found, joint_names)
+        said.append(
+            "The log shows no bounce, so only the arm was identified. If the ball bounced, look at "
+            "the axes and the unit of its position, z up in metres, and at the unit of ball_time."
+        )
+    return [*_mistakes(found, joint_names), *said, *_unseen(found, joint_names), *_frame(found)]
+
+
+def _mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
+    """Warnings of estimates that are far from what a robot may have."""
+    layout, listed, said = found.layout, estimates(found, joint_names), []
+    for name, place in layout.slices().items():
+        unknown = layout.unknowns[name]
+        off = (found.fit.vector[place] - unknown.mean) / (unknown.usual or unknown.deviation)
+        at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
+        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit):
+            entry = listed[place][i]
+            said.append(
+                f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
+                + f", {abs(off[i]):.1f} usual deviations from {unknown.mean:g}; look at "
+                f"{_MISTAKES.get(name, _OF_JOINTS)}."
+            )
+    return said
+
+
+def _frame(found: Identified) -> list[str]:
+    """What cannot be told from the place of the paddle."""
+    places, spread = found.layout.slices(), found.covariance
+    if "paddle_offset" not in places:
+        return []
+    paddle, said = places["paddle_offset"], []
+    bias = places["ball_position_bias"]
+    for axis, i in zip("xyz", range(bias.start, bias.stop), strict=True):
+        with_paddle = np.linalg.solve(spread[paddle, paddle], spread[paddle, i])
+        if spread[i, paddle] @ with_paddle > _TOLD_BY_PRIOR * spread[i, i]:
+            said.append(
+                f"The log does not tell ball_position_bias {axis} from paddle_offset: a ball's "
+                "frame that is off moves the bounces as a paddle does that is elsewhere. Measure "
+                "where the paddle is, and where the camera sees a ball that lies on it."
+            )
+    return said
 
 
 def _unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
