@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.signal import lfilter
 
 from bounce_mjx.commands.main import main
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
@@ -222,12 +223,40 @@ def test_noise_of_derivatives_is_no_information() -> None:
 
     weights, clean = problem.weights(pictures=0.0), problem.at(layout.mean, w.starts).angles
     measured = w._replace(angles=clean + 1e-3 * random.normal(size=clean.shape))
-    fit = Fit(layout.mean, w.starts, np.zeros(0), Predicted(*2 * (np.zeros(0),)), weights, 0.0)
+    at_fit = problem.at(layout.mean, w.starts)
+    fit = Fit(layout.mean, w.starts, np.zeros(0), at_fit, weights, 0.0)
     known = certainty(problem._replace(simulate=scattered, windows=measured), fit)
     deviations = np.sqrt(np.diag(known.covariance))
     assert np.all(deviations[place] > 0.9 * layout.deviation[place])
     gains = layout.slices()["servo_gain"]
     assert np.all(deviations[gains] < 0.1 * layout.deviation[gains])
+
+
+def test_a_log_shows_that_an_arm_is_never_late() -> None:
+    """Servos with their own lag of 10 ms alone: `action_latency` and `servo_lag` are 0, where both
+    can only make the arm later."""
+    log = flight_log(12.0, (0.0, 12.0))
+    log = log._replace(servo_targets=0.2 * np.sin(np.outer(log.times, np.arange(2.0, 14.0, 2.0))))
+    w, layout = windows_of(log), make_layout(6, True, 0.001)
+    sent = _Targets(log, w, 0.001)
+    at = w.first[:, None] + np.round(w.angle_times / 0.001).astype(int)
+
+    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
+        pairs = (layout.world(v) for v in vectors)
+        late = [sent(float(x["action_latency"]), float(x["servo_lag"])) for x in pairs]
+        angles = lfilter([0.1], [1.0, -0.9], np.array(late, float), axis=1)[:, at]
+        return Predicted(angles, np.repeat(w.balls[None], len(vectors), axis=0))
+
+    noise = Noise(np.full(6, 1e-4), np.full(3, 2e-3))
+    problem = Problem(simulate, w, layout, noise)
+    vector = layout.vector({"action_latency": 0.0, "servo_lag": 0.0})
+    shown = problem.at(vector, w.starts)
+    problem = problem._replace(windows=w._replace(angles=shown.angles))
+    fit = Fit(vector, w.starts, np.zeros(0), shown, problem.weights(pictures=0.0), 0.0)
+    spread = certainty(problem, fit).covariance
+    found = Identified(layout, w, noise, fit, spread, {}, {"joint_angles": 1.0}, {}, 0)
+    latency = estimates(found, NAMES)[0]
+    assert latency.seen and latency.low == 0.0 and latency.high < 1e-3
 
 
 def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:

@@ -11,7 +11,7 @@ from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
-from bounce_mjx.identify.unknowns import Layout, make_layout
+from bounce_mjx.identify.unknowns import FRAME_DEVIATION, Layout, make_layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
@@ -160,7 +160,7 @@ def identify(
     stages, states = ["arm"], search.arm_state
     pictures = np.ones_like(search.problem.windows.picture_weights)
     if with_ball:
-        fit = _beside(search.problem, fit, world_model(config, visual=False))
+        search, fit = _beside(search, fit, world_model(config, visual=False))
         fit, pictures = _ball(search, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
@@ -232,9 +232,10 @@ def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
     return search, search.run(["arm"], fit, 0.0, 8, search.arm_state)
 
 
-def _beside(problem: Problem, fit: Fit, model: mujoco.MjModel) -> Fit:
-    """The fit with the ball's frame moved so that the bounces are on the paddle: the search would
-    not find it, as a ball beside the paddle does not bounce."""
+def _beside(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, Fit]:
+    """The search and the fit with the ball's frame moved to where the bounces are on the paddle, if
+    they are beside it: no search would find it, as a ball beside the paddle does not bounce."""
+    problem, layout = search.problem, search.problem.layout
     windows, offsets = problem.windows, []
     addresses, data = find_addresses(model), mujoco.MjData(model)
     paddle, radius = addresses.paddle_geom, model.geom_size[addresses.ball_geom, 0]
@@ -251,10 +252,19 @@ def _beside(problem: Problem, fit: Fit, model: mujoco.MjModel) -> Fit:
     offset = np.median(offsets, axis=0) if offsets else np.zeros(3)
     sideways = np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2])
     offset *= [sideways, sideways, abs(offset[2]) > _BESIDE]
-    vector, starts, n = fit.vector.copy(), fit.starts.copy(), problem.layout.num_joints
-    vector[problem.layout.slices()["ball_position_bias"]] = offset
+    if not np.any(offset):
+        return search, fit
+    search.progress(f"the bounces are beside the paddle by {offset} m")
+    name, n = "ball_position_bias", layout.num_joints
+    unknown = layout.unknowns[name]
+    deviation = np.where(offset != 0.0, FRAME_DEVIATION, unknown.deviation)
+    wider = unknown._replace(deviation=tuple(deviation.tolist()))
+    layout = layout._replace(unknowns={**layout.unknowns, name: wider})
+    vector, starts = fit.vector.copy(), fit.starts.copy()
+    vector[layout.slices()[name]] = offset
     starts[windows.has_ball, 2 * n : 2 * n + 3] -= offset
-    return fit._replace(vector=vector, starts=starts)
+    search = search._replace(problem=problem._replace(layout=layout))
+    return search, fit._replace(vector=vector, starts=starts)
 
 
 def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:

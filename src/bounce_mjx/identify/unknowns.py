@@ -13,7 +13,7 @@ class Unknown(NamedTuple):
 
     mean: float
     """Its value before the log is seen, at which the search starts."""
-    deviation: float
+    deviation: float | tuple[float, ...]
     """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
     step: float
     """Difference at which derivatives are taken."""
@@ -30,8 +30,6 @@ class Unknown(NamedTuple):
     own: bool = False
     """Whether each joint's entry moves, nearly, that joint alone: one simulation then serves the
     angles of all."""
-    usual: float | None = None
-    """Deviation of a right value, if the prior covers mistakes too."""
 
 
 _JOINTS = None
@@ -54,13 +52,15 @@ BALL = {
     "restitution": Unknown(0.85, 0.08, 0.02, "", "bounce", limits=(0.6, 0.98)),
     "paddle_tilt": Unknown(0.0, 0.02, 8e-3, "rad", "bounce", 2),
     "paddle_offset": Unknown(0.0, 0.006, 8e-3, "m", "bounce", 3),
-    # The offset of the camera's frame, which nobody may have measured, is a part of it.
-    "ball_position_bias": Unknown(0.0, 0.1, 2e-3, "m", "bounce", 3, usual=0.012),
+    "ball_position_bias": Unknown(0.0, 0.012, 2e-3, "m", "bounce", 3),
     "contact_friction": Unknown(0.3, 0.3, 0.05, "", "bounce", limits=(0.0, np.inf)),
 }
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
+FRAME_DEVIATION = 0.1
+"""Prior deviation of `ball_position_bias` along an axis in which the frame of the ball's position
+is seen to be off, m."""
 
 
 class Layout(NamedTuple):
@@ -122,15 +122,28 @@ class Layout(NamedTuple):
         )
         return np.clip(vector, low, high)
 
+    def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
+        """The vector [P] with a delay from which the differences of derivatives, `steps` times
+        each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
+        at = {name: place.start for name, place in self.slices().items()}
+        delay, variance = at["action_latency"], at["servo_lag"]
+        mean = self._lag_mean(vector[variance] + steps * self.step[variance])
+        moved = vector.copy()
+        moved[delay] = max(vector[delay], mean + steps * self.step[delay])
+        return moved
+
+    def _lag_mean(self, variance: np.ndarray) -> np.ndarray:
+        """Mean m of a variance m (m + dt): those of y += (1 - exp(-dt / lag)) (x - y)."""
+        dt = self.physics_dt
+        return 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
+
     def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Each unknown's value [..., size], or [...] of a number."""
         world = {
             name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
             for name, place in self.slices().items()
         }
-        # Mean m and variance m (m + dt) of the filter y += (1 - exp(-dt / lag)) (x - y).
-        dt, variance = self.physics_dt, np.maximum(world["servo_lag"], 1e-14)
-        mean = 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
+        dt, mean = self.physics_dt, self._lag_mean(np.maximum(world["servo_lag"], 1e-14))
         latency = np.maximum(world["action_latency"] - mean, 0.0)
         return world | {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)}
 

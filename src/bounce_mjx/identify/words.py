@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.unknowns import CAMERA_ROTATION
+from bounce_mjx.identify.unknowns import ARM, BALL, CAMERA_ROTATION
 
 # Half the width of a 95% interval in standard deviations.
 _WIDTH = 1.96
@@ -38,8 +38,9 @@ _MOTIONS = {
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
 _MISTAKES = {
-    "ball_position_bias": "the frame of the ball's position, whose origin is the robot's base in "
-    "metres, x forward and z up, or swapped columns",
+    "ball_position_bias": "the frame of the ball's position (of the robot's base, in metres, z "
+    "up), swapped columns, or where the paddle is, which the log cannot tell from these: "
+    "paddle_offset has its prior",
     "gravity_tilt": "the axes of the ball's frame, which swapped columns turn too, or the base",
     "air_drag": "the unit of ball_time or of the ball's position",
     "ball_latency": "the unit or the clock of ball_time",
@@ -51,9 +52,6 @@ _MISTAKES = {
     "encoder_bias": "a joint's zero, the unit of the angles, swapped columns, or the ball's frame",
 }
 _OF_JOINTS = "another arm than --robot's, swapped columns of joints, or the frame of the ball"
-# Share of an estimate's variance that is that of others, beyond which they are told apart by their
-# priors alone.
-_TOLD_BY_PRIOR = 0.5
 
 
 class Estimate(NamedTuple):
@@ -106,6 +104,8 @@ def _delays(found: Identified) -> dict[str, tuple[float, float]]:
     width = _WIDTH * found.deviation[variance] * misfit(found)
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
     own = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
+    if found.deviation[delay] >= _UNSEEN * layout.deviation[delay]:
+        own = found.covariance[delay, delay]
     own = _WIDTH * misfit(found) * np.sqrt(max(own, 0.0))
     ends = np.repeat(vector[None], 3, axis=0)
     ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
@@ -149,40 +149,22 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "The log shows no bounce, so only the arm was identified. If the ball bounced, look at "
             "the axes and the unit of its position, z up in metres, and at the unit of ball_time."
         )
-    return [*_mistakes(found, joint_names), *said, *_unseen(found, joint_names), *_frame(found)]
+    return [*_mistakes(found, joint_names), *said, *_unseen(found, joint_names)]
 
 
 def _mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
-    """Warnings of estimates that are far from what a robot may have."""
+    """Warnings of estimates that are several deviations of the prior away."""
     layout, listed, said = found.layout, estimates(found, joint_names), []
     for name, place in layout.slices().items():
-        unknown = layout.unknowns[name]
-        off = (found.fit.vector[place] - unknown.mean) / (unknown.usual or unknown.deviation)
+        unknown = (ARM | BALL).get(name, layout.unknowns[name])
+        off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
         at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
         for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit):
             entry = listed[place][i]
             said.append(
                 f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
-                + f", {abs(off[i]):.1f} usual deviations from {unknown.mean:g}; look at "
+                + f", {abs(off[i]):.1f} deviations of the prior from {unknown.mean:g}; look at "
                 f"{_MISTAKES.get(name, _OF_JOINTS)}."
-            )
-    return said
-
-
-def _frame(found: Identified) -> list[str]:
-    """What cannot be told from the place of the paddle."""
-    places, spread = found.layout.slices(), found.covariance
-    if "paddle_offset" not in places:
-        return []
-    paddle, said = places["paddle_offset"], []
-    bias = places["ball_position_bias"]
-    for axis, i in zip("xyz", range(bias.start, bias.stop), strict=True):
-        with_paddle = np.linalg.solve(spread[paddle, paddle], spread[paddle, i])
-        if spread[i, paddle] @ with_paddle > _TOLD_BY_PRIOR * spread[i, i]:
-            said.append(
-                f"The log does not tell ball_position_bias {axis} from paddle_offset: a ball's "
-                "frame that is off moves the bounces as a paddle does that is elsewhere. Measure "
-                "where the paddle is, and where the camera sees a ball that lies on it."
             )
     return said
 
