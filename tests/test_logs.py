@@ -175,6 +175,11 @@ def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path:
             "joint angles in {}: row 8 has no number in the column joint_angles.",
         ),
         (with_cell(9, 0, ""), "joint angles in {}: row 10 has no number in the column time"),
+        (
+            with_cell(9, 1, "0.3"),
+            "1 of the 120 joint angles in {}: row 10 is a jump there and back",
+        ),
+        (with_cell(9, 7, "99"), "1 of the 60 pictures of the ball in {}: row 10 is farther away"),
         (with_cell(9, 0, "0"), "joint angles in {}: row 10 has a time out of order"),
         (swapped, "1 of the 120 joint angles in {}: row 41 has a time out of order"),
         (

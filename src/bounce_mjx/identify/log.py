@@ -33,6 +33,10 @@ _MIN_ROWS = 100
 # beyond which one is, s.
 _WRONG_TIMES = 0.05
 _FAR_IN_TIME = 3600.0
+# Acceleration of a joint, rad/s^2, beyond which an angle is wrong, and the smallest such error that
+# matters, rad.
+_FASTEST_ACCELERATION = 600.0
+_SMALLEST_SPIKE = 0.02
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -109,6 +113,7 @@ def make_log(
     """
     said = list(notes)
     angles, targets = (_in_order(source, rows, said) for rows in (angles, targets))
+    angles = _without(source, angles, _spikes(angles), "is a jump there and back", said)
     for one, other in ((angles, targets), (targets, angles)):
         if len(one.times) and len(other.times) and one.times[0] > other.times[-1]:
             raise UserError(
@@ -141,6 +146,22 @@ def _in_order(source: str, rows: Rows, said: list[str]) -> Rows:
     return _without(source, rows, ~kept, "has a time out of order", said)
 
 
+def _spikes(rows: Rows) -> np.ndarray:
+    """Which angles [R] are off a line through their neighbours as no arm can be."""
+    found, q = np.zeros(len(rows.times), bool), rows.values
+    if len(found) < 5:
+        return found
+    before, after = np.diff(rows.times)[:-1, None], np.diff(rows.times)[1:, None]
+    line = (after * q[:-2] + before * q[2:]) / (before + after)
+    off = np.max(np.abs(q[1:-1] - line), axis=1)
+    possible = 0.5 * _FASTEST_ACCELERATION * (before * after)[:, 0]
+    large = off > np.maximum(possible, max(_SMALLEST_SPIKE, 30.0 * np.median(off)))
+    # The line through a spike is off at its neighbours, by half as much.
+    beside = np.convolve(off, [0.5, 0.0, 0.5], "same")
+    found[1:-1] = large & (off > 1.5 * beside)
+    return found
+
+
 def _new_pictures(source: str, rows: Rows, said: list[str]) -> Rows:
     """The pictures in the order of their stamps, without those that repeat one: trackers, and logs
     of control steps, hold the last picture until the next. The others are counted in `said`."""
@@ -150,6 +171,9 @@ def _new_pictures(source: str, rows: Rows, said: list[str]) -> Rows:
     rows = _without(source, rows, same, "repeats the one before", said)
     far = np.abs(rows.times - np.median(rows.times)) > _FAR_IN_TIME
     rows = _without(source, rows, far, "has a time far from the others", said)
+    far = np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1)
+    far &= np.mean(far) < _WRONG_TIMES
+    rows = _without(source, rows, far, f"is farther away than {_FARTHEST_BALL:g} m", said)
     rows = rows.some(np.argsort(rows.times, kind="stable"))
     same = np.diff(rows.times, prepend=-np.inf) < _SAME_PICTURE
     return _without(source, rows, same, "has the time stamp of another", said)
