@@ -327,9 +327,16 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
         np.testing.assert_allclose(high - low, width, rtol=2e-2)
         np.testing.assert_allclose(_known(config, log, {})[1][places[name]], 0.5 * (low + high))
     assert compare(read_world(path), found, NAMES) == []
+    # The latency of the ball is that until its arrival, in what is printed and in the file.
+    late = found._replace(stamp_age=0.012)
+    path.write_text(world_of(late, log, NAMES, None), encoding="utf-8")
+    (printed,) = (e.value for e in estimates(late, NAMES) if e.label == "ball_latency")
+    assert printed == pytest.approx(vector[places["ball_latency"]][0] + 0.012)
+    assert read_world(path).estimates["ball_latency"] == pytest.approx(printed)
+    assert compare(read_world(path), late, NAMES) == []
     other = vector.copy()
     other[places["paddle_tilt"]] = 0.04, -0.08
-    changed = compare(read_world(path), found._replace(fit=fit._replace(vector=other)), NAMES)
+    changed = compare(read_world(path), late._replace(fit=fit._replace(vector=other)), NAMES)
     assert [line.split(" is ")[0] for line in changed] == ["paddle_tilt x", "paddle_tilt y"]
 
 
