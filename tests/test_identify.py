@@ -22,7 +22,7 @@ from bounce_mjx.identify.stages import (
     joined,
     sensor_noise,
 )
-from bounce_mjx.identify.unknowns import make_layout
+from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.words import estimates, sentences
 from bounce_mjx.identify.world import compare, world_of
@@ -374,7 +374,7 @@ def test_estimates_far_from_the_prior_are_warnings() -> None:
     vector, places = layout.mean.copy(), layout.slices()
     spread = np.diag((0.1 * layout.deviation) ** 2)
 
-    def said(vector: np.ndarray) -> list[str]:
+    def said(vector: np.ndarray, layout: Layout = layout) -> list[str]:
         fit = Fit(vector, np.zeros(0), np.linalg.inv(spread), *2 * (np.zeros(0),), 0.0)
         found = Identified(layout, windows_of(log), None, fit, spread, {}, {"b": 1.0}, {}, 0)
         return [text for text in sentences(found, NAMES) if text.startswith("warning: ")]
@@ -388,6 +388,12 @@ def test_estimates_far_from_the_prior_are_warnings() -> None:
     assert "ball_latency is 0.07 s" in latency and "the unit or the clock of ball_time" in latency
     assert "ball_position_bias z is 0.05 m" in frame
     assert "frame" in frame and "swapped columns" in frame and "paddle_offset" in frame
+    # A frame in which no ball would hit the paddle is one, however near it is.
+    name = "ball_position_bias"
+    wider = layout.unknowns[name]._replace(deviation=(0.012, 0.012, 0.1))
+    layout = layout._replace(unknowns=dict(layout.unknowns) | {name: wider})
+    (frame,) = said(layout.mean, layout)
+    assert "ball_position_bias z is 0 m" in frame
 
 
 def test_a_frame_of_metres_and_seconds_is_asked_for_where_no_bounce_is_seen() -> None:

@@ -159,7 +159,8 @@ def _mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
         unknown = (ARM | BALL).get(name, layout.unknowns[name])
         off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
         at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
-        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit):
+        beside = np.array(layout.unknowns[name].deviation) > unknown.deviation
+        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit | beside):
             entry = listed[place][i]
             said.append(
                 f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
