@@ -30,9 +30,11 @@ class Camera:
             self.pictures.append((time, ball + self.noise * self.random.standard_normal(3)))
 
     def measure(self, time: float) -> dict:
-        """Newest picture that has arrived, and the velocity from the last two pictures."""
+        """Newest picture that has arrived, if any, and the velocity from the last two."""
         arrived = [p for p in self.pictures if p[0] < time - self.delay + 1e-6]
-        taken, position = arrived[-1] if arrived else self.pictures[0]
+        if not arrived:
+            return {}
+        taken, position = arrived[-1]
         velocity = np.zeros(3)
         if len(arrived) > 1:
             velocity = (position - arrived[-2][1]) / (taken - arrived[-2][0])
@@ -65,7 +67,7 @@ def simulate(
         commands = arm.commands(measured)
         if recorder is not None:
             recorder.step(measured, commands[-1])
-        if arm.state == "ready":
+        if arm.state == "ready" and "ball_position" in measured:
             arm.start()
             begun, bounces, falling = data.time, 0, False
         elif arm.state == "stopped":

@@ -20,7 +20,7 @@ class IdentifyCommand(StrictModel):
     """Estimates the world of a robot from logs of its runs, and writes it for --world."""
 
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """CSV files of Recorder, or ROS bags (folders, .mcap or .db3 files)."""
+    """CSV files of Recorder, or ROS bags (folders, .mcap, .db3 or .bag files)."""
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa); the project's own arm by default."""
@@ -30,6 +30,9 @@ class IdentifyCommand(StrictModel):
     """World that was identified earlier; compare the logs with it, and write nothing."""
     camera_rotation: NonNegative = 0.0
     """Standard deviation of the camera's rotation to the base, rad; 0 for a calibrated one."""
+    joint_names: tuple[str, ...] = ()
+    """The driver's names of the joints in the logs, in the policy's order; by default the robot's
+    own."""
     topics: TopicsConfig = TopicsConfig()
     """Topics of a bag."""
 
@@ -41,6 +44,7 @@ def main(args: Sequence[str]) -> None:
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
     from bounce_mjx.identify.bags import Topics
+    from bounce_mjx.identify.log import unshown
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, joined
     from bounce_mjx.identify.words import estimates, sentences
@@ -65,14 +69,11 @@ def main(args: Sequence[str]) -> None:
     names = joint_names(model)
     topics = Topics(**command.topics.model_dump())
     console = Console(soft_wrap=True, highlight=False)
-    logs = []
-    for path in command.logs:
-        log, warnings = read_log(path, model, topics)
-        for warning in warnings:
-            console.print(f"warning: {warning}", markup=False)
-        logs.append(log)
+    read = [read_log(path, model, topics, command.joint_names) for path in command.logs]
+    log = joined([log for log, _ in read])
+    for warning in [*(said for _, warnings in read for said in warnings), *unshown(log, names)]:
+        console.print(f"warning: {warning}", markup=False)
     set_up_jax(config)
-    log = joined(logs)
     found = identify(
         config,
         log,
@@ -94,7 +95,7 @@ def main(args: Sequence[str]) -> None:
     for sentence in sentences(found, names):
         console.print(sentence, markup=False)
     if known is not None:
-        changed = compare(known, found, log, names)
+        changed = compare(known, found, names)
         for line in changed or [f"the robot still matches {command.check}"]:
             console.print(line, markup=False)
         sys.exit(1 if changed else 0)

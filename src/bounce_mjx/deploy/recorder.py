@@ -1,5 +1,6 @@
 """A log of a robot's run: one CSV file, from which `bounce-mjx identify` estimates its world."""
 
+import csv
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -56,32 +57,37 @@ class Recorder:
         self._joints, self._commands = tuple(joint_names), dict(commands or {})
         try:
             # A row reaches the file at once, as a robot's program may end at any time.
-            self._file = Path(path).open("x", buffering=1, encoding="utf-8")
+            self._file = Path(path).open("x", buffering=1, newline="", encoding="utf-8")
         except FileExistsError as error:
             raise UserError(f"the log {path} exists; choose another name") from error
         except OSError as error:
             raise UserError(
                 f"the log {path} cannot be created ({error.strerror}); choose another folder"
             ) from error
-        self._file.write(",".join(columns(self._joints, self._commands)) + "\n")
+        self._rows = csv.writer(self._file, lineterminator="\n")
+        self._rows.writerow(columns(self._joints, self._commands))
         self._last: tuple[float, np.ndarray] | None = None
 
     def step(self, measurements: Mapping[str, Any], servo_targets: Any) -> None:
         """Writes the row of a control step.
 
         Args:
-          measurements: as for `DeployedPolicy.step`, with `time`. A missing one leaves its cells
-            empty. `ball_position` counts as a new picture if it was taken (`time` - `ball_age`)
-            at another time than the last one; without `ball_age`, if it differs.
+          measurements: as for `DeployedPolicy.step`, with `time`. A missing one, or one that is not
+            finite, leaves its cells empty. `ball_position` counts as a new picture if it was taken
+            (`time` - `ball_age`) at another time than the last one; without `ball_age`, if it
+            differs.
           servo_targets: sent in this step [J], rad.
+
+        Raises:
+          UserError: a measurement has another size.
         """
         count, time = len(self._joints), float(np.ravel(measurements["time"])[0])
         row = [time]
         for name in ("joint_angles", "joint_velocities"):
-            row += _cells(measurements.get(name), count)
-        row += _cells(servo_targets, count)
+            row += _cells(name, measurements.get(name), count)
+        row += _cells("servo_targets", servo_targets, count)
         row += self._new_picture(time, measurements)
-        row += [cell for name in self._commands for cell in _cells(measurements.get(name), 1)]
+        row += [cell for name in self._commands for cell in _cells(name, measurements.get(name), 1)]
         self._write(row)
 
     def picture(self, time: float, position: Any, taken: float | None = None) -> None:
@@ -94,7 +100,7 @@ class Recorder:
         """
         self._last = (time if taken is None else taken), np.array(position, float)
         joints = [None] * (3 * len(self._joints))
-        picture = [*_cells(position, 3), self._last[0]]
+        picture = [*_cells("ball_position", position, 3), self._last[0]]
         self._write([time, *joints, *picture, *[None] * len(self._commands)])
 
     def close(self) -> None:
@@ -109,9 +115,10 @@ class Recorder:
 
     def _new_picture(self, time: float, measurements: Mapping[str, Any]) -> list[float | None]:
         """Cells of the picture, empty if it is none or the last one."""
-        if "ball_position" not in measurements:
+        cells = _cells("ball_position", measurements.get("ball_position"), 3)
+        if None in cells:
             return [None] * 4
-        position, age = np.array(measurements["ball_position"], float), measurements.get("ball_age")
+        position, age = np.array(cells), measurements.get("ball_age")
         taken = time if age is None else time - float(np.ravel(age)[0])
         if self._last is not None:
             last, seen = self._last
@@ -119,11 +126,17 @@ class Recorder:
             if same_time or (age is None and np.array_equal(position, seen)):
                 return [None] * 4
         self._last = taken, position
-        return [*_cells(position, 3), taken]
+        return [*cells, taken]
 
     def _write(self, row: list[float | None]) -> None:
-        self._file.write(",".join("" if x is None else repr(float(x)) for x in row) + "\n")
+        self._rows.writerow(["" if x is None else repr(float(x)) for x in row])
 
 
-def _cells(values: Any, count: int) -> list[float | None]:
-    return [None] * count if values is None else np.ravel(np.asarray(values, float)).tolist()
+def _cells(name: str, values: Any, count: int) -> list[float | None]:
+    """A measurement's cells, empty if it is missing or not finite."""
+    if values is None:
+        return [None] * count
+    values = np.ravel(np.asarray(values, float))
+    if len(values) != count:
+        raise UserError(f"{name} has {len(values)} numbers, and the log has {count} cells for it")
+    return values.tolist() if np.all(np.isfinite(values)) else [None] * count

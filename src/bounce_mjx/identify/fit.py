@@ -215,15 +215,18 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     layout, (deviations, _, searched) = problem.layout, _per_state(problem.windows)
     place, of_state = np.arange(len(fit.vector)), np.flatnonzero(searched)
     scale, reach, size = layout.deviation, deviations[of_state], len(fit.vector)
+    vector = layout.interior(fit.vector, 2.0)
     lines = [
-        _linearised(problem, fit.vector, fit.starts, place, of_state, fit.weights, step)
+        _linearised(problem, vector, fit.starts, place, of_state, fit.weights, step)
         for step in (1.0, -1.0, 2.0, -2.0)
     ]
     one, two = (0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:]))
     by_state = np.mean([line.by_state for line in lines], axis=0) * reach
     at_guess = (fit.starts - problem.windows.starts)[:, of_state] / reach
     both = np.concatenate([one, two], axis=2)
-    reduced = _eliminate(lines[0].residuals, both, by_state, at_guess)
+    at_fit = Predicted(fit.predicted.angles[None], fit.predicted.balls[None])
+    residuals = problem.whitened(problem.residuals(at_fit), fit.weights)[0]
+    reduced = _eliminate(residuals, both, by_state, at_guess)
     of_windows = _symmetric(reduced.informations[:, :size, size:])
     # A ball that meets the paddle's edge has no derivative. That of a lag near 0 is another matter.
     others = place != layout.slices()["servo_lag"].start

@@ -1,5 +1,6 @@
 """A log of a robot's run, as `deploy.recorder.Recorder` writes it, and its checks."""
 
+import bisect
 import csv
 import os
 import re
@@ -28,11 +29,24 @@ _LARGEST_ANGLE = 4.0 * np.pi
 _FARTHEST_BALL = 20.0
 _LONGEST_STEP = 0.2
 _MIN_ROWS = 100
+# Largest share of a measurement's rows whose times may be wrong, and time from the log's middle
+# beyond which one is, s.
+_WRONG_TIMES = 0.05
+_FAR_IN_TIME = 3600.0
+# Acceleration of a joint, rad/s^2, beyond which an angle is wrong, and the smallest such error that
+# matters, rad.
+_FASTEST_ACCELERATION = 600.0
+_SMALLEST_SPIKE = 0.02
+# Two pictures closer than this are one, s.
+_SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
 # the clocks count as one, and age of a picture (s) beyond which they do not.
 _STRETCHES = 12
 _DRIFT = 1e-3
 _LARGEST_AGE = 1.0
+# Two quartz clocks drift by less; a stamp that drifts by more, s over the log, has another unit.
+_FASTEST_DRIFT = 2e-4
+_NO_CLOCK = 0.1
 
 
 class Log(NamedTuple):
@@ -54,6 +68,8 @@ class Log(NamedTuple):
     """The ball in each picture [P, 3], m."""
     arrivals: np.ndarray
     """Time [P] of the row in which each picture arrived."""
+    notes: tuple[str, ...] = ()
+    """What was left out or corrected in reading, a sentence each."""
 
     @property
     def seconds(self) -> float:
@@ -61,15 +77,143 @@ class Log(NamedTuple):
         return float(self.times[-1] - self.times[0])
 
 
+class Rows(NamedTuple):
+    """Rows of one measurement, in the order of the file."""
+
+    name: str
+    """What they are, for messages."""
+    place: str
+    """Place of a row in the file, with {} for its number."""
+    numbers: np.ndarray
+    """[R]."""
+    times: np.ndarray
+    """When each was measured [R], s."""
+    arrivals: np.ndarray
+    """When each arrived [R], s."""
+    values: np.ndarray
+    """[R, k]."""
+
+    def some(self, kept: np.ndarray) -> "Rows":
+        """The rows of a mask [R], or at indices."""
+        return Rows(*self[:2], *(array[kept] for array in self[2:]))
+
+    def at(self, row: int) -> str:
+        """Place of a row, for messages."""
+        return self.place.format(self.numbers[row])
+
+
+def make_log(
+    source: str, angles: Rows, targets: Rows, balls: Rows, notes: Sequence[str] = ()
+) -> Log:
+    """The log of three measurements, without the rows that repeat others or have wrong times.
+
+    Raises:
+      UserError: more than a twentieth of the times are wrong, or angles and targets have two
+        clocks.
+    """
+    said = list(notes)
+    angles, targets = (_in_order(source, rows, said) for rows in (angles, targets))
+    angles = _without(source, angles, _spikes(angles), "is a jump there and back", said)
+    for one, other in ((angles, targets), (targets, angles)):
+        if len(one.times) and len(other.times) and one.times[0] > other.times[-1]:
+            raise UserError(
+                f"the {one.name} in {source} begin at {one.times[0]:.6g} s and the {other.name} "
+                f"end at {other.times[-1]:.6g} s: they have two clocks, such as simulated time and "
+                "that of the computer; give both time stamps of one clock"
+            )
+    pictures = _new_pictures(source, balls, said)
+    return Log(
+        source, angles.times, angles.values, targets.times, targets.values,
+        pictures.times, pictures.values, pictures.arrivals, tuple(said),
+    )  # fmt: skip
+
+
+def _in_order(source: str, rows: Rows, said: list[str]) -> Rows:
+    """The rows with increasing times; the others are counted in `said`."""
+    if len(rows.times) < 2:
+        return rows
+    same = (np.diff(rows.times) == 0.0) & np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)
+    rows = _without(source, rows, np.append(False, same), "repeats the one before", said)
+    near = np.abs(rows.times - np.median(rows.times)) < _FAR_IN_TIME
+    kept = near.copy()
+    kept[near] = _longest_increase(rows.times[near])
+    wrong = int(np.sum(~kept))
+    if wrong > max(_WRONG_TIMES * len(kept), 1.0):
+        raise UserError(
+            f"{wrong} of the {len(kept)} times of the {rows.name} in {source} do not increase, "
+            f"that of {rows.at(int(np.argmin(kept)))} first; give each its own time, of one clock"
+        )
+    return _without(source, rows, ~kept, "has a time out of order", said)
+
+
+def _spikes(rows: Rows) -> np.ndarray:
+    """Which angles [R] are off a line through their neighbours as no arm can be."""
+    found, q = np.zeros(len(rows.times), bool), rows.values
+    if len(found) < 5:
+        return found
+    before, after = np.diff(rows.times)[:-1, None], np.diff(rows.times)[1:, None]
+    line = (after * q[:-2] + before * q[2:]) / (before + after)
+    off = np.max(np.abs(q[1:-1] - line), axis=1)
+    possible = 0.5 * _FASTEST_ACCELERATION * (before * after)[:, 0]
+    large = off > np.maximum(possible, max(_SMALLEST_SPIKE, 30.0 * np.median(off)))
+    # The line through a spike is off at its neighbours, by half as much.
+    beside = np.convolve(off, [0.5, 0.0, 0.5], "same")
+    found[1:-1] = large & (off > 1.5 * beside)
+    return found
+
+
+def _new_pictures(source: str, rows: Rows, said: list[str]) -> Rows:
+    """The pictures in the order of their stamps, without those that repeat one: trackers, and logs
+    of control steps, hold the last picture until the next. The others are counted in `said`."""
+    if len(rows.times) < 2:
+        return rows
+    same = np.append(False, np.all(np.diff(rows.values, axis=0) == 0.0, axis=1))
+    rows = _without(source, rows, same, "repeats the one before", said)
+    far = np.abs(rows.times - np.median(rows.times)) > _FAR_IN_TIME
+    rows = _without(source, rows, far, "has a time far from the others", said)
+    far = np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1)
+    far &= np.mean(far) < _WRONG_TIMES
+    rows = _without(source, rows, far, f"is farther away than {_FARTHEST_BALL:g} m", said)
+    rows = rows.some(np.argsort(rows.times, kind="stable"))
+    same = np.diff(rows.times, prepend=-np.inf) < _SAME_PICTURE
+    return _without(source, rows, same, "has the time stamp of another", said)
+
+
+def _without(source: str, rows: Rows, dropped: np.ndarray, why: str, said: list[str]) -> Rows:
+    """The rows that are not dropped; the others are counted in `said`."""
+    if np.any(dropped):
+        said.append(
+            f"{int(np.sum(dropped))} of the {len(dropped)} {rows.name} in {source} do not count: "
+            f"{rows.at(int(np.argmax(dropped)))} {why}"
+        )
+    return rows.some(~dropped)
+
+
+def _longest_increase(values: np.ndarray) -> np.ndarray:
+    """Which values [T] are of the longest increasing part of a sequence (patience sorting)."""
+    ends: list[float] = []
+    last: list[int] = []
+    before = np.full(len(values), -1)
+    for i, value in enumerate(values.tolist()):
+        k = bisect.bisect_left(ends, value)
+        ends[k : k + 1], last[k : k + 1] = [value], [i]
+        before[i] = last[k - 1] if k else -1
+    kept, i = np.zeros(len(values), bool), last[-1] if last else -1
+    while i >= 0:
+        kept[i], i = True, before[i]
+    return kept
+
+
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log; nothing but the file is touched.
+    """Reads a CSV log; nothing but the file is touched. Cells are separated by commas, semicolons
+    or tabs, as the header's; beside the last two, a decimal comma is read.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
 
     Raises:
-      UserError: the file cannot be read, a column is missing or states an unknown unit, or a cell
-        is not a finite number.
+      UserError: the file cannot be read, a column is missing or states an unknown unit, a cell is
+        no number, a measurement is never whole, or as `make_log`.
     """
     header, rows, lines = _cells(path)
     found = _columns(path, header)
@@ -87,68 +231,93 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
         return values * UNITS[unit][given]
 
     times = column("time", "s")
-    if np.any(empty := np.isnan(times)):
-        raise UserError(f"{path} has no time in row {lines[int(np.argmax(empty))]}; give seconds")
+    numbers, notes = np.array(lines), []
+
+    def group(what: str, names: Sequence[str], unit: str, stamps: np.ndarray | None) -> Rows:
+        values = np.stack([column(name, unit) for name in names], axis=1)
+        stamp = times if stamps is None else stamps
+        of_rows = Rows(what, "row {}", numbers, stamp, times, values)
+        titles = [*names, "time", "ball_time"]
+        return _whole(path, of_rows, titles, notes)
+
     angles, targets = (
-        np.stack([column(f"{name}.{joint}", "rad") for joint in joint_names], axis=1)
-        for name in ("joint_angles", "servo_targets")
+        group(what, [f"{name}.{joint}" for joint in joint_names], "rad", None)
+        for what, name in (("joint angles", "joint_angles"), ("servo targets", "servo_targets"))
     )
-    ball_columns = [f"ball_position.{axis}" for axis in "xyz"]
-    if any(name in found for name in (*ball_columns, "ball_time")):
-        balls = np.stack([column(name, "m") for name in ball_columns], axis=1)
-        stamps = column("ball_time", "s") if "ball_time" in found else times
+    ball = [f"ball_position.{axis}" for axis in "xyz"]
+    if any(name in found for name in (*ball, "ball_time")):
+        stamps = column("ball_time", "s") if "ball_time" in found else None
+        balls = group("pictures of the ball", ball, "m", stamps)
     else:
-        balls, stamps = np.full((len(times), 3), np.nan), times
-    of_angles, of_targets = (
-        _filled(path, group, names, lines)
-        for group, names in (
-            (angles, [f"joint_angles.{joint}" for joint in joint_names]),
-            (targets, [f"servo_targets.{joint}" for joint in joint_names]),
-        )
-    )
-    of_pictures = _filled(
-        path, np.column_stack([balls, stamps[:, None]]) if "ball_time" in found else balls,
-        [*ball_columns, "ball_time"], lines,
-    )  # fmt: skip
-    log = Log(
-        source=str(path),
-        times=times[of_angles],
-        joint_angles=angles[of_angles],
-        target_times=times[of_targets],
-        servo_targets=targets[of_targets],
-        picture_times=stamps[of_pictures],
-        ball_positions=balls[of_pictures],
-        arrivals=times[of_pictures],
-    )
-    back = np.flatnonzero(np.diff(times) < 0.0)
-    if back.size:
-        i = int(back[0]) + 1
-        raise UserError(
-            f"{path} goes back in time in row {lines[i]}, from {times[i - 1]:.6g} to "
-            f"{times[i]:.6g} s; give rows in the order of one clock"
-        )
-    return log
+        nothing = np.zeros(0)
+        balls = Rows("pictures of the ball", "row {}", *3 * [nothing], np.zeros((0, 3)))
+    return make_log(str(path), angles, targets, balls, notes)
+
+
+def clock_drift(log: Log) -> tuple[float, float]:
+    """By how much the age of the pictures grows each second, and the age (s) of the youngest ones
+    at the first arrival: a line (Theil 1950 and Sen 1968, which no fourth of its points can bend)
+    through the shortest time from a stamp to its arrival in each stretch of the log."""
+    ages = log.arrivals - log.picture_times
+    parts = np.array_split(np.arange(len(ages)), _STRETCHES)
+    youngest = np.array([part[np.argmin(ages[part])] for part in parts])
+    times, least = log.arrivals[youngest] - log.arrivals[0], ages[youngest]
+    one, other = np.triu_indices(_STRETCHES, 1)
+    apart = times[other] - times[one]
+    slopes = (least[other] - least[one])[apart > 0.0] / apart[apart > 0.0]
+    slope = float(np.median(slopes)) if len(slopes) else 0.0
+    return slope, float(np.median(least - slope * times))
 
 
 def in_one_clock(log: Log) -> Log:
     """The log with the pictures' time stamps in the clock of their arrivals.
 
-    A camera with its own clock is off by a constant and drifts by some parts in 1e5. The shortest
-    times from a stamp to its arrival show it: a line through those of each stretch. A drift of less
-    than a millisecond, and an offset of less than a second, count as none.
+    A camera with its own clock is off by a constant and drifts by some parts in 1e5. A drift of
+    less than a millisecond, and an offset of less than a second, count as none; so does one that is
+    faster than any clock's.
+
+    Raises:
+      UserError: the stamps are no seconds.
     """
     if len(log.picture_times) < _STRETCHES * 20:
         return log
-    ages = log.arrivals - log.picture_times
-    parts = np.array_split(np.arange(len(ages)), _STRETCHES)
-    youngest = np.array([part[np.argmin(ages[part])] for part in parts])
-    times, least = log.arrivals[youngest], ages[youngest]
-    slope, constant = np.polyfit(times - times[0], least, 1)
-    drift = slope * (log.arrivals - times[0])
-    if np.ptp(drift) < _DRIFT:
-        drift = np.zeros_like(ages)
-    offset = constant if abs(constant) > _LARGEST_AGE else 0.0
-    return log._replace(picture_times=log.picture_times + drift + offset)
+    slope, youngest = clock_drift(log)
+    since = log.arrivals - log.arrivals[0]
+    total, notes = abs(slope) * float(np.max(since)), list(log.notes)
+    if abs(slope) > _FASTEST_DRIFT and total > _NO_CLOCK:
+        raise UserError(
+            f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
+            "second, and those of a clock by 1 s; if they are milliseconds, write ball_time [ms]"
+        )
+    if total < _DRIFT or abs(slope) > _FASTEST_DRIFT:
+        if total > 5.0 * _DRIFT:
+            notes.append(
+                f"the pictures in {log.source} grow older by {1e3 * total:.1f} ms over the log, "
+                "faster than clocks drift; it is taken for a part of their latency"
+            )
+        slope = 0.0
+    else:
+        notes.append(
+            f"the camera's clock drifts by {1e6 * slope:.0f} parts in 1e6 in {log.source}, "
+            f"{1e3 * total:.1f} ms over the log; the pictures' time stamps are corrected"
+        )
+    offset = youngest if abs(youngest) > _LARGEST_AGE else 0.0
+    if offset:
+        notes.append(
+            f"the camera's clock is {offset:.6g} s behind the robot's in {log.source}; the "
+            "pictures' time stamps are corrected, and the youngest counts as of no age"
+        )
+    return log._replace(
+        picture_times=log.picture_times + slope * since + offset, notes=tuple(notes)
+    )
+
+
+def least_age(log: Log) -> float:
+    """Time from a picture's stamp to its arrival, s: 0 if the stamp is that of the arrival. Of the
+    youngest pictures, as the others wait for the next control step."""
+    if not len(log.arrivals):
+        return 0.0
+    return max(0.0, float(np.quantile(log.arrivals - log.picture_times, 0.02)))
 
 
 def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> list[str]:
@@ -161,8 +330,8 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
       Warnings, a sentence each.
 
     Raises:
-      UserError: it is too short, its times are not seconds of one clock, a joint is far outside
-        its range, or the ball is far away.
+      UserError: it is too short, its times are not seconds, a joint is far outside its range, or
+        the ball is far away.
     """
     if len(log.times) < _MIN_ROWS or len(log.target_times) < _MIN_ROWS:
         raise UserError(
@@ -170,14 +339,7 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
             f"{len(log.target_times)} with servo targets; record at least {_MIN_ROWS} of each"
         )
     for name, times in (("joint angles", log.times), ("servo targets", log.target_times)):
-        steps = np.diff(times)
-        if np.any(steps <= 0.0):
-            i = int(np.argmax(steps <= 0.0)) + 1
-            raise UserError(
-                f"the time of the {name} in {log.source} does not increase at {times[i]:.6g} s; "
-                "give each row its own time, of one clock"
-            )
-        if (typical := float(np.median(steps))) > _LONGEST_STEP:
+        if (typical := float(np.median(np.diff(times)))) > _LONGEST_STEP:
             raise UserError(
                 f"the {name} in {log.source} are {typical:.3g} s apart, and at most "
                 f"{_LONGEST_STEP:g} s is expected; if the times are milliseconds, write time [ms]"
@@ -191,7 +353,25 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
             f"the ball in {log.source} is at {log.ball_positions[i]} m at the time "
             f"{log.picture_times[i]:.6g} s; if these are millimetres, write ball_position.x [mm]"
         )
-    return _warnings(log)
+    unseen = log.times[-1] - log.arrivals[-1] if len(log.arrivals) else 0.0
+    return [f"{log.source} shows no ball in its last {unseen:.1f} s"] if unseen > 2.0 else []
+
+
+def unshown(log: Log, joint_names: Sequence[str]) -> list[str]:
+    """What all logs of a robot together lack, a sentence each."""
+    said = []
+    if not len(log.picture_times):
+        said.append(
+            f"{log.source} has no picture of the ball; only the arm is identified, and the ball's "
+            "and the camera's terms keep their prior ranges"
+        )
+    moved = np.ptp(log.servo_targets, axis=0)
+    if np.any(moved < 0.01):
+        said.append(
+            f"in {log.source}, {joint_names[int(np.argmin(moved))]} moves by less than 0.01 rad; "
+            "record bounce-mjx excite too"
+        )
+    return said
 
 
 def _check_ranges(
@@ -212,24 +392,6 @@ def _check_ranges(
     )
 
 
-def _warnings(log: Log) -> list[str]:
-    warnings = []
-    if not len(log.picture_times):
-        warnings.append(
-            f"{log.source} has no picture of the ball; only the arm is identified, and the ball's "
-            "and the camera's terms keep their prior ranges"
-        )
-    elif (unseen := log.times[-1] - log.arrivals[-1]) > 2.0:
-        warnings.append(f"{log.source} shows no ball in its last {unseen:.1f} s")
-    moved = np.ptp(log.servo_targets, axis=0)
-    if np.any(moved < 0.01):
-        warnings.append(
-            f"in {log.source}, joint number {int(np.argmin(moved)) + 1} moves by less than 0.01 "
-            "rad; record bounce-mjx excite too"
-        )
-    return warnings
-
-
 def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     """Header, cells, and line number of each row of a CSV file."""
     try:
@@ -241,7 +403,10 @@ def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
                 "are read; cut out the minutes that matter"
             )
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
+            head = file.readline()
+            delimiter = max(",;\t", key=head.count)
+            file.seek(0)
+            reader = csv.reader(file, delimiter=delimiter)
             header = [name.strip() for name in next(reader, [])]
             rows, lines = [], []
             for row in reader:
@@ -252,7 +417,7 @@ def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
                         f"{path} has {len(row)} cells in row {reader.line_num}, and its header "
                         f"has {len(header)}; give each row a cell for each column"
                     )
-                rows.append(row)
+                rows.append(row if delimiter == "," else [c.replace(",", ".") for c in row])
                 lines.append(reader.line_num)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
@@ -267,8 +432,8 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, tuple[int, str]]:
     """Index and stated unit of each column by its name."""
     found: dict[str, tuple[int, str]] = {}
     for i, title in enumerate(header):
-        match = re.fullmatch(r"(\S+)\s*(?:\[(.*)\])?", title)
-        name, unit = match.groups() if match else (title, None)
+        match = re.fullmatch(r"(.*?)\s*(?:\[([^\[\]]*)\])?", title)
+        name, unit = match.groups()
         if name in found:
             raise UserError(f"{path} has two columns {shorten(name)}; leave one")
         found[name] = i, (unit or "").strip()
@@ -283,7 +448,8 @@ def _missing(
     if others:
         return (
             f"{path} is of a robot with the joints {', '.join(map(shorten, present[:20]))}, and "
-            f"this one has {', '.join(joint_names)}; give the log's robot with --robot"
+            f"this one has {', '.join(joint_names)}; give the log's robot with --robot, or the "
+            "log's names in this order with --joint-names"
         )
     known = ", ".join(map(shorten, found[:30])) or "nothing"
     return f"{path} has no column {name} [{unit}]; its columns are {known}"
@@ -292,7 +458,7 @@ def _missing(
 def _numbers(
     path: Path, title: str, index: int, rows: Sequence[Sequence[str]], lines: Sequence[int]
 ) -> np.ndarray:
-    """Numbers of a column [R]; NaN for an empty cell."""
+    """Numbers of a column [R]; NaN for an empty cell, or one that says so."""
     values = np.full(len(rows), np.nan)
     for i, row in enumerate(rows):
         text = row[index].strip()
@@ -302,7 +468,7 @@ def _numbers(
             values[i] = float(text)
         except ValueError:
             values[i] = np.inf
-        if not np.isfinite(values[i]):
+        if np.isinf(values[i]):
             raise UserError(
                 f"{path} has {shorten(repr(text))} in the column {shorten(title)}, row {lines[i]}; "
                 "give a finite number, or leave the cells of the measurement empty"
@@ -310,20 +476,19 @@ def _numbers(
     return values
 
 
-def _filled(
-    path: Path, group: np.ndarray, names: Sequence[str], lines: Sequence[int]
-) -> np.ndarray:
-    """Rows [R] in which all cells of a measurement are filled; UserError if some are not."""
-    empty = np.isnan(group)
-    partly = np.any(empty, axis=1) & ~np.all(empty, axis=1)
-    if names[-1] == "ball_time" and group.shape[1] == 4:
-        # Without a ball, the time of the picture may be filled.
-        partly &= ~np.all(empty[:, :3], axis=1)
-    if np.any(partly):
-        row = int(np.argmax(partly))
-        name = names[int(np.argmax(empty[row]))]
-        raise UserError(
-            f"{path} has no number in the column {name}, row {lines[row]}; fill all cells of a "
-            "measurement, or none"
-        )
-    return ~np.any(empty, axis=1)
+def _whole(path: Path, rows: Rows, titles: Sequence[str], notes: list[str]) -> Rows:
+    """The rows that hold the measurement; those that hold a part of it are counted in `notes`.
+
+    Args:
+      titles: names of the columns, then those of the row's time and of the measurement's.
+    """
+    rows = rows.some(~np.all(np.isnan(rows.values), axis=1))
+    empty = np.isnan(np.column_stack([rows.values, rows.arrivals, rows.times]))
+    partly = np.any(empty, axis=1)
+    if not np.any(partly):
+        return rows
+    i = int(np.argmax(partly))
+    why = f"has no number in the column {titles[int(np.argmax(empty[i]))]}"
+    if np.all(partly):
+        raise UserError(f"{path} {why}, {rows.at(i)}; fill all cells of a measurement, or none")
+    return _without(str(path), rows, partly, why, notes)

@@ -8,12 +8,11 @@ import numpy as np
 
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.identify.fit import Fit, Problem, minimise
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import make_run, make_simulator
 from bounce_mjx.identify.stages import BEFORE_BOUNCE, sensor_noise
 from bounce_mjx.identify.unknowns import Layout, Unknown, make_layout
 from bounce_mjx.identify.windows import MAX_DELAY, Windows, cut
-from bounce_mjx.identify.world import least_age
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS
 

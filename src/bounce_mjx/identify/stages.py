@@ -4,13 +4,16 @@ import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
+from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
-from bounce_mjx.identify.unknowns import Layout, make_layout
+from bounce_mjx.identify.unknowns import FRAME_DEVIATION, Layout, make_layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS
 
@@ -26,6 +29,8 @@ _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
 BEFORE_BOUNCE = 0.012
 """Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
 _FEWEST_BOUNCES = 3
+# Height of the bounces over the paddle beyond which the search would not find it, m.
+_BESIDE = 0.03
 
 
 class Identified(NamedTuple):
@@ -46,6 +51,8 @@ class Identified(NamedTuple):
     """On the windows that the search had not seen."""
     dropped: int
     """Windows whose ball was not in free flight."""
+    stamp_age: float = 0.0
+    """Time from a picture's stamp to its arrival, s: `ball_latency` in the fit is without it."""
 
     @property
     def deviation(self) -> np.ndarray:
@@ -68,9 +75,9 @@ def joined(logs: Sequence[Log]) -> Log:
         )
         start = float(max(parts[-1].times[-1], parts[-1].target_times[-1])) + 1.0
     source = ", ".join(log.source for log in logs)
-    return Log(
-        source, *(np.concatenate(arrays) for arrays in zip(*(p[1:] for p in parts), strict=True))
-    )
+    arrays = zip(*(part[1:-1] for part in parts), strict=True)
+    notes = tuple(note for log in logs for note in log.notes)
+    return Log(source, *(np.concatenate(array) for array in arrays), notes)
 
 
 def sensor_noise(log: Log) -> Noise:
@@ -153,13 +160,15 @@ def identify(
     stages, states = ["arm"], search.arm_state
     pictures = np.ones_like(search.problem.windows.picture_weights)
     if with_ball:
+        search, fit = _beside(search, fit, world_model(config, visual=False))
         fit, pictures = _ball(search, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
     fit = search.run(stages, fit, pictures, 3, states)
     tested = search.tested(fit, pictures, states)
     fit = search.run(stages, tested, pictures, 3, states, np.ones_like(search.training))
-    return _identified(search.problem, fit, _errors(search.problem, tested))
+    found = _identified(search.problem, fit, _errors(search.problem, tested))
+    return found._replace(stamp_age=least_age(log))
 
 
 class _Search(NamedTuple):
@@ -221,6 +230,41 @@ def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
             search.progress(message)
             search, fit = regular, other
     return search, search.run(["arm"], fit, 0.0, 8, search.arm_state)
+
+
+def _beside(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, Fit]:
+    """The search and the fit with the ball's frame moved to where the bounces are on the paddle, if
+    they are beside it: no search would find it, as a ball beside the paddle does not bounce."""
+    problem, layout = search.problem, search.problem.layout
+    windows, offsets = problem.windows, []
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    paddle, radius = addresses.paddle_geom, model.geom_size[addresses.ball_geom, 0]
+    for s in np.flatnonzero(windows.has_ball):
+        bounce, counts = windows.bounces[s], windows.angle_weights[s] > 0.0
+        if np.any(counts):
+            since = np.where(counts, np.abs(windows.angle_times[s] - bounce), np.inf)
+            data.qpos[list(addresses.arm_qpos)] = windows.angles[s, np.argmin(since)]
+            mujoco.mj_kinematics(model, data)
+            above = data.geom_xmat[paddle].reshape(3, 3)[:, 2]
+            above = (model.geom_size[paddle, 2] + radius) * above
+            ball = windows.balls[s, np.argmin(np.abs(windows.picture_times[s] - bounce))]
+            offsets.append(ball - data.geom_xpos[paddle] - above)
+    offset = np.median(offsets, axis=0) if offsets else np.zeros(3)
+    sideways = np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2])
+    offset *= [sideways, sideways, abs(offset[2]) > _BESIDE]
+    if not np.any(offset):
+        return search, fit
+    search.progress(f"the bounces are beside the paddle by {offset} m")
+    name, n = "ball_position_bias", layout.num_joints
+    unknown = layout.unknowns[name]
+    deviation = np.where(offset != 0.0, FRAME_DEVIATION, unknown.deviation)
+    wider = unknown._replace(deviation=tuple(deviation.tolist()))
+    layout = layout._replace(unknowns={**layout.unknowns, name: wider})
+    vector, starts = fit.vector.copy(), fit.starts.copy()
+    vector[layout.slices()[name]] = offset
+    starts[windows.has_ball, 2 * n : 2 * n + 3] -= offset
+    search = search._replace(problem=problem._replace(layout=layout))
+    return search, fit._replace(vector=vector, starts=starts)
 
 
 def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:

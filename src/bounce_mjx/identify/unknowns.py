@@ -13,7 +13,7 @@ class Unknown(NamedTuple):
 
     mean: float
     """Its value before the log is seen, at which the search starts."""
-    deviation: float
+    deviation: float | tuple[float, ...]
     """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
     step: float
     """Difference at which derivatives are taken."""
@@ -39,7 +39,9 @@ ARM = {
     "servo_lag": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
     "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, True),
     "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, True),
-    "joint_frictionloss": Unknown(1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, True),
+    "joint_frictionloss": Unknown(
+        1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, own=True
+    ),
     "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
     "gravity_tilt": Unknown(0.0, 0.03, 4e-3, "rad", "flight", 2),
@@ -56,6 +58,9 @@ BALL = {
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
+FRAME_DEVIATION = 0.1
+"""Prior deviation of `ball_position_bias` along an axis in which the frame of the ball's position
+is seen to be off, m."""
 
 
 class Layout(NamedTuple):
@@ -117,15 +122,28 @@ class Layout(NamedTuple):
         )
         return np.clip(vector, low, high)
 
+    def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
+        """The vector [P] with a delay from which the differences of derivatives, `steps` times
+        each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
+        at = {name: place.start for name, place in self.slices().items()}
+        delay, variance = at["action_latency"], at["servo_lag"]
+        mean = self._lag_mean(vector[variance] + steps * self.step[variance])
+        moved = vector.copy()
+        moved[delay] = max(vector[delay], mean + steps * self.step[delay])
+        return moved
+
+    def _lag_mean(self, variance: np.ndarray) -> np.ndarray:
+        """Mean m of a variance m (m + dt): those of y += (1 - exp(-dt / lag)) (x - y)."""
+        dt = self.physics_dt
+        return 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
+
     def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Each unknown's value [..., size], or [...] of a number."""
         world = {
             name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
             for name, place in self.slices().items()
         }
-        # Mean m and variance m (m + dt) of the filter y += (1 - exp(-dt / lag)) (x - y).
-        dt, variance = self.physics_dt, np.maximum(world["servo_lag"], 1e-14)
-        mean = 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
+        dt, mean = self.physics_dt, self._lag_mean(np.maximum(world["servo_lag"], 1e-14))
         latency = np.maximum(world["action_latency"] - mean, 0.0)
         return world | {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)}
 

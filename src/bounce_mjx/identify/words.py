@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.unknowns import CAMERA_ROTATION
+from bounce_mjx.identify.unknowns import ARM, BALL, CAMERA_ROTATION
 
 # Half the width of a 95% interval in standard deviations.
 _WIDTH = 1.96
@@ -35,6 +35,23 @@ _MOTIONS = {
     "ball_latency": "bounces at several target heights show it",
     "restitution": "more bounces show it",
 }
+# Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
+_SURPRISING = 3.0
+_MISTAKES = {
+    "ball_position_bias": "the frame of the ball's position (of the robot's base, in metres, z "
+    "up), swapped columns, or where the paddle is, which the log cannot tell from these: "
+    "paddle_offset has its prior",
+    "gravity_tilt": "the axes of the ball's frame, which swapped columns turn too, or the base",
+    "air_drag": "the unit of ball_time or of the ball's position",
+    "ball_latency": "the unit or the clock of ball_time",
+    "restitution": "the unit of ball_time, or another ball or paddle than the model's",
+    "paddle_tilt": "the axes of the ball's frame, or how the paddle is mounted",
+    "paddle_offset": "the frame of the ball's position, or how the paddle is mounted",
+    CAMERA_ROTATION: "the axes of the ball's frame, which swapped columns turn too",
+    "action_latency": "the clock of the servo targets",
+    "encoder_bias": "a joint's zero, the unit of the angles, swapped columns, or the ball's frame",
+}
+_OF_JOINTS = "another arm than --robot's, swapped columns of joints, or the frame of the ball"
 
 
 class Estimate(NamedTuple):
@@ -53,7 +70,8 @@ class Estimate(NamedTuple):
 
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
-    """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them."""
+    """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
+    `ball_latency` is the time from the exposure to the arrival."""
     layout, width = found.layout, _WIDTH * found.deviation * misfit(found)
     world = layout.world(found.fit.vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.unknowns])
@@ -63,6 +81,9 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
         place = layout.slices()[name]
         low[place], high[place] = ends
         alone[place] = np.inf
+    late = layout.slices().get("ball_latency", slice(0, 0))
+    for array in (values, low, high):
+        array[late] += found.stamp_age
     seen = found.deviation < _UNSEEN * layout.deviation
     units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
     labels = layout.labels(joint_names)
@@ -83,6 +104,8 @@ def _delays(found: Identified) -> dict[str, tuple[float, float]]:
     width = _WIDTH * found.deviation[variance] * misfit(found)
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
     own = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
+    if found.deviation[delay] >= _UNSEEN * layout.deviation[delay]:
+        own = found.covariance[delay, delay]
     own = _WIDTH * misfit(found) * np.sqrt(max(own, 0.0))
     ends = np.repeat(vector[None], 3, axis=0)
     ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
@@ -122,8 +145,29 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "not in free flight; their pictures do not count."
         )
     if not np.any(found.windows.has_ball):
-        said.append("The log shows no bounce, so only the arm was identified.")
-    return said + _unseen(found, joint_names)
+        said.append(
+            "The log shows no bounce, so only the arm was identified. If the ball bounced, look at "
+            "the axes and the unit of its position, z up in metres, and at the unit of ball_time."
+        )
+    return [*_mistakes(found, joint_names), *said, *_unseen(found, joint_names)]
+
+
+def _mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
+    """Warnings of estimates that are several deviations of the prior away."""
+    layout, listed, said = found.layout, estimates(found, joint_names), []
+    for name, place in layout.slices().items():
+        unknown = (ARM | BALL).get(name, layout.unknowns[name])
+        off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
+        at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
+        beside = np.array(layout.unknowns[name].deviation) > unknown.deviation
+        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit | beside):
+            entry = listed[place][i]
+            said.append(
+                f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
+                + f", {abs(off[i]):.1f} deviations of the prior from {unknown.mean:g}; look at "
+                f"{_MISTAKES.get(name, _OF_JOINTS)}."
+            )
+    return said
 
 
 def _unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:

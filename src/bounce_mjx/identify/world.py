@@ -15,6 +15,8 @@ from bounce_mjx.world.randomization import TERMS
 
 # Factor by which a range is wider than the interval of each term alone.
 _MARGIN = 1.5
+# Longest time between two pictures of one flight, s.
+_TOGETHER = 0.1
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
@@ -32,7 +34,6 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     places, listed = found.layout.slices(), estimates(found, joint_names)
     for name, place in places.items():
         by_term[name] = listed[place]
-    late = least_age(log)
     ranges: dict[str, list[Any]] = {}
     identified: dict[str, float | list[float]] = {}
     sources: dict[str, str] = {}
@@ -40,14 +41,13 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     for name, entries in by_term.items():
         if name == CAMERA_ROTATION:
             continue
-        shift = late if name == "ball_latency" else 0.0
-        ranges[name] = _range(name, entries, shift)
-        each = [float(f"{entry.value + shift:.5g}") for entry in entries]
+        ranges[name] = _range(name, entries)
+        each = [float(f"{entry.value:.5g}") for entry in entries]
         identified[name] = each if len(each) > 1 else each[0]
         shown = [entry for entry in entries if entry.seen]
         if len(shown) < len(entries):
             assumed.append(name)
-        values = ", ".join(_words(entry, shift) for entry in entries)
+        values = ", ".join(_words(entry) for entry in entries)
         how = "Identified" if shown else "Not shown, so the prior stands,"
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     if "ball_latency" not in by_term:
@@ -74,38 +74,32 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     return head + "".join(parts)
 
 
-def compare(
-    world: NamedWorld, found: Identified, log: Log, joint_names: Sequence[str]
-) -> list[str]:
+def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Terms of a world that a log contradicts, a sentence each; none if the robot is still the
     same."""
     given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
-    late, changed = least_age(log), []
+    changed = []
     for name, place in found.layout.slices().items():
         if name not in given:
             continue
-        shift = late if name == "ball_latency" else 0.0
         ends = (np.broadcast_to(end, len(listed[place])) for end in given[name])
         for entry, low, high in zip(listed[place], *ends, strict=True):
-            if entry.seen and (entry.high + shift < low or entry.low + shift > high):
-                changed.append(
-                    f"{entry.label} is {_words(entry, shift)} now, outside {low:g} to {high:g}"
-                )
+            if entry.seen and (entry.high < low or entry.low > high):
+                changed.append(f"{entry.label} is {_words(entry)} now, outside {low:g} to {high:g}")
     return changed
 
 
-def _words(entry: Estimate, shift: float) -> str:
-    half = 0.5 * (entry.high - entry.low)
-    value, unit = entry.value + shift, f" {entry.unit}" if entry.unit else ""
+def _words(entry: Estimate) -> str:
+    half, unit = 0.5 * (entry.high - entry.low), f" {entry.unit}" if entry.unit else ""
     if entry.unit == "s":
-        return f"{1e3 * value:.1f} +- {1e3 * half:.1f} ms"
-    return f"{value:.4g} +- {half:.2g}{unit}"
+        return f"{1e3 * entry.value:.1f} +- {1e3 * half:.1f} ms"
+    return f"{entry.value:.4g} +- {half:.2g}{unit}"
 
 
-def _range(name: str, entries: Sequence[Estimate], shift: float) -> list[Any]:
+def _range(name: str, entries: Sequence[Estimate]) -> list[Any]:
     value, low, high, alone = np.transpose([(e.value, e.low, e.high, e.alone) for e in entries])
     low = value - _MARGIN * np.minimum(value - low, alone)
-    ends = np.stack([low, value + _MARGIN * np.minimum(high - value, alone)]) + shift
+    ends = np.stack([low, value + _MARGIN * np.minimum(high - value, alone)])
     return _clipped(name, ends if len(entries) > 1 else ends[:, 0])
 
 
@@ -116,12 +110,24 @@ def _clipped(name: str, ends: Any) -> list[Any]:
     return np.vectorize(lambda x: float(f"{x:.4g}"))(ends).tolist()
 
 
-def least_age(log: Log) -> float:
-    """Time from a picture's stamp to its arrival, s: 0 if the stamp is that of the arrival. Of the
-    youngest pictures, as the others wait for the next control step."""
-    if not len(log.arrivals):
-        return 0.0
-    return max(0.0, float(np.quantile(log.arrivals - log.picture_times, 0.02)))
+def camera_of(log: Log) -> tuple[float, float] | None:
+    """Rate of the pictures (Hz), and share of them that were lost; None for fewer than 50.
+
+    A picture that came together with a later one, between two control steps, is not lost.
+    """
+    intervals, steps = np.diff(log.picture_times), np.searchsorted(log.times, log.arrivals)
+    together = intervals < _TOGETHER
+    if np.sum(together) < 50:
+        return None
+    intervals, period = intervals[together], float(np.median(intervals[together]))
+    for _ in range(3):
+        # Stamps that are rounded, or of every second picture at times, have another median.
+        periods = np.maximum(np.round(intervals / period), 1.0)
+        period = float(np.sum(intervals) / np.sum(periods))
+    missing = periods - 1.0
+    if np.mean(np.isin(log.arrivals, log.times)) > 0.9:
+        missing = np.minimum(missing, np.maximum(np.diff(steps)[together] - 1.0, 0.0))
+    return 1.0 / period, float(np.sum(missing) / (len(missing) + np.sum(missing)))
 
 
 def _sensors(found: Identified, log: Log) -> dict[str, tuple[tuple[float, float], str]]:
@@ -133,14 +139,11 @@ def _sensors(found: Identified, log: Log) -> dict[str, tuple[tuple[float, float]
             "Third differences of the joint angles",
         )
     }
-    intervals = np.diff(log.picture_times)
-    together = intervals[intervals < 0.1]
-    if len(together) > 50:
-        interval = float(np.median(together))
-        lost = 1.0 - len(together) / float(np.sum(np.round(together / interval)))
+    if (camera := camera_of(log)) is not None:
+        rate, lost = camera
         noise = found.noise.balls
         ranges |= {
-            "camera_rate": ((0.97 / interval, 1.03 / interval), "Intervals of the pictures"),
+            "camera_rate": ((0.97 * rate, 1.03 * rate), "Intervals of the pictures"),
             "frame_drop": ((0.5 * lost, 1.5 * lost + 0.01), "Missing pictures"),
             "ball_position_noise": (
                 (0.8 * float(np.min(noise)), 1.2 * float(np.max(noise))),
