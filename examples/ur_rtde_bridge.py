@@ -36,7 +36,8 @@ class Camera:
 
 
 def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> list[str]:
-    """Bounces for a time, and starts again after each stop. Returns the reasons of the stops."""
+    """Bounces for a time, and starts again when the ball was lost; any other fault needs somebody
+    who looks. Returns the reasons of the stops."""
     arm, step, reasons = policy.supervise(RATE), policy.metadata.control_dt, []
     for _ in range(round(seconds / step)):
         joints = {"joint_angles": receive.getActualQ(), "joint_velocities": receive.getActualQd()}
@@ -50,6 +51,8 @@ def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> 
             arm.start()
         elif arm.state == "stopped":
             reasons.append(arm.reason)
+            if arm.fault != "ball_lost":
+                break
             arm.restart()
     control.servoStop()
     return reasons

@@ -260,6 +260,12 @@ class WorldConfig(StrictModel):
         return {}
 
     @property
+    def ball_bounds(self) -> tuple[float, float] | None:
+        """Largest distance of the ball from the robot's base (m), and its largest measured speed
+        (m/s), before an episode ends; None if the task does not bound them."""
+        return None
+
+    @property
     def num_substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.control_dt / self.physics_dt)
