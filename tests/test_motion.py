@@ -192,7 +192,7 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
     for i in range(50):
         if arm.step(**flying(i)) != "running":
             break
-    assert arm.supervisor.fault == "box" and "outside the box" in arm.supervisor.reason
+    assert arm.supervisor.fault == "box" and "m outside the box" in arm.supervisor.reason
     arm.until("stopped", 50)
     # The command that would have left the box was not sent.
     arm.check()
@@ -287,7 +287,7 @@ def test_a_stuck_arm_is_seen_within_half_a_second(name: str, joints: Any) -> Non
         if arm.state != "running":
             break
         angles[joints] = home[joints]
-    assert arm.fault == "joint_stuck" and "has not moved for 0.3 s" in arm.reason
+    assert arm.fault == "joint_stuck" and "is stuck" in arm.reason
 
 
 @pytest.mark.parametrize("height, fault", [(0.3, "old_picture"), (0.03, None)])

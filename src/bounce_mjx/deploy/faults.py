@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import USUAL_BALL, Metadata
+from bounce_mjx.deploy.metadata import Metadata
 
 STUCK_SHARE = 0.25
 """Share of `action_scale` by which an arm must have been asked to move, to be stuck if it rests."""
@@ -45,7 +45,7 @@ class Allowed(NamedTuple):
     """Speed of each joint [J], rad/s."""
     jump: np.ndarray
     """Change of each angle [J] from one control step to the next, rad."""
-    box: np.ndarray | None
+    box: np.ndarray
     """Lowest and highest position of the paddle [2, 3], m."""
     still: float
     """Range of a resting angle, rad."""
@@ -75,11 +75,9 @@ def picture_age(metadata: Metadata) -> float:
     return min(max(largest(metadata, "ball_latency") + 5.0 / rate, 0.1), 1.0)
 
 
-def allowed(
-    metadata: Metadata, age: float, steps_late: float, box: np.ndarray | None = None
-) -> Allowed:
+def allowed(metadata: Metadata, age: float, steps_late: float, box: Any = None) -> Allowed:
     """The bounds of a policy's worlds, with the settings of a supervisor."""
-    limits, dt, bounds = metadata.limits, metadata.control_dt, metadata.ball or USUAL_BALL
+    limits, dt = metadata.limits, metadata.control_dt
     noise = _LARGEST_NOISE * largest(metadata, "joint_angle_noise")
     still = _STILL + 0.8 * noise
     count = len(metadata.joint_names)
@@ -88,11 +86,11 @@ def allowed(
         elapsed=steps_late * dt,
         idle=steps_late,
         age=age,
-        ball=(bounds.distance, bounds.speed),
+        ball=metadata.ball,
         ball_noise=1.5 * _LARGEST_NOISE * largest(metadata, "ball_position_noise"),
         speed=speed,
         jump=2.0 * speed * dt + noise,
-        box=box,
+        box=np.array([[-np.inf], [np.inf]]) if box is None else box,
         still=still,
         asked=max(STUCK_SHARE * metadata.action_scale, 0.6 * still),
         offset=_SAG + largest(metadata, "encoder_bias"),
@@ -122,17 +120,20 @@ def _arms(metadata: Metadata) -> dict[str, np.ndarray]:
     return {"pull": np.array(pull), "settled": np.array(settled)}
 
 
-def _beyond(value: Any, limit: Any) -> tuple[Any, Any]:
-    return value > limit, value
+def _largest_norm(vectors: Any) -> Any:
+    return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
+
+
+def _late(a: Allowed, elapsed: Any) -> tuple[Any, Any]:
+    return elapsed > a.elapsed, 1e3 * elapsed
 
 
 def _picture(a: Allowed, age: Any) -> tuple[Any, Any]:
     return (age > a.age) | (age < -_SYNCHRONOUS), 1e3 * age
 
 
-def _ball_speed(a: Allowed, ball: Any, last_ball: Any, between: Any) -> tuple[Any, Any]:
-    moved = np.max(np.linalg.norm(ball - last_ball, axis=-1), axis=-1)
-    return moved > a.ball[1] * between + a.ball_noise, moved / between
+def _place(a: Allowed, ball: Any) -> tuple[Any, Any]:
+    return (far := _largest_norm(ball)) > a.ball[0], far
 
 
 def _lost(a: Allowed, ball: Any, last_ball: Any, paddle: Any) -> tuple[Any, Any]:
@@ -141,6 +142,19 @@ def _lost(a: Allowed, ball: Any, last_ball: Any, paddle: Any) -> tuple[Any, Any]
     beside, before = (np.linalg.norm((b - paddle)[..., :2], axis=-1) for b in (ball, last_ball))
     is_lost = (below > _BELOW) | ((beside > _BESIDE) & (beside >= before))
     return np.any(is_lost, axis=-1), np.max(np.maximum(below, beside), axis=-1)
+
+
+def _velocity(a: Allowed, ball_velocity: Any) -> tuple[Any, Any]:
+    return (fast := _largest_norm(ball_velocity)) > a.ball[1], fast
+
+
+def _moved(a: Allowed, ball: Any, last_ball: Any, between: Any) -> tuple[Any, Any]:
+    moved = _largest_norm(ball - last_ball)
+    return moved > a.ball[1] * between + a.ball_noise, moved / between
+
+
+def _fast(a: Allowed, velocities: Any) -> tuple[Any, Any]:
+    return np.any(np.abs(velocities) > a.speed, axis=-1), np.max(np.abs(velocities), axis=-1)
 
 
 def _jump(a: Allowed, angles: Any) -> tuple[Any, Any]:
@@ -164,8 +178,6 @@ def _stuck(a: Allowed, angles: Any, commands: Any) -> tuple[Any, Any]:
 
 
 def _outside(a: Allowed, target: Any) -> tuple[Any, Any]:
-    if a.box is None:
-        return np.zeros(target.shape[:-1], bool), np.zeros(target.shape[:-1])
     over = np.max(np.maximum(a.box[0] - target, target - a.box[1]), axis=-1)
     return over > 0.0, over
 
@@ -175,60 +187,25 @@ class Rule(NamedTuple):
 
     fault: str
     """Code of the fault."""
-    needs: tuple[str, ...]
-    """The facts that it judges."""
+    needs: str
+    """Names of the facts that it judges."""
     check: Callable[..., tuple[Any, Any]]
     """Bounds and facts -> whether it is broken, and a number for the reason."""
     reason: str
 
 
 RULES = (
-    Rule(
-        "late_step",
-        ("elapsed",),
-        lambda a, elapsed: (elapsed > a.elapsed, 1e3 * elapsed),
-        "a control step came after {:.0f} ms",
-    ),
-    Rule(
-        "no_step",
-        ("idle",),
-        lambda a, idle: _beyond(idle, a.idle),
-        "{:.0f} calls in a row had a time that is no new control step",
-    ),
-    Rule("old_picture", ("age",), _picture, "the picture of the ball is {:.0f} ms old"),
-    Rule(
-        "ball_place",
-        ("ball",),
-        lambda a, ball: _beyond(np.max(np.linalg.norm(ball, axis=-1), axis=-1), a.ball[0]),
-        "the ball is {:.3g} m from the base",
-    ),
-    Rule("ball_lost", ("ball", "last_ball", "paddle"), _lost, "the ball is lost"),
-    Rule(
-        "ball_speed",
-        ("ball_velocity",),
-        lambda a, v: _beyond(np.max(np.linalg.norm(v, axis=-1), axis=-1), a.ball[1]),
-        "the ball has {:.3g} m/s",
-    ),
-    Rule("ball_speed", ("ball", "last_ball", "between"), _ball_speed, "the ball has {:.3g} m/s"),
-    Rule(
-        "joint_speed",
-        ("velocities",),
-        lambda a, v: (np.any(np.abs(v) > a.speed, axis=-1), np.max(np.abs(v), axis=-1)),
-        "a joint has {:.3g} rad/s",
-    ),
-    Rule("joint_jump", ("angles",), _jump, "a joint's angle has jumped by {:.3g} rad"),
-    Rule(
-        "joint_stuck",
-        ("angles", "commands"),
-        _stuck,
-        f"a joint has not moved for {_STUCK_SECONDS:g} s, though its command is {{:.3g}} rad away",
-    ),
-    Rule(
-        "box",
-        ("target",),
-        _outside,
-        "the command would bring the paddle {:.3g} m outside the box",
-    ),
+    Rule("late_step", "elapsed", _late, "a control step came after {:.0f} ms"),
+    Rule("no_step", "idle", lambda a, n: (n > a.idle, n), "{} calls in a row are no new step"),
+    Rule("old_picture", "age", _picture, "the picture of the ball is {:.0f} ms old"),
+    Rule("ball_place", "ball", _place, "the ball is {:.3g} m from the base"),
+    Rule("ball_lost", "ball last_ball paddle", _lost, "the ball is lost"),
+    Rule("ball_speed", "ball_velocity", _velocity, "the ball has {:.3g} m/s"),
+    Rule("ball_speed", "ball last_ball between", _moved, "the ball has {:.3g} m/s"),
+    Rule("joint_speed", "velocities", _fast, "a joint has {:.3g} rad/s"),
+    Rule("joint_jump", "angles", _jump, "a joint's angle has jumped by {:.3g} rad"),
+    Rule("joint_stuck", "angles commands", _stuck, "a joint is stuck {:.3g} rad from its command"),
+    Rule("box", "target", _outside, "the paddle's command is {:.3g} m outside the box"),
 )
 """What must hold: of the measurements, of the arm's following, and of the command. The facts, for
 any batch [...]:
@@ -244,16 +221,15 @@ any batch [...]:
 
 def faults(bounds: Allowed, facts: dict[str, Any]) -> list[tuple[Rule, Any, Any]]:
     """The rules that the facts decide, each with whether it is broken and its number [...]."""
+    rules = [(rule, rule.needs.split()) for rule in RULES]
     return [
-        (rule, *rule.check(bounds, *(facts[name] for name in rule.needs)))
-        for rule in RULES
-        if all(name in facts for name in rule.needs)
+        (rule, *rule.check(bounds, *map(facts.get, needs)))
+        for rule, needs in rules
+        if facts.keys() >= set(needs)
     ]
 
 
 def first_fault(bounds: Allowed, facts: dict[str, Any]) -> tuple[str, str] | None:
     """Code and reason of the first rule that a single control step breaks."""
-    for rule, broken, number in faults(bounds, facts):
-        if broken:
-            return rule.fault, rule.reason.format(float(number))
-    return None
+    broken = (x for x in faults(bounds, facts) if x[1])
+    return next(((rule.fault, rule.reason.format(number)) for rule, _, number in broken), None)

@@ -38,7 +38,7 @@ Vector = tuple[Length, Length, Length]
 Limit = Annotated[float, (1e-6, 1e9)]
 
 # Entries that files may lack: their targets jump, they are of one ball, and its bounds are usual.
-_LATER = {"limits": "null", "num_balls": "1", "ball": "null"}
+_LATER = {"limits": "null", "num_balls": "1", "ball": '{"distance": 3.0, "speed": 20.0}'}
 
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
@@ -103,10 +103,6 @@ class BallBounds(NamedTuple):
     """Largest measured speed, m/s."""
 
 
-USUAL_BALL = BallBounds(3.0, 20.0)
-"""Bounds for a file without its own."""
-
-
 class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
@@ -117,8 +113,8 @@ class Metadata(NamedTuple):
     """Order of the joints in every array of J joints."""
     num_balls: Annotated[int, (1, 3)]
     """Number of balls, each of which is measured."""
-    ball: BallBounds | None
-    """Bounds of each ball; None for `USUAL_BALL`."""
+    ball: BallBounds
+    """Bounds of each ball."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
     position: Literal["measured", "filter"]

@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 
 from bounce_mjx.deploy.histories import Histories, Measurements
-from bounce_mjx.deploy.metadata import (
-    PER_BALL,
-    UNITS,
-    USUAL_BALL,
-    BallBounds,
-    Metadata,
-    measurement_sizes,
-)
+from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
 from bounce_mjx.deploy.motion import Motion
 from bounce_mjx.deploy.network import OnnxNetwork
 from bounce_mjx.deploy.supervisor import Supervisor
@@ -263,11 +256,6 @@ class DeployedPolicy:
         values = self._histories.values | self._network.memory
         return np.concatenate([values[i.name].ravel() for i in self.metadata.observation])
 
-    @property
-    def ball_bounds(self) -> BallBounds:
-        """Bounds of each ball in the training."""
-        return self.metadata.ball or USUAL_BALL
-
     def _needs(self) -> tuple[str, ...]:
         reads = self._network.reads
         optional = ("ball_quaternion", "ball_angular_velocity")
@@ -339,10 +327,10 @@ class DeployedPolicy:
     def _refuse_impossible(self, measured: Measurements) -> None:
         """Raises UserError for a measurement that no world of the training can hold."""
         far = np.linalg.norm(measured.get("ball_position", np.zeros(3)).reshape(-1, 3), axis=1)
-        if np.max(far) > 2.0 * self.ball_bounds.distance:
+        if np.max(far) > 2.0 * self.metadata.ball.distance:
             raise UserError(
                 f"the measurement ball_position is {np.max(far):.3g} m from the robot's base, but "
-                f"no ball of the training farther than {self.ball_bounds.distance:.3g} m; give "
+                f"no ball of the training farther than {self.metadata.ball.distance:.3g} m; give "
                 "metres in the robot's frame"
             )
         for name in self.metadata.commands.keys() & measured.keys():

@@ -260,10 +260,10 @@ class WorldConfig(StrictModel):
         return {}
 
     @property
-    def ball_bounds(self) -> tuple[float, float] | None:
+    def ball_bounds(self) -> tuple[float, float]:
         """Largest distance of the ball from the robot's base (m), and its largest measured speed
-        (m/s), before an episode ends; None if the task does not bound them."""
-        return None
+        (m/s), before an episode ends."""
+        return 3.0, 20.0
 
     @property
     def num_substeps(self) -> int:
