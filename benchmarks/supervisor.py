@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import FLYING, Allowed, allowed, faults, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FLYING, Allowed, allowed, faults, picture_age
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
@@ -104,17 +104,20 @@ def facts(metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray]) -
     is_new = np.append(True, np.any(ball[1:] != ball[:-1], axis=(1, 2)))
     newest = np.maximum.accumulate(np.where(is_new, np.arange(len(angles)), 0))
     taken = (times - age)[newest]
-    before = np.append(-1, newest[:-1])[newest]
+    numbers, pictures = np.cumsum(is_new) - 1, np.append(np.flatnonzero(is_new), -1)
+    before, earlier = (pictures[np.maximum(numbers - k, -1)] for k in (1, EARLIER))
     flies = np.max(ball[..., 2], axis=1) > paddle[:, 2] + FLYING
-    none = before < 0
+    balls = [np.where(i[:, None, None] < 0, np.nan, ball[i]) for i in (before, earlier)]
+    between = np.maximum(taken - taken[before], metadata.control_dt)
     return {
         "angles": windows(angles, steps + 1),
         "commands": windows(sent, inputs),
         "velocities": episode["velocities"],
         "paddle": paddle,
         "ball": ball,
-        "last_ball": np.where(none[:, None, None], np.nan, ball[before]),
-        "between": np.where(none, np.nan, np.maximum(taken - taken[before], metadata.control_dt)),
+        "last_ball": balls[0],
+        "earlier_ball": balls[1],
+        "between": np.where(before < 0, np.nan, between),
         "age": np.where(flies, np.maximum(age, times - taken), age),
     }
 
@@ -132,23 +135,17 @@ def first(found: list, step: int = 0) -> tuple[int, str]:
 def delays(
     metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, float]:
-    """Times from a fault until a rule is broken, s; infinite where the episode ends before."""
+    """Times from a fault until a rule is broken, s; infinite where none is in 2 s."""
     length = int(np.sum(episode["running"]))
     if length < 200:
         return {}
     step, found = int(rng.integers(50, length - 100)), {}
     episode = {key: value[step - 50 : min(step + 200, length)] for key, value in episode.items()}
     step, length = 50, len(episode["age"])
-    for name in (
-        "a picture repeats",
-        *(f"joint {j + 1}" for j in range(episode["angles"].shape[1])),
-    ):
+    repeated = {f"the angle of joint {j + 1}": ("angles", j) for j in range(len(bounds.speed))}
+    for name, (kind, entry) in ({"a picture": ("ball", ...)} | repeated).items():
         changed = {key: value.copy() for key, value in episode.items()}
-        if name.startswith("joint"):
-            j = int(name.split()[1]) - 1
-            changed["angles"][step:, j] = changed["angles"][step, j]
-        else:
-            changed["ball"][step:] = changed["ball"][step]
+        changed[kind][step:, entry] = changed[kind][step, entry]
         at, _ = first(faults(bounds, facts(metadata, bounds, changed)), step)
         found[name] = (at - step) * metadata.control_dt if at < length else np.inf
     return found

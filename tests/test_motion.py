@@ -301,6 +301,17 @@ def test_a_picture_that_stays_the_same_is_old_in_flight_alone(height: float, fau
     assert arm.fault == fault
 
 
+def test_a_ball_that_comes_nearer_is_not_lost() -> None:
+    """From a noisy camera, as when it is thrown at the arm; at the same place it is lost."""
+    for speed, fault in ((-1.5, None), (0.0, "ball_lost")):
+        arm, rng = running(), np.random.default_rng(0)
+        arm.supervisor._pictures = []
+        for i in range(30):
+            ball = [0.589 + 1.4 + 0.01 * speed * i, 0.0, 0.4] + rng.normal(0.0, 0.003, 3)
+            arm.step(ball_position=ball)
+        assert arm.supervisor.fault == fault
+
+
 def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
     arm = running()
     arm.supervisor.stop("an emergency stop")
@@ -359,6 +370,7 @@ def test_the_table_judges_recorded_steps_as_single_ones() -> None:
         "ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
         "ball_velocity": rng.normal(0.0, 5.0, (*size, 1, 3)),
         "last_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
+        "earlier_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
         "between": rng.uniform(0.01, 0.1, size),
         "paddle": rng.normal(0.0, 0.1, (*size, 3)),
         "velocities": rng.normal(0.0, 1.5, (*size, 6)),

@@ -24,6 +24,8 @@ FASTEST = 6.283
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
 _BELOW, _BESIDE, FLYING = 0.1, 0.9, 0.05
+# Pictures in which the noise is smaller than the motion of a ball that comes nearer.
+EARLIER = 5
 # Difference of two clocks, s.
 _SYNCHRONOUS = 1e-3
 
@@ -136,10 +138,10 @@ def _place(a: Allowed, ball: Any) -> tuple[Any, Any]:
     return (far := _largest_norm(ball)) > a.ball[0], far
 
 
-def _lost(a: Allowed, ball: Any, last_ball: Any, paddle: Any) -> tuple[Any, Any]:
+def _lost(a: Allowed, ball: Any, earlier_ball: Any, paddle: Any) -> tuple[Any, Any]:
     paddle = paddle[..., None, :]
     below = paddle[..., 2] - ball[..., 2]
-    beside, before = (np.linalg.norm((b - paddle)[..., :2], axis=-1) for b in (ball, last_ball))
+    beside, before = (np.linalg.norm((b - paddle)[..., :2], axis=-1) for b in (ball, earlier_ball))
     is_lost = (below > _BELOW) | ((beside > _BESIDE) & (beside >= before))
     return np.any(is_lost, axis=-1), np.max(np.maximum(below, beside), axis=-1)
 
@@ -199,7 +201,7 @@ RULES = (
     Rule("no_step", "idle", lambda a, n: (n > a.idle, n), "{} calls in a row are no new step"),
     Rule("old_picture", "age", _picture, "the picture of the ball is {:.0f} ms old"),
     Rule("ball_place", "ball", _place, "the ball is {:.3g} m from the base"),
-    Rule("ball_lost", "ball last_ball paddle", _lost, "the ball is lost"),
+    Rule("ball_lost", "ball earlier_ball paddle", _lost, "the ball is lost"),
     Rule("ball_speed", "ball_velocity", _velocity, "the ball has {:.3g} m/s"),
     Rule("ball_speed", "ball last_ball between", _moved, "the ball has {:.3g} m/s"),
     Rule("joint_speed", "velocities", _fast, "a joint has {:.3g} rad/s"),
@@ -212,7 +214,8 @@ any batch [...]:
 
 - `elapsed` [...]: time since the last control step, s; `idle` [...]: calls without a step;
 - `age` [...] of the ball's picture, s; `ball` and `ball_velocity` [..., B, 3] in it, m and m/s;
-  `last_ball` [..., B, 3] in the picture before, and the time `between` them [...], s; NaN for none;
+  `last_ball` [..., B, 3] in the picture before, the time `between` them [...], s, and
+  `earlier_ball` in the one `EARLIER` before; NaN for none;
 - `angles` [..., T + 1, J] and `commands` [..., K, J] of the last control steps, rad: a command is
   that at the end of the step before its angle; `velocities` [..., J], rad/s; `paddle` [..., 3], m;
 - `target` [..., 3]: where the next command brings the paddle, m.

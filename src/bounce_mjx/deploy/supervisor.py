@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import FASTEST, FLYING, allowed, first_fault, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FASTEST, FLYING, allowed, first_fault, picture_age
 from bounce_mjx.deploy.histories import Measurements
 from bounce_mjx.errors import UserError
 
@@ -216,13 +216,14 @@ class Supervisor:
         """The facts of the ball's newest picture [B, 3] and of the one before."""
         if not self._pictures or np.any(ball != self._pictures[-1][0]):
             taken = self._clock - (age or 0.0)
-            self._pictures = [*self._pictures[-1:], (ball, taken)]
+            self._pictures = [*self._pictures[-EARLIER:], (ball, taken)]
         held = self._clock - self._pictures[-1][1]
         # A ball in flight that does not move is an old picture, whatever its age is said to be.
         if age is None or np.max(ball[:, 2]) > paddle[2] + FLYING:
             age = held if age is None else max(held, age)
-        (last, before), (_, taken) = self._pictures[0], self._pictures[-1]
-        between = max(taken - before, self._policy.metadata.control_dt)
-        if len(self._pictures) < 2:
-            last, between = np.full(ball.shape, np.nan), math.nan
-        return {"ball": ball, "last_ball": last, "between": between, "age": age}
+        seen, facts = self._pictures, {"ball": ball, "age": age}
+        if len(seen) > 1:
+            between = max(seen[-1][1] - seen[-2][1], self._policy.metadata.control_dt)
+            facts |= {"last_ball": seen[-2][0], "between": between}
+        none = np.full(ball.shape, np.nan)
+        return facts | {"earlier_ball": seen[0][0] if len(seen) > EARLIER else none}
