@@ -35,16 +35,13 @@ class Bridge(Node):
         self.create_timer(1.0 / RATE, self.tick)
 
     def on_joints(self, message: JointState) -> None:
-        """Takes the arm's angles; a message of other joints alone, such as a gripper's, has none.
-        The supervisor brakes if velocities are missing, or if no more angles come."""
+        """Takes the arm's angles; a message of other joints, such as a gripper's, has none."""
         if not set(self.names) <= set(message.name):
             return
         order = [message.name.index(name) for name in self.names]
-        for key, values in (
-            ("joint_angles", message.position),
-            ("joint_velocities", message.velocity),
-        ):
-            self.measured[key] = [values[i] for i in order if i < len(values)]
+        self.measured["joint_angles"] = [message.position[i] for i in order]
+        # A driver without velocities sends none, and the supervisor brakes.
+        self.measured["joint_velocities"] = [v for i in order for v in message.velocity[i : i + 1]]
 
     def on_ball(self, message: PointStamped) -> None:
         point, self.taken = message.point, message.header.stamp

@@ -36,8 +36,7 @@ class Camera:
 
 
 def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> list[str]:
-    """Bounces for a time, and starts again when the ball was lost; any other fault needs somebody
-    who looks. Returns the reasons of the stops."""
+    """Bounces for a time, again after each lost ball, until another fault. Returns the reasons."""
     arm, step, reasons = policy.supervise(RATE), policy.metadata.control_dt, []
     for _ in range(round(seconds / step)):
         joints = {"joint_angles": receive.getActualQ(), "joint_velocities": receive.getActualQd()}
