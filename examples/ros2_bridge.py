@@ -1,8 +1,10 @@
 """A policy on the topics of ROS 2, with the controller forward_position_controller of ros2_control.
 
-`python examples/ros2_bridge.py POLICY` subscribes to /joint_states and /ball (PointStamped, in the
-frame of the base), and publishes /forward_position_controller/commands at 500 Hz. Publish a message
-on /start for each episode. Read "Safety steps" in docs/real-robot.md first.
+`python examples/ros2_bridge.py POLICY [JOINT ...]` subscribes to /joint_states and /ball
+(PointStamped, in the frame of the base), and publishes /forward_position_controller/commands at
+500 Hz. The joints are the driver's names in the policy's order, if they differ from the policy's.
+Publish a message on /start for each episode, also after a fault. Read "Safety steps" in
+docs/real-robot.md first.
 """
 
 import sys
@@ -33,9 +35,13 @@ class Bridge(Node):
         self.create_timer(1.0 / RATE, self.tick)
 
     def on_joints(self, message: JointState) -> None:
+        """Takes the arm's angles; a message of other joints, such as a gripper's, has none."""
+        if not set(self.names) <= set(message.name):
+            return
         order = [message.name.index(name) for name in self.names]
         self.measured["joint_angles"] = [message.position[i] for i in order]
-        self.measured["joint_velocities"] = [message.velocity[i] for i in order]
+        # A driver without velocities sends none, and the supervisor brakes.
+        self.measured["joint_velocities"] = [v for i in order for v in message.velocity[i : i + 1]]
 
     def on_ball(self, message: PointStamped) -> None:
         point, self.taken = message.point, message.header.stamp
@@ -49,16 +55,18 @@ class Bridge(Node):
             self.arm.start()
 
     def tick(self) -> None:
-        if "joint_angles" not in self.measured or self.taken is None:
+        if "joint_angles" not in self.measured:
             return
         if not self.queue:
             now = self.get_clock().now()
-            age = (now - rclpy.time.Time.from_msg(self.taken)).nanoseconds * 1e-9
-            time = {"time": now.nanoseconds * 1e-9, "ball_age": max(age, 0.0)}
-            self.queue = list(self.arm.commands(self.measured | time))
+            measured = self.measured | {"time": now.nanoseconds * 1e-9}
+            if self.taken is not None:
+                age = now - rclpy.time.Time.from_msg(self.taken)
+                measured["ball_age"] = age.nanoseconds * 1e-9
+            self.queue = list(self.arm.commands(measured))
         self.publisher.publish(Float64MultiArray(data=self.queue.pop(0).tolist()))
 
 
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(Bridge(load_policy(sys.argv[1])))
+    rclpy.spin(Bridge(load_policy(sys.argv[1], joint_names=sys.argv[2:] or None)))

@@ -36,7 +36,7 @@ class Camera:
 
 
 def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> list[str]:
-    """Bounces for a time, and starts again after each stop. Returns the reasons of the stops."""
+    """Bounces for a time, again after each lost ball, until another fault. Returns the reasons."""
     arm, step, reasons = policy.supervise(RATE), policy.metadata.control_dt, []
     for _ in range(round(seconds / step)):
         joints = {"joint_angles": receive.getActualQ(), "joint_velocities": receive.getActualQd()}
@@ -50,6 +50,8 @@ def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> 
             arm.start()
         elif arm.state == "stopped":
             reasons.append(arm.reason)
+            if arm.fault != "ball_lost":
+                break
             arm.restart()
     control.servoStop()
     return reasons

@@ -103,8 +103,10 @@ def test_ur_rtde_bridge() -> None:
         def getActualQ(self) -> list[float]:
             return world.data.qpos[:6].tolist()
 
+        broken = False
+
         def getActualQd(self) -> list[float]:
-            return world.data.qvel[:6].tolist()
+            return [np.nan] * 6 if self.broken else world.data.qvel[:6].tolist()
 
         def getTimestamp(self) -> float:
             return world.time
@@ -123,11 +125,16 @@ def test_ur_rtde_bridge() -> None:
 
     camera = bridge["Camera"].__new__(bridge["Camera"])
     camera.socket, camera.newest = Socket(), {}
-    control = Control()
+    control, receive = Control(), Receive()
     wished = {"target_height": 0.5}
-    reasons = bridge["bounce"](policy, control, Receive(), camera, wished, SECONDS)
+    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
     assert control.stopped and world.ticks == SECONDS * RATE
     check(world, reasons)
+    # Only a lost ball starts it again by itself.
+    receive.broken = True
+    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
+    assert len(reasons) == 1 and "joint_velocities holds nan" in reasons[0]
+    assert world.ticks < 2 * SECONDS * RATE
 
 
 def message(**fields: Any) -> types.SimpleNamespace:
@@ -194,6 +201,8 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
             velocity=world.data.qvel[:6][::-1].tolist(),
         )
         node.subscribed["/joint_states"](state)
+        gripper = message(name=["finger"], position=[0.02], velocity=[])
+        node.subscribed["/joint_states"](gripper)
         picture = world.picture()
         if picture is not None and picture[0] != shown:
             shown = picture[0]
@@ -208,3 +217,9 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         world.watch(node.arm)
     assert len(said) == 1
     check(world, [said[0].removeprefix("stopped as ").removesuffix("; going home")])
+    # A message without velocities brakes the arm.
+    assert node.arm.state == "running"
+    node.subscribed["/joint_states"](message(**vars(state) | {"velocity": []}))
+    for _ in range(RATE // 10):
+        tick()
+    assert node.arm.state == "stopped" and "joint_velocities" in node.arm.reason

@@ -765,9 +765,9 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
     }
     policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
     assert policy.needs == ("ball_position",)
-    policy.step({"ball_position": (1.0, 2.0, 3.0)})
-    policy.step({"ball_position": (4.0, 5.0, 6.0)})
-    expected = [4.0, 5.0, 6.0, 1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]
+    policy.step({"ball_position": (0.1, 0.2, 0.3)})
+    policy.step({"ball_position": (0.4, 0.5, 0.6)})
+    expected = [0.4, 0.5, 0.6, 0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0]
     np.testing.assert_array_equal(policy.observation[:10], expected)
     with pytest.raises(UserError, match="call step with joint_angles first"):
         policy.servo_targets(np.zeros(6))
@@ -840,6 +840,7 @@ WRONG_ENTRIES = {
     "position": ["differences", 3],
     "estimator": [None, {}, []],
     "paddle": [[0.0, 0.0], [1e300, 0.0, 0.0]],
+    "ball": [[3.0, 20.0], {"distance": -1.0, "speed": 9.0}, {"distance": 3.0}],
     "paddle_normal": [[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
     "chain": [[], {}, [{"joint": 0}], None],
     "observation": [[], {}, [["joint_angles", 1, 6, "rad"]]],

@@ -1,5 +1,8 @@
 """A deployed policy's commands between two actions, and its supervisor."""
 
+import copy
+import math
+import pickle
 from typing import Any
 
 import jax
@@ -8,7 +11,9 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
+from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import policy_metadata
+from bounce_mjx.deploy.faults import allowed, faults, first_fault, picture_age
 from bounce_mjx.deploy.metadata import CommandLimits, from_entries, to_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
@@ -130,21 +135,28 @@ def running(**settings: Any) -> Arm:
 
 
 FAULTS = {
-    "stale picture": ({"ball_age": 0.12}, "picture of the ball is 120 ms old"),
-    "not finite": ({"joint_velocities": [np.nan] * 6}, "joint_velocities holds nan"),
-    "missing": ({"ball_velocity": None}, "ball_velocity"),
-    "lost": ({"ball_position": [0.6, 0.0, -0.2]}, "the ball is lost"),
-    "fast": ({"joint_velocities": [9.0] * 6}, "a joint has 9 rad/s"),
-    "behind": ({"joint_angles": HOME + 1.0}, "behind its command"),
+    "old_picture": ({"ball_age": 0.12}, "picture of the ball is 120 ms old"),
+    "old_picture of the future": ({"ball_age": -0.02}, "picture of the ball is -20 ms old"),
+    "measurement": ({"joint_velocities": [np.nan] * 6}, "joint_velocities holds nan"),
+    "measurement missing": ({"ball_velocity": None}, "ball_velocity"),
+    "measurement missing too": ({"joint_angles": None}, "joint_angles"),
+    "ball_lost": ({"ball_position": [0.6, 0.0, -0.2]}, "the ball is lost"),
+    "ball_lost mirrored": ({"ball_position": [-0.589, 0.0, 0.45]}, "the ball is lost"),
+    "ball_place in mm": ({"ball_position": [589.0, 0.0, 450.0]}, "741 m from the base"),
+    "ball_place": ({"ball_position": [4.0, 0.0, 0.45]}, "4.03 m from the base"),
+    "ball_speed": ({"ball_velocity": [0.0, 0.0, -2000.0]}, "the ball has 2e+03 m/s"),
+    "ball_speed by position": ({"ball_position": [0.589, 0.5, 0.45]}, "the ball has 50 m/s"),
+    "joint_speed": ({"joint_velocities": [9.0] * 6}, "a joint has 9 rad/s"),
+    "joint_jump": ({"joint_angles": HOME + 1.0}, "jumped by 1"),
 }
 
 
-@pytest.mark.parametrize("wrong, reason", FAULTS.values(), ids=FAULTS.keys())
-def test_a_fault_brakes_within_the_limits_and_says_why(wrong: dict, reason: str) -> None:
-    arm = running()
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_brakes_within_the_limits_and_says_why(name: str) -> None:
+    arm, (wrong, reason) = running(), FAULTS[name]
     angles = arm.angles
     assert arm.step(**wrong) == "braking"
-    assert reason in arm.supervisor.reason
+    assert arm.supervisor.fault == name.split()[0] and reason in arm.supervisor.reason
     arm.until("stopped", 100)
     assert reason in arm.supervisor.reason
     # At rest from then on, even with good measurements.
@@ -165,17 +177,264 @@ def test_a_late_step_and_an_old_picture_without_an_age_are_faults() -> None:
     assert state != "running" and "old" in arm.supervisor.reason
 
 
+def flying(i: int, **others: Any) -> dict[str, Any]:
+    """Measurements of a ball that each picture shows elsewhere."""
+    return {"ball_position": [0.589, 0.0, 0.45 + 1e-4 * i]} | others
+
+
 def test_a_command_outside_of_the_box_is_a_fault() -> None:
-    policy = load_policy("pretrained")
-    paddle = (0.58856, 0.0, 0.05)
-    low, high = ([x + d for x in paddle] for d in (-0.002, 0.002))
+    policy = limited()
+    paddle = Chain(policy.metadata).paddle(HOME)[0]
+    low, high = (list(paddle + d) for d in (-0.005, 0.005))
     arm = Arm(policy.supervise(1000, box=(low, high)))
     arm.until("ready", 20)
     arm.supervisor.start()
+    for i in range(50):
+        if arm.step(**flying(i)) != "running":
+            break
+    assert arm.supervisor.fault == "box" and "m outside the box" in arm.supervisor.reason
     arm.until("stopped", 50)
-    assert "outside the box" in arm.supervisor.reason
-    with pytest.raises(UserError, match="the box is"):
-        policy.supervise(1000, box=(high, low))
+    # The command that would have left the box was not sent.
+    arm.check()
+
+
+SETTINGS = {
+    "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
+    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf, "0.1"],
+    "max_steps_late": [0, -1, math.nan, math.inf],
+    "home_speed": [0.0, -1.0, 2.5, 1e9, math.nan],
+    "rate": [125, 0, math.nan, "500"],
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_wrong_setting_is_refused_at_once(name: str) -> None:
+    policy = limited()
+    for value in SETTINGS[name]:
+        with pytest.raises(UserError, match=f"the {name} is|{name} is"):
+            policy.supervise(**{"rate": 1000} | {name: value})
+
+
+def test_the_largest_age_of_a_picture_is_that_of_the_training() -> None:
+    latency = {"ur5e": 0.075 + 5.0 / 45.0, "robust": 0.065 + 5.0 / 60.0, "pretrained": 0.1}
+    for name, expected in latency.items():
+        assert picture_age(load_policy(name).metadata) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("rate", [100, 125, 200, 250, 500, 1000])
+def test_a_policy_acts_at_its_own_rate(rate: int) -> None:
+    policy, rng = load_policy("pretrained"), np.random.default_rng(0)
+    actions = []
+    for k in range(2 * rate):
+        ball = [0.589, 0.0, 0.3 + 0.1 * rng.random()]
+        action = policy.step(measured(ball_position=ball, time=1e3 + k / rate))
+        if not actions or np.any(action != actions[-1]):
+            actions.append(action)
+    assert abs(len(actions) - 200) <= 1 and policy.step_number == len(actions) - 1
+
+
+@pytest.mark.parametrize("late", [0.0, 0.004, -0.03], ids=["repeated", "early", "back"])
+def test_a_call_without_a_new_step_goes_on_where_the_last_ended(late: float) -> None:
+    """No commands are sent twice: the ones of a call without a step brake."""
+    arm = running()
+    for i in range(25, 45):
+        if i in (30, 31, 35):
+            time, arm.time = arm.time, arm.time - 0.01 + late
+            assert arm.step(**flying(i)) == "running"
+            arm.time = time
+        assert arm.step(**flying(i)) == "running"
+    arm.check()
+    time = arm.time - 0.01 + late
+    for i in range(3):
+        arm.time = time
+        state = arm.step(**flying(45 + i))
+    assert state == "stopped" and arm.supervisor.fault == "no_step"
+    assert "3 calls in a row" in arm.supervisor.reason
+    arm.check()
+
+
+def supervised(name: str) -> tuple[Any, np.ndarray, Any]:
+    """A supervisor of a shipped policy, the arm's home, and measurements of a ball above it."""
+    policy = load_policy(name)
+    home = np.array(policy.metadata.default_joint_angles)
+    place = Chain(policy.metadata).paddle(home)[0]
+
+    def seen(angles: np.ndarray, step: int, height: float) -> dict[str, Any]:
+        given = measured(angles, joint_velocities=np.zeros(len(home)), ball_age=0.005)
+        given |= {"ball_position": place + [0.05, 0.03, height], "target_height": 0.6}
+        kept = {k: v for k, v in given.items() if k in (*policy.needs, "ball_age")}
+        return kept | {"time": step * policy.metadata.control_dt}
+
+    return policy.supervise(500), home, seen
+
+
+@pytest.mark.parametrize("joints", [slice(None), 1], ids=["all joints", "joint 2"])
+@pytest.mark.parametrize("name", ["pretrained", "robust", "robust_small", "ur5e", "panda", "iiwa"])
+def test_a_stuck_arm_is_seen_within_half_a_second(name: str, joints: Any) -> None:
+    arm, home, seen = supervised(name)
+    step, angles = 0, home
+    while arm.state != "ready":
+        arm.commands(seen(home, step, 0.4))
+        step += 1
+    # An arm that rests is not asked to move.
+    for _ in range(40):
+        arm.commands(seen(home, step, 0.4))
+        step += 1
+    arm.start()
+    for i in range(50):
+        angles = arm.commands(seen(angles, step, 0.25 + 0.15 * np.sin(0.11 * i)))[-1].copy()
+        step += 1
+        if arm.state != "running":
+            break
+        angles[joints] = home[joints]
+    assert arm.fault == "joint_stuck" and "is stuck" in arm.reason
+
+
+@pytest.mark.parametrize("height, fault", [(0.3, "old_picture"), (0.03, None)])
+def test_a_picture_that_stays_the_same_is_old_in_flight_alone(height: float, fault: Any) -> None:
+    arm, home, seen = supervised("robust")
+    angles = home
+    for step in range(60):
+        angles = arm.commands(seen(angles, step, height))[-1]
+        if arm.state == "ready":
+            arm.start()
+    assert arm.fault == fault
+
+
+def test_a_ball_that_comes_nearer_is_not_lost() -> None:
+    """From a noisy camera, as when it is thrown at the arm; at the same place it is lost."""
+    for speed, fault in ((-1.5, None), (0.0, "ball_lost")):
+        arm, rng = running(), np.random.default_rng(0)
+        arm.supervisor._pictures = []
+        for i in range(30):
+            ball = [0.589 + 1.4 + 0.01 * speed * i, 0.0, 0.4] + rng.normal(0.0, 0.003, 3)
+            arm.step(ball_position=ball)
+        assert arm.supervisor.fault == fault
+
+
+def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
+    arm = running()
+    arm.supervisor.stop("an emergency stop")
+    # Braking and resting need no measurement.
+    for _ in range(100):
+        rows = arm.supervisor.commands({"joint_angles": None, "ball": "lost"})
+    assert arm.supervisor.state == "stopped"
+    stopped, moved = rows[-1], HOME + 0.6
+    for _ in range(20):
+        rows = arm.supervisor.commands(measured(moved))
+        np.testing.assert_array_equal(rows, np.tile(stopped, (10, 1)))
+    arm.supervisor.restart()
+    moves = Arm(arm.supervisor, moved)
+    moves.step()
+    assert np.abs(moves.rows[1] - moved).max() < 1e-3 and arm.supervisor.state == "homing"
+    moves.until("ready")
+    moves.check()
+    np.testing.assert_allclose(moves.angles, HOME, atol=2e-3)
+
+
+def test_an_arm_is_home_when_its_angles_are() -> None:
+    """Homing needs no ball, but angles in each step; an arm that does not move stops."""
+    for angles, fault in ((HOME + 0.5, "joint_stuck"), (None, "measurement")):
+        arm = limited().supervise(1000)
+        arm.commands({"joint_angles": HOME + 0.5})
+        states = set()
+        for _ in range(300):
+            arm.commands({} if angles is None else {"joint_angles": angles})
+            states.add(arm.state)
+        assert arm.fault == fault and "ready" not in states
+    arm = limited().supervise(1000)
+    angles = HOME + 0.1
+    while arm.state != "ready":
+        angles = arm.commands({"joint_angles": angles})[-1]
+    # Somebody pushes it away.
+    arm.commands({"joint_angles": HOME + 0.03})
+    assert arm.state == "homing"
+    # Under a load, it rests beside its command.
+    for _ in range(60):
+        arm.commands({"joint_angles": HOME + 0.008})
+    assert arm.state == "ready"
+
+
+def test_the_table_judges_recorded_steps_as_single_ones() -> None:
+    metadata, rng = load_policy("ur5e").metadata, np.random.default_rng(0)
+    bounds = allowed(metadata, 0.1, 2.0, np.array([[-1.0] * 3, [1.0] * 3]))
+    _, steps, inputs = bounds.pull.shape
+    size = (2, 40)
+    # Some joints rest, though they are asked to move.
+    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps + 1, 6)), axis=-2)
+    angles = HOME + moves * rng.choice([0.0, 1.0], (*size, 1, 6), p=[0.1, 0.9])
+    recorded = {
+        "elapsed": rng.uniform(0.0, 0.021, size),
+        "idle": rng.integers(0, 4, size),
+        "age": rng.uniform(-0.002, 0.11, size),
+        "ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
+        "ball_velocity": rng.normal(0.0, 5.0, (*size, 1, 3)),
+        "last_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
+        "earlier_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
+        "between": rng.uniform(0.01, 0.1, size),
+        "paddle": rng.normal(0.0, 0.1, (*size, 3)),
+        "velocities": rng.normal(0.0, 1.5, (*size, 6)),
+        "angles": angles,
+        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, inputs, 6)),
+        "target": rng.normal(0.0, 0.5, (*size, 3)),
+    }
+    found = faults(bounds, recorded)
+    for rule, broken, number in found:
+        assert broken.shape == number.shape == size and 0 < np.sum(broken) < 80, rule.fault
+    for at in np.ndindex(size):
+        codes = [rule.fault for rule, broken, _ in found if broken[at]]
+        single = first_fault(bounds, {name: value[at] for name, value in recorded.items()})
+        assert (single and single[0]) == (codes[0] if codes else None)
+
+
+def test_a_policy_can_be_copied_in_the_middle_of_an_episode() -> None:
+    arm = running()
+    others = copy.deepcopy(arm), pickle.loads(pickle.dumps(arm))
+    for i in range(25, 30):
+        arm.step(**flying(i))
+    for other in others:
+        assert len(other.rows) < len(arm.rows)
+        for i in range(25, 30):
+            other.step(**flying(i))
+        np.testing.assert_array_equal(other.rows, arm.rows)
+
+
+def test_targets_of_a_reset_are_finite_numbers_for_the_joints() -> None:
+    policy = load_policy("robust")
+    policy.step(measured() | {"ball_velocity": np.zeros(3)})
+    for wrong in (np.zeros(5), [[0.0] * 6], [math.nan] * 6, "home"):
+        with pytest.raises(UserError, match=r"the targets .*; give .*numbers \(rad\)"):
+            policy.reset(wrong)
+    assert policy.step_number == 0
+    policy.reset()
+    assert policy.targets is None
+    policy.reset(HOME)
+    np.testing.assert_array_equal(policy.targets, HOME)
+
+
+def test_joints_may_have_the_names_of_the_driver() -> None:
+    names = [f"fr3_joint{i}" for i in range(1, 8)]
+    assert load_policy("panda", joint_names=names).metadata.joint_names == tuple(names)
+    for wrong in (names[:6], names[:6] + names[:1], [*names[:6], 7]):
+        with pytest.raises(UserError, match="joint_names are .*; give 7 different names"):
+            load_policy("panda", joint_names=wrong)
+
+
+IMPOSSIBLE = {
+    "a ball in mm": ({"ball_position": [589.0, 0.0, 450.0]}, "ball_position is 741 m .* metres"),
+    "a command in cm": ({"target_height": 50.0}, "target_height is 50, but .* 0.4 to 0.6 \\(m\\)"),
+    "angles in degrees": ({"joint_angles": np.degrees(HOME)}, "110 for Joint3, .* give rad"),
+}
+
+
+@pytest.mark.parametrize("wrong, words", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_a_step_refuses_what_no_world_can_hold(wrong: dict, words: str) -> None:
+    policy = load_policy("pretrained")
+    with pytest.raises(UserError, match=words):
+        policy.step(measured(**wrong))
+    assert policy.step_number == -1
+    # A lost ball is no error.
+    policy.step(measured(ball_position=[1.4, -1.4, 0.02]))
 
 
 def test_an_episode_starts_again_after_a_loss() -> None:

@@ -21,15 +21,16 @@ class Chain:
         self._cosine_term = self._sine_term @ cross
 
     def paddle(self, joint_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World position [3] (m) of the paddle's centre, and upward unit normal [3] of the paddle,
-        at joint angles [J] (rad)."""
-        angles = (joint_angles[self._joints] - self._references)[:, None, None]
+        """World position [..., 3] (m) of the paddle's centre, and upward unit normal [..., 3] of
+        the paddle, at joint angles [..., J] (rad)."""
+        angles = (joint_angles[..., self._joints] - self._references)[..., None, None]
         turned = np.sin(angles) * self._sine_term + (1.0 - np.cos(angles)) * self._cosine_term
+        rotations = self._fixed + turned
         position, normal = self._paddle, self._normal
-        for origin, rotation in zip(
-            self._positions[::-1], (self._fixed + turned)[::-1], strict=True
-        ):
-            position, normal = origin + rotation @ position, rotation @ normal
+        for i in reversed(range(len(self._joints))):
+            rotation = rotations[..., i, :, :]
+            position = self._positions[i] + (rotation @ position[..., None])[..., 0]
+            normal = (rotation @ normal[..., None])[..., 0]
         return position, normal
 
 

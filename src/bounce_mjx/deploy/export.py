@@ -18,6 +18,7 @@ from bounce_mjx.deploy.metadata import (
     MEASURED,
     NEXT,
     UNITS,
+    BallBounds,
     CommandLimits,
     CommandRange,
     Hinge,
@@ -138,6 +139,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         steps=steps,
         joint_names=joint_names(m),
         num_balls=env.num_balls,
+        ball=BallBounds(*env.ball_bounds),
         observation=_inputs(env),
         # Without a quantity that sees it, there is no filter.
         position=env.observation.position if filtered else "measured",

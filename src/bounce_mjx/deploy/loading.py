@@ -1,6 +1,7 @@
 """`load_policy`: loads a policy by name, from an ONNX file, or from a run."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from bounce_mjx.deploy.policy import DeployedPolicy
@@ -8,7 +9,11 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES, resource_path
 
 
-def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedPolicy:
+def load_policy(
+    policy: str | os.PathLike,
+    task: str | None = None,
+    joint_names: Sequence[str] | None = None,
+) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
     Args:
@@ -17,10 +22,25 @@ def load_policy(policy: str | os.PathLike, task: str | None = None) -> DeployedP
         `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
         JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
+      joint_names: the robot's own names of the joints, in the policy's order, such as
+        `fr3_joint1`; they replace those in `metadata.joint_names`.
 
     Raises:
-      UserError: there is no such policy, or the file is damaged.
+      UserError: there is no such policy, the file is damaged, or a name is missing or given twice.
     """
+    loaded = _loaded(policy, task)
+    if joint_names is not None:
+        names, own = tuple(joint_names), loaded.metadata.joint_names
+        if len(set(names)) != len(own) or not all(isinstance(name, str) for name in names):
+            raise UserError(
+                f"joint_names are {joint_names!r}; give {len(own)} different names, those of the "
+                f"joints {', '.join(own)} in this order"
+            )
+        loaded.metadata = loaded.metadata._replace(joint_names=names)
+    return loaded
+
+
+def _loaded(policy: str | os.PathLike, task: str | None) -> DeployedPolicy:
     if isinstance(policy, str) and policy in POLICIES:
         path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
         return DeployedPolicy(path.read_bytes(), f"the policy {policy}")

@@ -37,8 +37,8 @@ Length = Annotated[float, (-1e3, 1e3)]
 Vector = tuple[Length, Length, Length]
 Limit = Annotated[float, (1e-6, 1e9)]
 
-# Entries that older files lack: their targets jump, and they are of one ball.
-_LATER = {"limits": "null", "num_balls": "1"}
+# Entries that files may lack: their targets jump, they are of one ball, and its bounds are usual.
+_LATER = {"limits": "null", "num_balls": "1", "ball": '{"distance": 3.0, "speed": 20.0}'}
 
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
@@ -94,6 +94,15 @@ class CommandLimits(NamedTuple):
     """rad/s^3; None for no limit."""
 
 
+class BallBounds(NamedTuple):
+    """Bounds of a ball that the policy can have seen in its training."""
+
+    distance: Annotated[float, (0.1, 1e3)]
+    """Largest distance from the origin of the robot's frame, m."""
+    speed: Annotated[float, (0.1, 1e3)]
+    """Largest measured speed, m/s."""
+
+
 class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
@@ -104,6 +113,8 @@ class Metadata(NamedTuple):
     """Order of the joints in every array of J joints."""
     num_balls: Annotated[int, (1, 3)]
     """Number of balls, each of which is measured."""
+    ball: BallBounds
+    """Bounds of each ball."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
     position: Literal["measured", "filter"]

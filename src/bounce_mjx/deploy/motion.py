@@ -27,13 +27,17 @@ class Motion:
         """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
         still = np.zeros(len(self._low))
         self._start = None
-        self._end = None if angles is None else Setpoint(self._clipped(angles), still, still)
+        self._end = None if angles is None else Setpoint(np.array(angles, float), still, still)
 
     def begin(self, angles: np.ndarray) -> None:
         """Begins a control step with the measured angles [J], where the last one ended."""
         if self._end is None:
-            self.rest(angles)
+            self.rest(self.clipped(angles))
         self._start = self._end
+
+    def withdraw(self) -> None:
+        """Takes back the commands of the control step."""
+        self._end = self._start
 
     @property
     def is_known(self) -> bool:
@@ -57,7 +61,9 @@ class Motion:
 
     def aim(self, target: np.ndarray) -> None:
         """Wishes the joints at a target [J] at the end of the control step."""
-        target = self._clipped(target)
+        # An arm beyond its range comes back by its own speed.
+        low, high = np.minimum(self._low, self.position), np.maximum(self._high, self.position)
+        target = np.clip(target, low, high)
         if self._limits is None:
             still = np.zeros(len(target))
             self._end = Setpoint(target, still, still)
@@ -80,5 +86,6 @@ class Motion:
         step = speed * self._duration
         return self._start.position + np.clip(left, -step, step)
 
-    def _clipped(self, angles: np.ndarray) -> np.ndarray:
+    def clipped(self, angles: np.ndarray) -> np.ndarray:
+        """Angles [J] within the joints' ranges."""
         return np.clip(angles, self._low, self._high)

@@ -1,6 +1,7 @@
 """The network of a policy's ONNX file, with what its task remembers of the measurements."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -28,15 +29,7 @@ class OnnxNetwork:
 
     def __init__(self, model: bytes):
         """Loads an ONNX file; any exception means that it is not a policy."""
-        with needed("onnxruntime", "onnxruntime"):
-            import onnxruntime
-        options = onnxruntime.SessionOptions()
-        # The network is too small to share between threads.
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = _LOG_ERRORS_ONLY
-        self._session = onnxruntime.InferenceSession(
-            model, options, providers=["CPUExecutionProvider"]
-        )
+        self._model, self._session = model, _session(model)
         entries = self._session.get_modelmeta().custom_metadata_map
         self.metadata: Metadata = from_entries(entries)
         self._inputs = {i.name: (i.type, i.shape[1:]) for i in self._session.get_inputs()}
@@ -54,6 +47,12 @@ class OnnxNetwork:
         """Names of the quantities that the action depends on."""
         self.reads |= {n.removeprefix(MEASURED) for n in self._inputs if n.startswith(MEASURED)}
         self.reset()
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_session": None}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__ = state | {"_session": _session(state["_model"])}
 
     def reset(self) -> None:
         """Forgets the past."""
@@ -115,3 +114,14 @@ class OnnxNetwork:
         is_fixed = all(type(n) is int and n > 0 for shape in shapes for n in shape)
         if not is_fixed or sum(map(math.prod, shapes)) > _LARGEST_MEMORY:
             raise ValueError("its memory has no fixed size, or is too large")
+
+
+def _session(model: bytes) -> Any:
+    """A session of onnxruntime for an ONNX file."""
+    with needed("onnxruntime", "onnxruntime"):
+        import onnxruntime
+    options = onnxruntime.SessionOptions()
+    # The network is too small to share between threads.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = _LOG_ERRORS_ONLY
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

@@ -1,6 +1,8 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
+import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from bounce_mjx.errors import MissingPackage, UserError
 _MAX_PAUSE = 1.0
 # Measurements beyond it are not of a robot.
 _LARGEST = 1e6
+# Joint angles outside their range, rad, and commands outside theirs, that no world can hold.
+_OUTSIDE = 0.5
 
 
 class DeployedPolicy:
@@ -47,8 +51,11 @@ class DeployedPolicy:
             """Measurements required in every step."""
             # A network that fails or gives no numbers fails here, and not on the robot.
             self.reset()
+            zeros = {name: np.zeros(self._sizes[name]) for name in self.needs}
+            zeros |= {name: c.range[0] for name, c in self.metadata.commands.items()}
+            zeros["joint_angles"] = self.metadata.default_joint_angles
             for _ in range(2):
-                self.step({name: np.zeros(self._sizes[name]) for name in self.needs})
+                self.step({name: zeros[name] for name in self.needs})
         except MissingPackage:
             raise
         # onnxruntime raises exceptions of many types for a damaged file.
@@ -66,12 +73,20 @@ class DeployedPolicy:
         Args:
           targets: servo targets [J] (rad) at which the arm rests; by default, the joint angles of
             the next step.
+
+        Raises:
+          UserError: the targets are not J finite numbers; nothing is forgotten.
         """
+        count = len(self.metadata.joint_names)
+        if targets is not None:
+            targets = _array("the targets", targets, (count,), "rad", _LARGEST)
         self._histories: Histories | None = None
         self._network.reset()
         self._measured: Measurements = {}
-        self._time: float | None = None
-        self._action = np.zeros(len(self.metadata.joint_names))
+        self._first: float | None = None
+        self.step_number = -1
+        """Number of the last step, from 0; -1 before the first one."""
+        self._action = np.zeros(count)
         self._motion.rest(targets)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
@@ -87,20 +102,22 @@ class DeployedPolicy:
             the last one. Of several balls (`metadata.num_balls`), each quantity has one row per
             ball [B, 3], or the rows one after another.
 
-            With `time`, the elapsed time is rounded to control steps. A call less than half a
-            control step after the last one, or before it, is a repetition: it changes nothing and
-            returns the last action. A call several control steps late fills the missed steps with
-            interpolated measurements and the last action.
+            With `time`, a call may come at any rate: the time since the first step is rounded to
+            control steps. A call whose step is not a new one changes nothing and returns the last
+            action. A call several control steps late fills the missed steps with interpolated
+            measurements and the last action.
 
         Returns:
           Action [J], from -1 to 1; `servo_targets` converts it.
 
         Raises:
           UserError: a required measurement is missing; a measurement is unknown, has the wrong
-            shape or is not finite; or the time is more than 1 s from the last. The policy's
-            state does not change. Or the network gives no finite action; then call `reset`.
+            shape, is not finite, or is what no world of the training can hold, mostly in another
+            unit or frame; or the time is more than 1 s from the last. The policy's state does
+            not change. Or the network gives no finite action; then call `reset`.
         """
         measured = self._with_lead(self.checked(measurements))
+        self._refuse_impossible(measured)
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
         if steps == 0:
@@ -120,7 +137,10 @@ class DeployedPolicy:
                     self._network.step(self._histories.values, self._histories.newest)
             self._histories.add(measured, self._action)
         action = self._network.step(self._histories.values, self._histories.newest)
-        self._measured, self._time, self._action = measured, time, action
+        self._measured, self._action = measured, action
+        self.step_number += steps
+        if self._first is None and time is not None:
+            self._first = time - self.step_number * self.metadata.control_dt
         if "joint_angles" in measured:
             self._motion.begin(measured["joint_angles"])
             self._act(action)
@@ -158,13 +178,18 @@ class DeployedPolicy:
         """
         if self.targets is None:
             raise UserError("there are no commands before the first step; call step first")
-        count = rate * self.metadata.control_dt
+        return self._motion.at(np.arange(1, self.commands_per_step(rate) + 1) / rate)
+
+    def commands_per_step(self, rate: float) -> int:
+        """Number of `commands` of a control step at a rate (Hz); UserError as there."""
+        dt = self.metadata.control_dt
+        count = rate * dt if isinstance(rate, Real) else math.nan
         if not (0.999 < count < 10_000.5 and abs(count - round(count)) < 1e-3):
             raise UserError(
-                f"the rate is {rate!r} Hz, but must be a multiple of "
-                f"{1.0 / self.metadata.control_dt:g} Hz, one command for each control step"
+                f"the rate is {rate!r} Hz, but must be a multiple of {1.0 / dt:g} Hz, one command "
+                "for each control step"
             )
-        return self._motion.at(np.arange(1, round(count) + 1) / rate)
+        return round(count)
 
     @property
     def targets(self) -> np.ndarray | None:
@@ -184,6 +209,10 @@ class DeployedPolicy:
         self._begin(joint_angles)
         self._motion.aim(self._motion.position)
 
+    def withdraw(self) -> None:
+        """Takes back the commands of the last step, which were not sent."""
+        self._motion.withdraw()
+
     def move(
         self, target: np.ndarray, speed: float, joint_angles: np.ndarray | None = None
     ) -> None:
@@ -197,8 +226,12 @@ class DeployedPolicy:
 
         Args:
           settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
-            `max_picture_age`, s (0.1); `max_steps_late`, control steps between two steps (2);
-            `max_error`, distance of a joint from its command, rad (0.4); `home_speed`, rad/s (0.3).
+            `max_picture_age`, s (at most 1; by default the file's largest latency and five of its
+            longest camera intervals, at least 0.1); `max_steps_late`, control steps between two
+            steps, and calls in a row without a new step (2); `home_speed`, rad/s (0.3).
+
+        Raises:
+          UserError: the rate is not a multiple of the policy's, or a setting is wrong.
         """
         return Supervisor(self, rate, **settings)
 
@@ -280,15 +313,42 @@ class DeployedPolicy:
 
     def _steps_since(self, time: float | None) -> int:
         """Control steps since the last step, at least 0."""
-        if time is None or self._time is None:
+        if time is None or self._first is None:
             return 1
-        elapsed = time - self._time
+        dt = self.metadata.control_dt
+        elapsed = time - self._first - self.step_number * dt
         if abs(elapsed) > _MAX_PAUSE:
             raise UserError(
                 f"the time {time} s is {elapsed:.3g} s after the last step's; call reset after a "
                 f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
             )
-        return max(0, round(elapsed / self.metadata.control_dt))
+        return max(0, round((time - self._first) / dt) - self.step_number)
+
+    def _refuse_impossible(self, measured: Measurements) -> None:
+        """Raises UserError for a measurement that no world of the training can hold."""
+        far = np.linalg.norm(measured.get("ball_position", np.zeros(3)).reshape(-1, 3), axis=1)
+        if np.max(far) > 2.0 * self.metadata.ball.distance:
+            raise UserError(
+                f"the measurement ball_position is {np.max(far):.3g} m from the robot's base, but "
+                f"no ball of the training farther than {self.metadata.ball.distance:.3g} m; give "
+                "metres in the robot's frame"
+            )
+        for name in self.metadata.commands.keys() & measured.keys():
+            (low, high), unit = self.metadata.commands[name]
+            room, value = max(high - low, _OUTSIDE), float(measured[name][0])
+            if not low - room <= value <= high + room:
+                raise UserError(
+                    f"the command {name} is {value:g}, but the training had {low:g} to {high:g} "
+                    f"({unit or 'no unit'}); give one near this range"
+                )
+        angles = measured.get("joint_angles", np.array(self.metadata.default_joint_angles))
+        outside = np.abs(angles - self._motion.clipped(angles))
+        if np.max(outside) > _OUTSIDE:
+            joint = self.metadata.joint_names[int(np.argmax(outside))]
+            raise UserError(
+                f"the measurement joint_angles has {angles[np.argmax(outside)]:.3g} for {joint}, "
+                f"{np.max(outside):.2g} rad outside its range; give rad, in the policy's order"
+            )
 
 
 def _array(

@@ -1,11 +1,14 @@
 """A supervisor between a policy and an arm."""
 
+import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
+from bounce_mjx.deploy.faults import EARLIER, FASTEST, FLYING, allowed, first_fault, picture_age
 from bounce_mjx.deploy.histories import Measurements
 from bounce_mjx.errors import UserError
 
@@ -14,17 +17,14 @@ if TYPE_CHECKING:
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
 Box = tuple[Sequence[float], Sequence[float]]
+Fault = tuple[str, str] | None
 
-# Of a joint, for a policy without limits: the training ends an episode there, rad/s.
-_FASTEST = 6.283
 _HOME_TOLERANCE = 2e-3
-# Below the paddle, a ball is lost, m.
-_LOST = 0.1
 
 
 class Supervisor:
-    """Gives an arm's commands, and stops the arm when a measurement or a command is wrong;
-    `DeployedPolicy.supervise` creates it.
+    """Gives an arm's commands, and stops the arm when a measurement, the arm or a command breaks a
+    rule (`deploy.faults`); `DeployedPolicy.supervise` creates it.
 
     Call `commands` once each control step, in every state:
 
@@ -32,7 +32,7 @@ class Supervisor:
     - ready: it rests there until `start`;
     - running: it follows the policy, until a fault or `stop`;
     - braking: the commands slow down within the arm's limits, then it is
-    - stopped: it rests, and `reason` says why, until `restart`.
+    - stopped: the commands rest, and `fault` and `reason` say why, until `restart`.
     """
 
     def __init__(
@@ -40,29 +40,38 @@ class Supervisor:
         policy: "DeployedPolicy",
         rate: float,
         box: Box | None = None,
-        max_picture_age: float = 0.1,
+        max_picture_age: float | None = None,
         max_steps_late: float = 2.0,
-        max_error: float = 0.4,
         home_speed: float = 0.3,
     ):
         """See `DeployedPolicy.supervise`."""
+        policy.commands_per_step(rate)
         self._policy, self._rate = policy, rate
+        metadata, limits = policy.metadata, policy.metadata.limits
+        age = picture_age(metadata) if max_picture_age is None else max_picture_age
+        fastest = FASTEST if limits is None else min(limits.velocity)
+        for name, value, most in (
+            ("max_picture_age", age, 1.0),
+            ("max_steps_late", max_steps_late, math.inf),
+            ("home_speed", home_speed, fastest),
+        ):
+            if not (isinstance(value, Real) and 0.0 < value <= most and math.isfinite(value)):
+                limit = "" if most == math.inf else f" and at most {most:g}"
+                raise UserError(f"{name} is {value!r}; give a finite number above 0{limit}")
         self._box = None if box is None else np.array(box, float)
         if self._box is not None and (
-            self._box.shape != (2, 3) or np.any(np.diff(self._box, axis=0) <= 0.0)
+            self._box.shape != (2, 3) or not np.all(np.diff(self._box, axis=0) > 0.0)
         ):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._max_age, self._max_late = max_picture_age, max_steps_late
-        self._max_error, self._home_speed = max_error, home_speed
-        self._chain = Chain(policy.metadata)
-        limits = policy.metadata.limits
-        self._fastest = _FASTEST if limits is None else 1.2 * np.array(limits.velocity)
+        self._allowed = allowed(metadata, age, max_steps_late, self._box)
+        self._home_speed, self._chain = home_speed, Chain(metadata)
         self.state: State = "homing"
+        self.fault: str | None = None
+        """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
+        that the policy refuses, `stopped` after `stop`."""
         self.reason: str | None = None
         """Why the arm has stopped or brakes."""
-        self._time: float | None = None
-        self._picture: np.ndarray | None = None
-        self._pictured = 0.0
+        self._is_new = True
 
     def start(self) -> None:
         """Starts an episode.
@@ -76,111 +85,145 @@ class Supervisor:
                 "after a stop, and commands until the arm is home"
             )
         self._policy.reset(self._policy.targets)
-        self._time = self._picture = None
+        self._time: float | None = None
+        self._clock, self._idle = 0.0, 0
+        self._pictures: list[tuple[np.ndarray, float]] = []
         self.state = "running"
 
-    def stop(self, reason: str) -> None:
+    def stop(self, reason: str, fault: str = "stopped") -> None:
         """Brakes, from any state."""
         if self.state not in ("braking", "stopped"):
-            self.state, self.reason = "braking", reason
+            self.state, self.fault, self.reason = "braking", fault, reason
 
     def restart(self) -> None:
-        """Goes home after a stop, such as a loss of the ball, for the next `start`.
+        """Goes home after a stop, from where the arm then is, for the next `start`.
 
         Raises:
           UserError: the arm has not stopped.
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        self.state, self.reason = "homing", None
+        self.state, self.fault, self.reason, self._is_new = "homing", None, None, True
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad.
 
         Args:
-          measurements: as for `DeployedPolicy.step`. Without `time` no step is late, and without
-            `ball_age` a picture is as old as the time since the ball's position last changed.
+          measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
+            needed, and none while the arm brakes and after. Without `time` no step is late, and
+            without `ball_age` a picture is as old as the time since the ball's position last
+            changed.
 
         Raises:
           UserError: the first joint angles are wrong, so that no command is known.
         """
         policy = self._policy
-        if self.state == "running":
-            fault = self._step(measurements)
-            if fault is None:
-                return policy.commands(self._rate)
-            self.stop(fault)
-        angles = None
-        if policy.targets is None:
-            # Only the first command starts from the measured angles; no camera is needed for it.
-            given = {k: v for k, v in measurements.items() if k == "joint_angles"}
-            angles = policy.checked(given, ("joint_angles",))["joint_angles"]
-        if self.state == "homing":
-            self._go_home(angles)
-        else:
-            policy.hold(angles)
+        if self.state not in ("braking", "stopped"):
+            step = self._follow if self.state == "running" else self._go_home
+            try:
+                fault = step(measurements)
+            except UserError as error:
+                if policy.targets is None:
+                    raise
+                fault = "measurement", str(error)
+            if fault is not None:
+                self.stop(fault[1], fault[0])
+        if self.state in ("braking", "stopped"):
+            policy.hold(self._angles(measurements) if policy.targets is None else None)
             if self.state == "braking" and policy.is_still:
                 self.state = "stopped"
         return policy.commands(self._rate)
 
-    def _step(self, measurements: Mapping[str, Any]) -> str | None:
-        """A step of the policy; what is wrong with it, if anything is."""
-        try:
-            measured = self._policy.checked(measurements)
-            fault = self._fault(measured)
+    def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
+        """The measured joint angles [J], whatever else is measured."""
+        given = {k: v for k, v in measurements.items() if k == "joint_angles"}
+        return self._policy.checked(given, ("joint_angles",))["joint_angles"]
+
+    def _go_home(self, measurements: Mapping[str, Any]) -> Fault:
+        """A step of the way home, and what is wrong with it."""
+        policy, angles = self._policy, self._angles(measurements)
+        home = np.array(policy.metadata.default_joint_angles)
+        if self._is_new:
+            # A small distance is the arm's load, and needs no step of the command.
+            if policy.targets is None or not self._are_near(policy.targets, angles):
+                policy.reset(angles)
+            self._is_new = False
+            _, steps, inputs = self._allowed.pull.shape
+            self._past = np.tile(angles, (round(steps) + 1, 1))
+            self._sent = np.tile(policy.targets, (inputs, 1))
+        fault = first_fault(self._allowed, self._window(angles))
+        if fault is not None:
+            return fault
+        if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
+            policy.move(home, self._home_speed)
+            return None
+        policy.hold()
+        is_home = policy.is_still and self._are_near(angles, home)
+        self.state = "ready" if is_home else "homing"
+        return None
+
+    def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
+        return bool(np.max(np.abs(one - other)) <= self._allowed.offset)
+
+    def _follow(self, measurements: Mapping[str, Any]) -> Fault:
+        """A step of the policy, and what is wrong with it."""
+        policy = self._policy
+        measured = policy.checked(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
+        fault = first_fault(self._allowed, self._facts(measured))
+        if fault is not None:
+            return fault
+        last = policy.step_number
+        policy.step(measurements)
+        self._idle = self._idle + 1 if policy.step_number == last else 0
+        if self._idle:
+            fault = first_fault(self._allowed, {"idle": self._idle})
             if fault is None:
-                self._policy.step(measurements)
-                fault = self._wrong_target()
-        except UserError as error:
-            fault = str(error)
+                policy.hold()
+            return fault
+        fault = first_fault(self._allowed, {"target": self._chain.paddle(policy.targets)[0]})
+        if fault is not None:
+            policy.withdraw()
         return fault
 
-    def _go_home(self, angles: np.ndarray | None) -> None:
-        policy = self._policy
-        home = np.array(policy.metadata.default_joint_angles)
-        at = angles if policy.targets is None else policy.targets
-        if np.abs(at - home).max() > _HOME_TOLERANCE:
-            policy.move(home, self._home_speed, angles)
-            return
-        policy.hold(angles)
-        if policy.is_still:
-            self.state = "ready"
+    def _window(self, angles: np.ndarray) -> dict[str, np.ndarray]:
+        """The last angles and commands, with those of this control step."""
+        self._past = np.concatenate([self._past[1:], angles[None]])
+        self._sent = np.concatenate([self._sent[1:], self._policy.targets[None]])
+        return {"angles": self._past, "commands": self._sent}
 
-    def _fault(self, measured: Measurements) -> str | None:
-        """What is wrong with the measurements of a running episode."""
-        control_dt = self._policy.metadata.control_dt
-        time = float(measured["time"][0]) if "time" in measured else None
-        last, self._time = self._time, time
-        if time is not None and last is not None and time - last > self._max_late * control_dt:
-            return f"a control step came after {1e3 * (time - last):.0f} ms"
+    def _facts(self, measured: Measurements) -> dict[str, Any]:
+        """The facts of a running episode, for the rules."""
+        facts: dict[str, Any] = self._window(measured["joint_angles"])
+        facts["paddle"] = self._chain.paddle(measured["joint_angles"])[0]
+        if "joint_velocities" in measured:
+            facts["velocities"] = measured["joint_velocities"]
+        elapsed, time = self._policy.metadata.control_dt, None
+        if "time" in measured:
+            time = float(measured["time"][0])
+            if self._time is not None:
+                facts["elapsed"] = elapsed = max(time - self._time, 0.0)
+                time = self._time + elapsed
+        self._time = time
+        self._clock += elapsed
+        if "ball_velocity" in measured:
+            facts["ball_velocity"] = measured["ball_velocity"].reshape(-1, 3)
         if "ball_position" in measured:
-            ball = measured["ball_position"]
-            if self._picture is None or np.any(ball != self._picture):
-                self._picture, self._pictured = ball, 0.0
-            else:
-                self._pictured += control_dt if None in (time, last) else time - last
-            age = float(measured["ball_age"][0]) if "ball_age" in measured else self._pictured
-            if age > self._max_age:
-                return f"the picture of the ball is {1e3 * age:.0f} ms old"
-        angles, speeds = measured.get("joint_angles"), measured.get("joint_velocities")
-        if angles is not None:
-            paddle, _ = self._chain.paddle(angles)
-            if "ball_position" in measured:
-                lowest = np.min(measured["ball_position"].reshape(-1, 3)[:, 2])
-                if lowest < paddle[2] - _LOST:
-                    return "the ball is lost"
-            if np.abs(self._policy.targets - angles).max() > self._max_error:
-                return f"a joint is more than {self._max_error:g} rad behind its command"
-        if speeds is not None and np.any(np.abs(speeds) > self._fastest):
-            return f"a joint has {np.abs(speeds).max():.3g} rad/s"
-        return None
+            age = float(measured["ball_age"][0]) if "ball_age" in measured else None
+            facts |= self._picture(measured["ball_position"].reshape(-1, 3), age, facts["paddle"])
+        return facts
 
-    def _wrong_target(self) -> str | None:
-        """What is wrong with the command at the end of the control step."""
-        if self._box is None:
-            return None
-        paddle, _ = self._chain.paddle(self._policy.targets)
-        if np.any(paddle < self._box[0]) or np.any(paddle > self._box[1]):
-            place = ", ".join(f"{x:.3f}" for x in paddle)
-            return f"the command would bring the paddle to ({place}) m, outside the box"
-        return None
+    def _picture(self, ball: np.ndarray, age: float | None, paddle: np.ndarray) -> dict[str, Any]:
+        """The facts of the ball's newest picture [B, 3] and of the one before."""
+        if not self._pictures or np.any(ball != self._pictures[-1][0]):
+            taken = self._clock - (age or 0.0)
+            self._pictures = [*self._pictures[-EARLIER:], (ball, taken)]
+        held = self._clock - self._pictures[-1][1]
+        # A ball in flight that does not move is an old picture, whatever its age is said to be.
+        if age is None or np.max(ball[:, 2]) > paddle[2] + FLYING:
+            age = held if age is None else max(held, age)
+        seen, facts = self._pictures, {"ball": ball, "age": age}
+        if len(seen) > 1:
+            between = max(seen[-1][1] - seen[-2][1], self._policy.metadata.control_dt)
+            facts |= {"last_ball": seen[-2][0], "between": between}
+        none = np.full(ball.shape, np.nan)
+        return facts | {"earlier_ball": seen[0][0] if len(seen) > EARLIER else none}

@@ -10,8 +10,8 @@ import numpy as np
 
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import compile_spec
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
+from bounce_mjx.evaluation.contacts import ContactChecker
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.world.config import WorldConfig
 
 MARGIN = 0.01
@@ -71,10 +71,14 @@ def excite(
     centre = _lifted(model, home)
     room = np.where(limited, np.min(np.abs(ranges - centre[:, None]), axis=1) - 0.02, np.inf)
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
-    contacts = _Contacts(config, table_height)
-    if touching := contacts.at(home):
+    contacts = ContactChecker(config, MARGIN, table_height)
+    # Parts of one arm that overlap or pass each other closely in its start pose are drawn so.
+    near = ContactChecker(config, 2.0 * MARGIN).touching(home)
+    allowed = {pair for pair in near if min(pair) >= 0}
+    if below := sorted(contacts.touching(home) - allowed):
         raise UserError(
-            f"the start pose has {touching}; change default_joint_angles or --table-height"
+            f"the start pose has {_contact(contacts, below[0])}; change default_joint_angles or "
+            "--table-height"
         )
     times = np.arange(round(seconds / config.control_dt)) * config.control_dt
     every = max(round(_CHECKED / config.control_dt), 1)
@@ -91,16 +95,40 @@ def excite(
         targets = home + lift
         moving = np.isin(times, inner)
         targets[moving] += _motion(inner - inner[0], amplitudes, bounds)
-        hit = next((t for t in range(0, len(times), every) if contacts.at(targets[t])), None)
+        poses = (
+            (t, pair)
+            for t in range(0, len(times), every)
+            for pair in sorted(contacts.touching(targets[t]) - allowed)
+        )
+        hit = next(poses, None)
         if hit is None:
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
-        moved = np.abs(targets[hit] - home - lift[hit]) > 1e-3
-        amplitudes = np.where(moved, 0.5 * amplitudes, amplitudes)
-        if not np.any(moved) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
+        step, pair = hit
+        moving = _moving(contacts, pair, targets[step], home + lift[step])
+        amplitudes = np.where(moving, 0.5 * amplitudes, amplitudes)
+        if not np.any(moving) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
+            mover = names[int(np.argmax(moving))] if np.any(moving) else "the lifted arm"
             raise UserError(
-                f"{names[int(np.argmin(amplitudes))]} cannot move around the start pose without "
-                f"{contacts.at(targets[hit])}; change default_joint_angles or --table-height"
+                f"{mover} cannot move around the start pose without {_contact(contacts, pair)}; "
+                "change default_joint_angles or --table-height"
             )
+
+
+def _moving(
+    contacts: ContactChecker, pair: tuple[int, int], pose: np.ndarray, rest: np.ndarray
+) -> np.ndarray:
+    """Which joints [n] bring a pair of parts together in a pose [n]: those without whose motion
+    from the rest [n] it is apart, or all if none is alone."""
+    moved = np.abs(pose - rest) > 1e-3
+    if pair in contacts.touching(rest):
+        return np.zeros_like(moved)
+    trials = np.where(np.eye(len(pose), dtype=bool), rest, pose)
+    alone = moved & [pair not in contacts.touching(trial) for trial in trials]
+    return alone if np.any(alone) else moved
+
+
+def _contact(contacts: ContactChecker, pair: tuple[int, int]) -> str:
+    return "a contact of " + " and ".join(map(contacts.name, pair))
 
 
 def _lifted(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
@@ -209,86 +237,6 @@ def _sweep(
     window = _smooth(np.minimum(t, length - t) / (0.2 * length))
     size = np.minimum(amplitude, 0.7 * bounds.amplitude(joint, rate))
     return size * window * np.sin(phase)
-
-
-class _Contacts:
-    """Contacts of the arm with itself, the floor and a table, by MuJoCo's collision."""
-
-    def __init__(self, config: WorldConfig, table_height: float | None):
-        spec, path = scene_spec(config.mjcf, config.robot)
-        for pair in list(spec.pairs):
-            spec.delete(pair)
-        for geom in spec.geoms:
-            geom.contype = geom.conaffinity = int(geom.type != mujoco.mjtGeom.mjGEOM_PLANE)
-            geom.margin = MARGIN
-        heights = {"floor": 0.0} | ({} if table_height is None else {"table": table_height})
-        for name, height in heights.items():
-            spec.worldbody.add_geom(
-                name=f"bounce_mjx {name}",
-                type=mujoco.mjtGeom.mjGEOM_PLANE,
-                size=[5.0, 5.0, 0.1],
-                pos=[0.0, 0.0, height],
-                contype=1,
-                conaffinity=1,
-                margin=0.0,
-            )
-        self._model = compile_spec(spec, path)
-        self._data = mujoco.MjData(self._model)
-        self._planes = {
-            self._model.geom(f"bounce_mjx {name}").id: f"the {name}" for name in heights
-        }
-        addresses = find_addresses(self._model)
-        self._qpos = list(addresses.arm_qpos)
-        self._ball = addresses.ball_geom
-        self._home: set[tuple[int, int]] = set()
-        # Parts of one arm that overlap in its start pose are drawn so.
-        self._home = {
-            pair
-            for pair in self._pairs(np.array(config.default_joint_angles))
-            if not self._planes.keys() & set(pair)
-        } | self._base_pairs()
-
-    def at(self, joint_angles: np.ndarray) -> str:
-        """The first contact at joint angles [n], in words; empty for none."""
-        for pair in self._pairs(joint_angles):
-            if pair not in self._home and not self._are_neighbours(pair):
-                return "a contact of " + " and ".join(self._name(geom) for geom in pair)
-        return ""
-
-    def _pairs(self, joint_angles: np.ndarray) -> list[tuple[int, int]]:
-        model, data = self._model, self._data
-        data.qpos[:] = model.qpos0
-        data.qpos[self._qpos] = joint_angles
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        pairs = {tuple(sorted(map(int, contact.geom))) for contact in data.contact}
-        return sorted(pair for pair in pairs if self._ball not in pair)
-
-    def _base_pairs(self) -> set[tuple[int, int]]:
-        """Pairs of a plane and a geom that no joint moves, such as the base on the floor."""
-        fixed = [g for g in range(self._model.ngeom) if self._is_fixed(g)]
-        return {tuple(sorted((plane, geom))) for plane in self._planes for geom in fixed}
-
-    def _are_neighbours(self, pair: tuple[int, int]) -> bool:
-        """Whether a joint connects both parts; MuJoCo checks those of a fixed base."""
-        m = self._model
-        bodies = [int(m.body_weldid[m.geom_bodyid[geom]]) for geom in pair]
-        parents = [int(m.body_weldid[m.body_parentid[body]]) for body in bodies]
-        joined = bodies[0] == parents[1] or bodies[1] == parents[0]
-        if not self._planes.keys() & set(pair):
-            return joined
-        # A link that turns about a vertical axis on its base comes no closer to a plane.
-        joint = m.body_jntadr[bodies[0] or bodies[1]]
-        return joined and joint >= 0 and abs(self._data.xaxis[joint][2]) > 0.999
-
-    def _is_fixed(self, geom: int) -> bool:
-        m = self._model
-        return int(m.body_weldid[m.geom_bodyid[geom]]) == 0
-
-    def _name(self, geom: int) -> str:
-        body = self._model.geom_bodyid[geom]
-        return self._planes.get(geom) or self._model.body(body).name or f"body {body}"
 
 
 def to_csv(motion: Excitation) -> str:

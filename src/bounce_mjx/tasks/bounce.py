@@ -163,6 +163,13 @@ class BounceConfig(WorldConfig):
         return super().heights | {"target_height_range": self.target_height_range[0]}
 
     @property
+    def ball_bounds(self) -> tuple[float, float]:
+        """Where an episode ends, and twice the speed of a fall from its greatest height."""
+        top = self.target_height_range[1] + self.max_height_above_target
+        aside = self.max_horizontal_distance
+        return math.hypot(aside, aside, top), 2.0 * math.sqrt(2.0 * 9.81 * top)
+
+    @property
     def commands(self) -> dict[str, Command]:
         """The target height."""
         return {

@@ -301,6 +301,12 @@ class WorldConfig(StrictModel):
         return {"ball_init_pos": self.ball_init_pos[2]}
 
     @property
+    def ball_bounds(self) -> tuple[float, float]:
+        """Largest distance of the ball from the robot's base (m), and its largest measured speed
+        (m/s), before an episode ends."""
+        return 3.0, 20.0
+
+    @property
     def num_substeps(self) -> int:
         """Physics steps in one control step."""
         return round(self.control_dt / self.physics_dt)
