@@ -191,7 +191,7 @@ def of_run(config: TrainConfig) -> tuple:
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         config = in_whole_blocks(config)
-        job = _Job(config, Console(quiet=True), PPOTrainer, Options("train"), None, stack)
+        job = _Job(config, Console(quiet=True), PPOTrainer, Options("train"), stack)
 
         def run_block() -> None:
             blocks.append(job.steps)
