@@ -35,9 +35,8 @@ class Camera:
         if not arrived:
             return {}
         taken, position = arrived[-1]
-        velocity = np.zeros(3)
-        if len(arrived) > 1:
-            velocity = (position - arrived[-2][1]) / (taken - arrived[-2][0])
+        before, last_position = arrived[max(len(arrived) - 2, 0)]
+        velocity = (position - last_position) / max(taken - before, 1e-3)
         return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
 
 
@@ -91,12 +90,11 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--target-height", type=float, nargs="+", default=[0.5], help="m")
     parser.add_argument("--log", help="CSV file for the log, which must not exist")
-    given = parser.parse_args()
+    args = parser.parse_args()
     with exit_on_user_error(), contextlib.ExitStack() as files:
-        robot, recorder = load_policy(given.policy), None
-        if given.log:
+        robot, recorder = load_policy(args.policy), None
+        if args.log:
             joints = robot.metadata.joint_names
-            recorder = files.enter_context(Recorder(given.log, joints, {"target_height": "m"}))
-        seconds, heights = given.seconds, given.target_height
-        for count, lasted in simulate(robot, Camera(), seconds, heights, recorder):
-            print(f"{count} bounces in {lasted:.1f} s of {seconds:g} s")
+            recorder = files.enter_context(Recorder(args.log, joints, {"target_height": "m"}))
+        for count, lasted in simulate(robot, Camera(), args.seconds, args.target_height, recorder):
+            print(f"{count} bounces in {lasted:.1f} s of {args.seconds:g} s")

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
+from bounce_mjx.config import command_line
 from bounce_mjx.env.env import Env, Memory
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
@@ -749,7 +750,7 @@ def test_eval_prints_warnings_and_missing_figures(env, monkeypatch, capsys, tmp_
     report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
     evaluation = PolicyEvaluation(report, "mujoco", ("the solver [CG] stops.",))
     said_first, now = [], 0.0
-    monkeypatch.setattr(eval_command.time, "monotonic", lambda: now)
+    monkeypatch.setattr(command_line.time, "monotonic", lambda: now)
 
     def evaluate(*_, started, progress, **__):
         nonlocal now

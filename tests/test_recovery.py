@@ -204,7 +204,7 @@ def test_a_warm_start_has_a_best_checkpoint_though_it_was_killed_before(
     def save_latest(writer: CheckpointWriter, names, *rest, **named) -> None:
         save(writer, ("latest",), *rest, **named)
         writer.close()
-        raise KeyboardInterrupt
+        raise SystemExit
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit):
         patch.setattr(CheckpointWriter, "save", save_latest)

@@ -526,8 +526,8 @@ def test_a_host_with_a_wrong_flag_ends_the_others(tmp_path: Path):
         assert follower.wait() == leader.wait() == 2
     assert re.fullmatch(r"error: .*--sede.*\n", follower.said)
     assert re.fullmatch(
-        r"error: process 1 \(on .+\) of this training has ended or no longer answers; see its "
-        r"output, then start all processes again\n",
+        r"config: .+\nerror: process 1 \(on .+\) of this training has ended or no longer answers; "
+        r"see its output, then start all processes again\n",
         leader.said,
     )
 
@@ -541,7 +541,7 @@ def test_hosts_with_different_configs_end_with_a_sentence(tmp_path: Path):
         "error: the processes of this training differ in seed, which is 0 in process 0 and 1 in "
         "process 1; start all with the same flags\n"
     )
-    assert leader.said == follower.said == sentence
+    assert leader.said == f"config: configs/cpu.yaml\n{sentence}" and follower.said == sentence
     assert not (tmp_path / "runs").exists()
 
 
