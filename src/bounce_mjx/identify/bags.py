@@ -1,6 +1,6 @@
 """Logs in ROS bags and MCAP files, read by `rosbags` (the extra `identify`)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,13 @@ from bounce_mjx.identify.log import Log, Rows, make_log
 
 # Time by which stamps and arrivals differ, s, beyond which they are of two clocks.
 _TWO_CLOCKS = 1.0
-_BALL = "pictures of the ball"
+# What to do about a bag that cannot be read, by its ending; a folder has none.
+_REMEDIES = {
+    "": "if it has no metadata.yaml, as its recorder was stopped, run ros2 bag reindex {}, or give "
+    "the file in it",
+    ".mcap": "if its recorder was stopped before the end, run mcap recover {}",
+    ".zstd": "unpack it by zstd -d {}",
+}
 
 
 class Topics(NamedTuple):
@@ -26,18 +32,7 @@ class Topics(NamedTuple):
     """geometry_msgs/PointStamped or PoseStamped with the ball's position."""
 
 
-class _Message(NamedTuple):
-    number: int
-    """Place in its topic, from 1."""
-    time: float
-    """The header's stamp, s; 0 without one."""
-    arrival: float
-    """The bag's time, s."""
-    frame: str
-    values: np.ndarray | None
-    """The measurement; None if it holds none."""
-    why: str
-    """Why it holds none."""
+_TYPES = Topics("JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped")
 
 
 def is_bag(path: Path) -> bool:
@@ -51,19 +46,18 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
 
     Raises:
       MissingPackage: rosbags is missing.
-      UserError: the bag cannot be read, lacks a topic, no message of a topic fits, the ball's are
-        in two frames, or as `make_log`.
+      UserError: the bag cannot be read, a topic is missing or of another type, the ball is in two
+        frames, or as `make_log`.
     """
-    found = _messages(path, joint_names, topics)
-    notes: list[str] = []
-    names = ("joint angles", "servo targets", _BALL)
-    angles, targets, balls = (
-        _rows(path, topic, f"{name} of {topic}", found[topic], size, notes)
-        for topic, name, size in zip(
-            topics, names, (len(joint_names), len(joint_names), 3), strict=True
-        )
+    found, num_joints = _messages(path, topics), len(joint_names)
+    angles, targets = (
+        _rows(f"{name} of {topic}", found[topic], num_joints, lambda m: _angles(m, joint_names))
+        for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets))
     )
-    frames = sorted({m.frame for m in found[topics.ball] if m.values is not None})
+    balls = _rows(f"pictures of the ball of {topics.ball}", found[topics.ball], 3, _position)
+    seen = zip(found[topics.ball], balls.faults, strict=True)
+    frames = sorted({message.header.frame_id for (_, message), fault in seen if not fault})
+    notes: list[str] = []
     if len(frames) > 1:
         named = ", ".join(shorten(frame) or "none" for frame in frames)
         raise UserError(
@@ -82,118 +76,87 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     return make_log(str(path), angles, targets, balls, notes)
 
 
-def _messages(path: Path, joint_names: Sequence[str], topics: Topics) -> dict[str, list[_Message]]:
-    """The messages of each topic."""
+def _messages(path: Path, topics: Topics) -> dict[str, list[tuple[float, Any]]]:
+    """The messages of each topic, each with its time of arrival, s."""
     with needed("rosbags", "'bounce_mjx[identify]'"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    found: dict[str, list[_Message]] = {topic: [] for topic in topics}
+    found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in topics}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-            present = {connection.topic for connection in bag.connections}
-            for topic in (topics.joints, topics.targets):
-                if topic not in present:
+            present = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
+            for topic, types in zip(topics, _TYPES, strict=True):
+                if present.get(topic) in types.split(" or "):
+                    continue
+                # An arm may have been recorded alone.
+                if topic in present or topic != topics.ball:
+                    listed = (f"{name} ({kind})" for name, kind in sorted(present.items()))
                     raise UserError(
-                        f"the bag {path} has no topic {topic}; it has "
-                        f"{', '.join(sorted(present)) or 'none'}: name the topics by "
-                        "--topics.joints, --topics.targets and --topics.ball"
+                        f"the bag {path} has no topic {topic} of {types}; it has "
+                        f"{', '.join(listed) or 'none'}: name the topics by --topics.joints, "
+                        "--topics.targets and --topics.ball"
                     )
             wanted = [c for c in bag.connections if c.topic in found]
             for connection, arrival, raw in bag.messages(connections=wanted):
                 message = bag.deserialize(raw, connection.msgtype)
-                of_topic = found[connection.topic]
-                number = len(of_topic) + 1
-                place = f"message {number} of {connection.topic} in {path}"
-                if connection.topic == topics.ball:
-                    values, why = _position(message, place), ""
-                else:
-                    values, why = _joints(message, joint_names)
-                if values is not None and not np.all(np.isfinite(values)):
-                    values, why = None, f"holds {values}"
-                header = getattr(message, "header", None)
-                stamp = getattr(header, "stamp", None)
-                time = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-                frame = getattr(header, "frame_id", "")
-                of_topic.append(_Message(number, time, 1e-9 * arrival, frame, values, why))
+                found[connection.topic].append((1e-9 * arrival, message))
     except UserError:
         raise
     # rosbags raises exceptions of many types for a damaged file.
     except Exception as error:
+        remedy = _REMEDIES.get(
+            path.suffix,
+            "give the folder of a ROS 2 bag, or a file that ends with .mcap, .db3, .bag or .csv",
+        )
         raise UserError(
-            f"the bag {path} cannot be read ({shorten(reason_of(error))}); {_hint(path)}"
+            f"the bag {path} cannot be read ({shorten(reason_of(error))}); {remedy.format(path)}"
         ) from error
     return found
 
 
-def _hint(path: Path) -> str:
-    """What to do about a bag that cannot be read."""
-    files = [*path.glob("*.mcap"), *path.glob("*.db3")] if path.is_dir() else []
-    if files and not (path / "metadata.yaml").exists():
-        return (
-            f"its recorder was stopped before it wrote metadata.yaml: give the file {files[0]}, or "
-            f"write it by ros2 bag reindex {path}"
-        )
-    if path.suffix == ".mcap":
-        return f"if its recorder was stopped before the end, mend it by mcap recover {path}"
-    if path.suffix in (".zstd", ".zst"):
-        return f"unpack it by zstd -d {path}"
-    if path.suffix.lower() in (".mcap", ".db3", ".bag") and path.suffix != path.suffix.lower():
-        return f"rename it to end with {path.suffix.lower()}"
-    return "give the folder of a ROS 2 bag, an .mcap, .db3 or .bag file, or a CSV file"
-
-
 def _rows(
-    path: Path, topic: str, name: str, messages: Sequence[_Message], size: int, notes: list[str]
+    name: str,
+    messages: Sequence[tuple[float, Any]],
+    size: int,
+    measured: Callable[[Any], tuple[Any, str]],
 ) -> Rows:
-    """The messages with a measurement; the others are counted in `notes`."""
-    if stamped := bool(messages) and np.median([m.time for m in messages]) > 0.0:
-        # Drivers that start before the clock, of a simulation say, stamp 0.
-        messages = [
-            m if m.time else m._replace(values=None, why="has no time stamp") for m in messages
-        ]
-    good = [m for m in messages if m.values is not None]
-    if len(good) < len(messages):
-        first = next(m for m in messages if m.values is None)
-        said = f"message {first.number} of {topic} in {path} {first.why}"
-        # An arm may have been recorded alone, with a tracker that saw no ball.
-        if not good and not name.startswith(_BALL):
-            raise UserError(said)
-        notes.append(
-            f"{len(messages) - len(good)} of the {len(messages)} {name} do not count: {said}"
-        )
-    numbers, stamps, arrivals = (np.array([m[i] for m in good]) for i in range(3))
-    times = stamps if stamped else arrivals
-    values = np.array([m.values for m in good], float).reshape(-1, size)
-    return Rows(name, "message {}", numbers, times, arrivals, values)
+    """The measurements [size] of a topic, or why a message holds none."""
+    arrivals, times = np.array([arrival for arrival, _ in messages]), np.zeros(len(messages))
+    values, faults = np.full((len(messages), size), np.nan), []
+    for i, (_, message) in enumerate(messages):
+        if hasattr(message, "header"):
+            times[i] = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        given, fault = measured(message)
+        if not fault:
+            values[i] = given
+            fault = "" if np.all(np.isfinite(values[i])) else f"holds {values[i]}"
+        faults.append(fault)
+    # Drivers that start before the clock, of a simulation say, stamp 0.
+    if np.any(times) and np.median(times) > 0.0:
+        why = np.where(times == 0.0, "has no time stamp", faults)
+    else:
+        times, why = arrivals, np.array(faults, str)
+    return Rows(name, "message {}", 1 + np.arange(len(why)), times, arrivals, values, why)
 
 
-def _joints(message: Any, joint_names: Sequence[str]) -> tuple[np.ndarray | None, str]:
-    """Angles [n] in the robot's order, or why there are none."""
-    if hasattr(message, "position"):
-        given = dict(zip(message.name, message.position, strict=False))
-        missing = [joint for joint in joint_names if joint not in given]
-        if not missing:
-            return np.array([given[joint] for joint in joint_names], float), ""
-        return None, (
-            f"has positions of the joints {', '.join(map(shorten, list(given)[:20])) or 'none'}, "
-            f"and {missing[0]} is missing; give a message with all joints, the log's robot with "
-            "--robot, or the driver's names with --joint-names"
-        )
-    if hasattr(message, "data") and np.size(message.data) == len(joint_names):
-        return np.array(message.data, float), ""
+def _angles(message: Any, joint_names: Sequence[str]) -> tuple[Any, str]:
+    """Angles in the robot's order, or why there are none."""
+    if hasattr(message, "data"):
+        wrong = len(message.data) != len(joint_names)
+        fault = f"has {len(message.data)} numbers for {len(joint_names)} joints" if wrong else ""
+        return message.data, fault
+    given = dict(zip(message.name, message.position, strict=False))
+    missing = [joint for joint in joint_names if joint not in given]
+    if not missing:
+        return [given[joint] for joint in joint_names], ""
     return None, (
-        f"is neither a JointState nor an array of {len(joint_names)} numbers; name another topic"
+        f"has positions of the joints {', '.join(map(shorten, list(given)[:20])) or 'none'}, "
+        f"and {missing[0]} is missing; give a message with all joints, the log's robot with "
+        "--robot, or the driver's names with --joint-names"
     )
 
 
-def _position(message: Any, place: str) -> np.ndarray:
-    """Position [3]; NaN, as trackers publish it, if the ball was not seen."""
-    point = getattr(message, "point", None)
-    if point is None:
-        point = getattr(getattr(message, "pose", None), "position", None)
-    if point is None:
-        raise UserError(
-            f"{place} is neither a PointStamped nor a PoseStamped; name another topic by "
-            "--topics.ball"
-        )
-    return np.array([point.x, point.y, point.z], float)
+def _position(message: Any) -> tuple[Any, str]:
+    """Position of the ball; NaN, as trackers publish it, if it was not seen."""
+    point = message.point if hasattr(message, "point") else message.pose.position
+    return [point.x, point.y, point.z], ""

@@ -4,7 +4,7 @@ import bisect
 import csv
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ MAX_BYTES = 256 * 2**20
 
 UNITS = {
     "rad": {"rad": 1.0, "deg": np.pi / 180.0},
-    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0},
     "m": {"m": 1.0, "mm": 1e-3},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }
@@ -29,9 +28,9 @@ _LARGEST_ANGLE = 4.0 * np.pi
 _FARTHEST_BALL = 20.0
 _LONGEST_STEP = 0.2
 _MIN_ROWS = 100
-# Largest share of a measurement's rows whose times may be wrong, and time from the log's middle
-# beyond which one is, s.
-_WRONG_TIMES = 0.05
+# Share of a measurement's rows from which their times, or balls far away, are no slips; and time
+# from the log's middle beyond which one is wrong, s.
+_WRONG_ROWS = 0.05
 _FAR_IN_TIME = 3600.0
 # Acceleration of a joint, rad/s^2, beyond which an angle is wrong, and the smallest such error that
 # matters, rad.
@@ -92,58 +91,79 @@ class Rows(NamedTuple):
     """When each arrived [R], s."""
     values: np.ndarray
     """[R, k]."""
+    faults: np.ndarray
+    """Why each holds no measurement [R]; empty if it holds one."""
 
     def some(self, kept: np.ndarray) -> "Rows":
         """The rows of a mask [R], or at indices."""
         return Rows(*self[:2], *(array[kept] for array in self[2:]))
 
-    def at(self, row: int) -> str:
-        """Place of a row, for messages."""
-        return self.place.format(self.numbers[row])
-
 
 def make_log(
     source: str, angles: Rows, targets: Rows, balls: Rows, notes: Sequence[str] = ()
 ) -> Log:
-    """The log of three measurements, without the rows that repeat others or have wrong times.
+    """The log of three measurements, without the rows that are faulty, repeat others or have wrong
+    times, which its notes count.
 
     Raises:
-      UserError: more than a twentieth of the times are wrong, or angles and targets have two
-        clocks.
+      UserError: no joint angle or target is left, or a twentieth of the times or of the balls
+        cannot be.
     """
     said = list(notes)
-    angles, targets = (_in_order(source, rows, said) for rows in (angles, targets))
-    angles = _without(source, angles, _spikes(angles), "is a jump there and back", said)
-    for one, other in ((angles, targets), (targets, angles)):
-        if len(one.times) and len(other.times) and one.times[0] > other.times[-1]:
-            raise UserError(
-                f"the {one.name} in {source} begin at {one.times[0]:.6g} s and the {other.name} "
-                f"end at {other.times[-1]:.6g} s: they have two clocks, such as simulated time and "
-                "that of the computer; give both time stamps of one clock"
-            )
-    pictures = _new_pictures(source, balls, said)
+    in_order = balls.some(np.argsort(balls.times, kind="stable"))
+    angles, targets, balls = (
+        _without(source, rows, rules, said)
+        for rows, rules in (
+            (angles, _RULES_OF_ANGLES),
+            (targets, _RULES_OF_TARGETS),
+            (in_order, _RULES_OF_PICTURES),
+        )
+    )
     return Log(
         source, angles.times, angles.values, targets.times, targets.values,
-        pictures.times, pictures.values, pictures.arrivals, tuple(said),
+        balls.times, balls.values, balls.arrivals, tuple(said),
     )  # fmt: skip
 
 
-def _in_order(source: str, rows: Rows, said: list[str]) -> Rows:
-    """The rows with increasing times; the others are counted in `said`."""
-    if len(rows.times) < 2:
-        return rows
-    same = (np.diff(rows.times) == 0.0) & np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)
-    rows = _without(source, rows, np.append(False, same), "repeats the one before", said)
-    near = np.abs(rows.times - np.median(rows.times)) < _FAR_IN_TIME
-    kept = near.copy()
-    kept[near] = _longest_increase(rows.times[near])
-    wrong = int(np.sum(~kept))
-    if wrong > max(_WRONG_TIMES * len(kept), 1.0):
-        raise UserError(
-            f"{wrong} of the {len(kept)} times of the {rows.name} in {source} do not increase, "
-            f"that of {rows.at(int(np.argmin(kept)))} first; give each its own time, of one clock"
+class _Rule(NamedTuple):
+    """What leaves out rows of a measurement."""
+
+    found: Callable[[Rows], np.ndarray]
+    """Which rows [R] it leaves out."""
+    why: str = ""
+    """What is wrong with them; by default, their fault."""
+    refused: float = np.inf
+    """Share of the rows from which the log is refused, if there are two."""
+    remedy: str = ""
+    """What to do then."""
+
+
+def _without(source: str, rows: Rows, rules: Sequence[_Rule], said: list[str]) -> Rows:
+    """The rows that no rule leaves out; the others are counted in `said`."""
+    for rule in rules:
+        wrong = rule.found(rows)
+        if not np.any(wrong):
+            continue
+        first, count = int(np.argmax(wrong)), int(np.sum(wrong))
+        sentence = (
+            f"{count} of the {len(wrong)} {rows.name} in {source} do not count: "
+            f"{rows.place.format(rows.numbers[first])} {rule.why or rows.faults[first]}"
         )
-    return _without(source, rows, ~kept, "has a time out of order", said)
+        if count >= max(rule.refused * len(wrong), 2.0):
+            raise UserError(sentence + rule.remedy)
+        said.append(sentence)
+        rows = rows.some(~wrong)
+    return rows
+
+
+def _repeated(rows: np.ndarray) -> np.ndarray:
+    """Which rows [R] of [R, k] are equal to the one before."""
+    return np.all(np.diff(rows, axis=0, prepend=np.nan) == 0.0, axis=1)
+
+
+def _far_in_time(rows: Rows) -> np.ndarray:
+    middle = np.median(rows.times) if len(rows.times) else 0.0
+    return np.abs(rows.times - middle) > _FAR_IN_TIME
 
 
 def _spikes(rows: Rows) -> np.ndarray:
@@ -162,46 +182,50 @@ def _spikes(rows: Rows) -> np.ndarray:
     return found
 
 
-def _new_pictures(source: str, rows: Rows, said: list[str]) -> Rows:
-    """The pictures in the order of their stamps, without those that repeat one: trackers, and logs
-    of control steps, hold the last picture until the next. The others are counted in `said`."""
-    if len(rows.times) < 2:
-        return rows
-    same = np.append(False, np.all(np.diff(rows.values, axis=0) == 0.0, axis=1))
-    rows = _without(source, rows, same, "repeats the one before", said)
-    far = np.abs(rows.times - np.median(rows.times)) > _FAR_IN_TIME
-    rows = _without(source, rows, far, "has a time far from the others", said)
-    far = np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1)
-    far &= np.mean(far) < _WRONG_TIMES
-    rows = _without(source, rows, far, f"is farther away than {_FARTHEST_BALL:g} m", said)
-    rows = rows.some(np.argsort(rows.times, kind="stable"))
-    same = np.diff(rows.times, prepend=-np.inf) < _SAME_PICTURE
-    return _without(source, rows, same, "has the time stamp of another", said)
-
-
-def _without(source: str, rows: Rows, dropped: np.ndarray, why: str, said: list[str]) -> Rows:
-    """The rows that are not dropped; the others are counted in `said`."""
-    if np.any(dropped):
-        said.append(
-            f"{int(np.sum(dropped))} of the {len(dropped)} {rows.name} in {source} do not count: "
-            f"{rows.at(int(np.argmax(dropped)))} {why}"
-        )
-    return rows.some(~dropped)
-
-
-def _longest_increase(values: np.ndarray) -> np.ndarray:
-    """Which values [T] are of the longest increasing part of a sequence (patience sorting)."""
+def _out_of_order(rows: Rows) -> np.ndarray:
+    """Which rows [R] are not of the longest part with increasing times (patience sorting)."""
     ends: list[float] = []
     last: list[int] = []
-    before = np.full(len(values), -1)
-    for i, value in enumerate(values.tolist()):
-        k = bisect.bisect_left(ends, value)
-        ends[k : k + 1], last[k : k + 1] = [value], [i]
+    before = np.full(len(rows.times), -1)
+    for i, time in enumerate(rows.times.tolist()):
+        k = bisect.bisect_left(ends, time)
+        ends[k : k + 1], last[k : k + 1] = [time], [i]
         before[i] = last[k - 1] if k else -1
-    kept, i = np.zeros(len(values), bool), last[-1] if last else -1
+    found, i = np.ones(len(rows.times), bool), last[-1] if last else -1
     while i >= 0:
-        kept[i], i = True, before[i]
-    return kept
+        found[i], i = False, before[i]
+    return found
+
+
+_ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
+_FAR = _Rule(_far_in_time, "has a time far from the others", *_ONE_CLOCK)
+_RULES_OF_TARGETS = (
+    _Rule(lambda rows: rows.faults != "", refused=1.0),
+    _Rule(
+        lambda rows: _repeated(np.column_stack([rows.times, rows.values])),
+        "repeats the one before",
+    ),
+    _FAR,
+    _Rule(_out_of_order, "has a time out of order", *_ONE_CLOCK),
+)
+_RULES_OF_ANGLES = (*_RULES_OF_TARGETS, _Rule(_spikes, "is a jump there and back"))
+_RULES_OF_PICTURES = (
+    # An arm may have been recorded alone, with a tracker that saw no ball.
+    _Rule(lambda rows: rows.faults != ""),
+    # Trackers, and logs of control steps, hold the last picture until the next.
+    _Rule(lambda rows: _repeated(rows.values), "repeats the one before"),
+    _FAR,
+    _Rule(
+        lambda rows: np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1),
+        f"is farther away than {_FARTHEST_BALL:g} m",
+        _WRONG_ROWS,
+        "; if these are millimetres, write ball_position.x [mm]",
+    ),
+    _Rule(
+        lambda rows: np.diff(rows.times, prepend=-np.inf) < _SAME_PICTURE,
+        "has the time stamp of another",
+    ),
+)
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
@@ -212,46 +236,49 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
       joint_names: the robot's joints, in the order of the result.
 
     Raises:
-      UserError: the file cannot be read, a column is missing or states an unknown unit, a cell is
-        no number, a measurement is never whole, or as `make_log`.
+      UserError: the file cannot be read, a column is missing or states an unknown unit, or as
+        `make_log`.
     """
-    header, rows, lines = _cells(path)
+    header, lines, rows = _cells(path)
     found = _columns(path, header)
 
     def column(name: str, unit: str) -> np.ndarray:
         if name not in found:
-            raise UserError(_missing(path, name, unit, list(found), joint_names))
+            raise UserError(
+                f"{path} has no column {name} [{unit}]; its columns are "
+                f"{', '.join(map(shorten, list(found)[:30]))}; if the joints have other names, "
+                "give the log's robot with --robot, or the names in this order with --joint-names"
+            )
         index, given = found[name]
         if given not in UNITS[unit]:
             raise UserError(
                 f"{path} has the column {shorten(header[index])}, whose unit must be one of "
                 f"{', '.join(UNITS[unit])}; write {name} [{unit}]"
             )
-        values = _numbers(path, header[index], index, rows, lines)
-        return values * UNITS[unit][given]
+        return np.array([_number(row[index]) for row in rows]) * UNITS[unit][given]
 
     times = column("time", "s")
-    numbers, notes = np.array(lines), []
 
-    def group(what: str, names: Sequence[str], unit: str, stamps: np.ndarray | None) -> Rows:
+    def group(what: str, names: Sequence[str], unit: str, stamp: str = "time") -> Rows:
+        """The rows with any cell of a measurement; those that lack another are faulty."""
         values = np.stack([column(name, unit) for name in names], axis=1)
-        stamp = times if stamps is None else stamps
-        of_rows = Rows(what, "row {}", numbers, stamp, times, values)
-        titles = [*names, "time", "ball_time"]
-        return _whole(path, of_rows, titles, notes)
+        stamps = column(stamp, "s")
+        empty = np.isnan(np.column_stack([values, times, stamps]))
+        why = np.array([f"has no number in the column {x}" for x in (*names, "time", stamp)])
+        faults = np.where(np.any(empty, axis=1), why[np.argmax(empty, axis=1)], "")
+        measured = ~np.all(np.isnan(values), axis=1)
+        return Rows(what, "row {}", lines, stamps, times, values, faults).some(measured)
 
     angles, targets = (
-        group(what, [f"{name}.{joint}" for joint in joint_names], "rad", None)
-        for what, name in (("joint angles", "joint_angles"), ("servo targets", "servo_targets"))
+        group(what, [f"{what.replace(' ', '_')}.{joint}" for joint in joint_names], "rad")
+        for what in ("joint angles", "servo targets")
     )
-    ball = [f"ball_position.{axis}" for axis in "xyz"]
+    what, ball = "pictures of the ball", [f"ball_position.{axis}" for axis in "xyz"]
     if any(name in found for name in (*ball, "ball_time")):
-        stamps = column("ball_time", "s") if "ball_time" in found else None
-        balls = group("pictures of the ball", ball, "m", stamps)
+        balls = group(what, ball, "m", "ball_time" if "ball_time" in found else "time")
     else:
-        nothing = np.zeros(0)
-        balls = Rows("pictures of the ball", "row {}", *3 * [nothing], np.zeros((0, 3)))
-    return make_log(str(path), angles, targets, balls, notes)
+        balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)), np.zeros(0, str))
+    return make_log(str(path), angles, targets, balls)
 
 
 def clock_drift(log: Log) -> tuple[float, float]:
@@ -330,28 +357,39 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
       Warnings, a sentence each.
 
     Raises:
-      UserError: it is too short, its times are not seconds, a joint is far outside its range, or
-        the ball is far away.
+      UserError: it is too short, its times are not seconds or of two clocks, or a joint is far
+        outside its range.
     """
-    if len(log.times) < _MIN_ROWS or len(log.target_times) < _MIN_ROWS:
-        raise UserError(
-            f"{log.source} has {len(log.times)} rows with joint angles and "
-            f"{len(log.target_times)} with servo targets; record at least {_MIN_ROWS} of each"
-        )
-    for name, times in (("joint angles", log.times), ("servo targets", log.target_times)):
+    limited = joint_ranges[:, :1] < joint_ranges[:, 1:]
+    ends = [-_BEYOND_RANGE, _BEYOND_RANGE], [-_LARGEST_ANGLE, _LARGEST_ANGLE]
+    low, high = np.where(limited, joint_ranges + ends[0], ends[1]).T
+    for name, times, values in (
+        ("joint angles", log.times, log.joint_angles),
+        ("servo targets", log.target_times, log.servo_targets),
+    ):
+        if len(times) < _MIN_ROWS:
+            raise UserError(
+                f"{log.source} has {len(times)} {name}; record at least {_MIN_ROWS} control steps"
+            )
         if (typical := float(np.median(np.diff(times)))) > _LONGEST_STEP:
             raise UserError(
                 f"the {name} in {log.source} are {typical:.3g} s apart, and at most "
                 f"{_LONGEST_STEP:g} s is expected; if the times are milliseconds, write time [ms]"
             )
-    for name, values in (("joint_angles", log.joint_angles), ("servo_targets", log.servo_targets)):
-        _check_ranges(log, name, values, joint_names, joint_ranges)
-    far = np.any(np.abs(log.ball_positions) > _FARTHEST_BALL, axis=1)
-    if np.any(far):
-        i = int(np.argmax(far))
+        if np.any(outside := (values < low) | (values > high)):
+            row, joint = np.argwhere(outside)[0]
+            column = f"{name.replace(' ', '_')}.{joint_names[joint]}"
+            raise UserError(
+                f"{column} in {log.source} is {values[row, joint]:.4g} rad at the time "
+                f"{times[row]:.6g} s, and {low[joint]:.3g} to {high[joint]:.3g} rad is expected; "
+                f"if these are degrees, write {column} [deg]"
+            )
+    begins, ends = (log.times[0], log.target_times[0]), (log.times[-1], log.target_times[-1])
+    if max(begins) > min(ends):
         raise UserError(
-            f"the ball in {log.source} is at {log.ball_positions[i]} m at the time "
-            f"{log.picture_times[i]:.6g} s; if these are millimetres, write ball_position.x [mm]"
+            f"the joint angles in {log.source} begin at {begins[0]:.6g} s and end at {ends[0]:.6g} "
+            f"s, and the servo targets at {begins[1]:.6g} and {ends[1]:.6g} s: they have two "
+            "clocks, such as simulated time and that of the computer; give stamps of one clock"
         )
     unseen = log.times[-1] - log.arrivals[-1] if len(log.arrivals) else 0.0
     return [f"{log.source} shows no ball in its last {unseen:.1f} s"] if unseen > 2.0 else []
@@ -374,26 +412,8 @@ def unshown(log: Log, joint_names: Sequence[str]) -> list[str]:
     return said
 
 
-def _check_ranges(
-    log: Log, name: str, values: np.ndarray, joint_names: Sequence[str], ranges: np.ndarray
-) -> None:
-    limited = ranges[:, 0] < ranges[:, 1]
-    low = np.where(limited, ranges[:, 0] - _BEYOND_RANGE, -_LARGEST_ANGLE)
-    high = np.where(limited, ranges[:, 1] + _BEYOND_RANGE, _LARGEST_ANGLE)
-    outside = (values < low) | (values > high)
-    if not np.any(outside):
-        return
-    row, joint = (int(i[0]) for i in np.nonzero(outside))
-    times = log.times if name == "joint_angles" else log.target_times
-    raise UserError(
-        f"{name}.{joint_names[joint]} in {log.source} is {values[row, joint]:.4g} rad at the time "
-        f"{times[row]:.6g} s, and {low[joint]:.3g} to {high[joint]:.3g} rad is expected; if these "
-        f"are degrees, write {name}.{joint_names[joint]} [deg]"
-    )
-
-
-def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Header, cells, and line number of each row of a CSV file."""
+def _cells(path: Path) -> tuple[list[str], np.ndarray, Sequence[list[str]]]:
+    """Header, and line number [R] and cells of each row, of a CSV file."""
     try:
         if not os.path.isfile(path):
             raise UserError(f"the log {path} is not a file; give a CSV file or a ROS bag")
@@ -408,24 +428,31 @@ def _cells(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
             file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
             header = [name.strip() for name in next(reader, [])]
-            rows, lines = [], []
-            for row in reader:
-                if not any(row):
-                    continue
-                if len(row) != len(header):
-                    raise UserError(
-                        f"{path} has {len(row)} cells in row {reader.line_num}, and its header "
-                        f"has {len(header)}; give each row a cell for each column"
-                    )
-                rows.append(row if delimiter == "," else [c.replace(",", ".") for c in row])
-                lines.append(reader.line_num)
+            numbered = [(reader.line_num, row) for row in reader if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in UTF-8"
         ) from error
-    if not rows:
+    if not numbered:
         raise UserError(f"the log {path} is empty; record with bounce_mjx's Recorder")
-    return header, rows, lines
+    for line, row in numbered:
+        if len(row) != len(header):
+            raise UserError(
+                f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
+                "give each row a cell for each column"
+            )
+        if delimiter != ",":
+            row[:] = [cell.replace(",", ".") for cell in row]
+    lines, rows = zip(*numbered, strict=True)
+    return header, np.array(lines), rows
+
+
+def _number(text: str) -> float:
+    """A cell's number; NaN if it holds none, or one that is not finite."""
+    try:
+        return float(text) if np.isfinite(float(text)) else np.nan
+    except ValueError:
+        return np.nan
 
 
 def _columns(path: Path, header: Sequence[str]) -> dict[str, tuple[int, str]]:
@@ -438,57 +465,3 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, tuple[int, str]]:
             raise UserError(f"{path} has two columns {shorten(name)}; leave one")
         found[name] = i, (unit or "").strip()
     return found
-
-
-def _missing(
-    path: Path, name: str, unit: str, found: Sequence[str], joint_names: Sequence[str]
-) -> str:
-    present = [c.partition(".")[2] for c in found if c.startswith("joint_angles.")]
-    others = [joint for joint in present if joint not in joint_names]
-    if others:
-        return (
-            f"{path} is of a robot with the joints {', '.join(map(shorten, present[:20]))}, and "
-            f"this one has {', '.join(joint_names)}; give the log's robot with --robot, or the "
-            "log's names in this order with --joint-names"
-        )
-    known = ", ".join(map(shorten, found[:30])) or "nothing"
-    return f"{path} has no column {name} [{unit}]; its columns are {known}"
-
-
-def _numbers(
-    path: Path, title: str, index: int, rows: Sequence[Sequence[str]], lines: Sequence[int]
-) -> np.ndarray:
-    """Numbers of a column [R]; NaN for an empty cell, or one that says so."""
-    values = np.full(len(rows), np.nan)
-    for i, row in enumerate(rows):
-        text = row[index].strip()
-        if not text:
-            continue
-        try:
-            values[i] = float(text)
-        except ValueError:
-            values[i] = np.inf
-        if np.isinf(values[i]):
-            raise UserError(
-                f"{path} has {shorten(repr(text))} in the column {shorten(title)}, row {lines[i]}; "
-                "give a finite number, or leave the cells of the measurement empty"
-            )
-    return values
-
-
-def _whole(path: Path, rows: Rows, titles: Sequence[str], notes: list[str]) -> Rows:
-    """The rows that hold the measurement; those that hold a part of it are counted in `notes`.
-
-    Args:
-      titles: names of the columns, then those of the row's time and of the measurement's.
-    """
-    rows = rows.some(~np.all(np.isnan(rows.values), axis=1))
-    empty = np.isnan(np.column_stack([rows.values, rows.arrivals, rows.times]))
-    partly = np.any(empty, axis=1)
-    if not np.any(partly):
-        return rows
-    i = int(np.argmax(partly))
-    why = f"has no number in the column {titles[int(np.argmax(empty[i]))]}"
-    if np.all(partly):
-        raise UserError(f"{path} {why}, {rows.at(i)}; fill all cells of a measurement, or none")
-    return _without(str(path), rows, partly, why, notes)

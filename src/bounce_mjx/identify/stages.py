@@ -63,16 +63,10 @@ class Identified(NamedTuple):
 def joined(logs: Sequence[Log]) -> Log:
     """Several logs, one after another; no window spans two of them."""
     parts, start = [], 0.0
+    of_time = "times", "target_times", "picture_times", "arrivals"
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])
-        parts.append(
-            log._replace(
-                times=log.times + shift,
-                target_times=log.target_times + shift,
-                picture_times=log.picture_times + shift,
-                arrivals=log.arrivals + shift,
-            )
-        )
+        parts.append(log._replace(**{name: getattr(log, name) + shift for name in of_time}))
         start = float(max(parts[-1].times[-1], parts[-1].target_times[-1])) + 1.0
     source = ", ".join(log.source for log in logs)
     arrays = zip(*(part[1:-1] for part in parts), strict=True)
