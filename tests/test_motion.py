@@ -147,7 +147,6 @@ FAULTS = {
     "ball_speed": ({"ball_velocity": [0.0, 0.0, -2000.0]}, "the ball has 2e+03 m/s"),
     "ball_speed by position": ({"ball_position": [0.589, 0.5, 0.45]}, "the ball has 50 m/s"),
     "joint_speed": ({"joint_velocities": [9.0] * 6}, "a joint has 9 rad/s"),
-    "joint_jump": ({"joint_angles": HOME + 1.0}, "jumped by 1"),
 }
 
 

@@ -45,8 +45,6 @@ class Allowed(NamedTuple):
     """Error of the distance between two pictures, m."""
     speed: np.ndarray
     """Speed of each joint [J], rad/s."""
-    jump: np.ndarray
-    """Change of each angle [J] from one control step to the next, rad."""
     box: np.ndarray
     """Lowest and highest position of the paddle [2, 3], m."""
     still: float
@@ -80,8 +78,7 @@ def picture_age(metadata: Metadata) -> float:
 def allowed(metadata: Metadata, age: float, steps_late: float, box: Any = None) -> Allowed:
     """The bounds of a policy's worlds, with the settings of a supervisor."""
     limits, dt = metadata.limits, metadata.control_dt
-    noise = _LARGEST_NOISE * largest(metadata, "joint_angle_noise")
-    still = _STILL + 0.8 * noise
+    still = _STILL + 0.8 * _LARGEST_NOISE * largest(metadata, "joint_angle_noise")
     count = len(metadata.joint_names)
     speed = np.full(count, FASTEST) if limits is None else 1.2 * np.array(limits.velocity)
     return Allowed(
@@ -91,7 +88,6 @@ def allowed(metadata: Metadata, age: float, steps_late: float, box: Any = None) 
         ball=metadata.ball,
         ball_noise=1.5 * _LARGEST_NOISE * largest(metadata, "ball_position_noise"),
         speed=speed,
-        jump=2.0 * speed * dt + noise,
         box=np.array([[-np.inf], [np.inf]]) if box is None else box,
         still=still,
         asked=max(STUCK_SHARE * metadata.action_scale, 0.6 * still),
@@ -159,11 +155,6 @@ def _fast(a: Allowed, velocities: Any) -> tuple[Any, Any]:
     return np.any(np.abs(velocities) > a.speed, axis=-1), np.max(np.abs(velocities), axis=-1)
 
 
-def _jump(a: Allowed, angles: Any) -> tuple[Any, Any]:
-    change = np.abs(angles[..., -1, :] - angles[..., -2, :])
-    return np.any(change > a.jump, axis=-1), np.max(change, axis=-1)
-
-
 def _stuck(a: Allowed, angles: Any, commands: Any) -> tuple[Any, Any]:
     """Whether a joint rests that no arm of the training would have rested, whatever its offset."""
     still = np.ptp(angles, axis=-2) < a.still
@@ -205,7 +196,6 @@ RULES = (
     Rule("ball_speed", "ball_velocity", _velocity, "the ball has {:.3g} m/s"),
     Rule("ball_speed", "ball last_ball between", _moved, "the ball has {:.3g} m/s"),
     Rule("joint_speed", "velocities", _fast, "a joint has {:.3g} rad/s"),
-    Rule("joint_jump", "angles", _jump, "a joint's angle has jumped by {:.3g} rad"),
     Rule("joint_stuck", "angles commands", _stuck, "a joint is stuck {:.3g} rad from its command"),
     Rule("box", "target", _outside, "the paddle's command is {:.3g} m outside the box"),
 )
