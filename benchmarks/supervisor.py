@@ -97,7 +97,6 @@ def windows(values: np.ndarray, steps: int) -> np.ndarray:
 def facts(metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray]) -> dict[str, Any]:
     """The facts of each step [T] for the rules, as the supervisor finds them."""
     angles, ball, age = episode["angles"], episode["ball"], episode["age"]
-    _, steps, inputs = bounds.pull.shape
     sent = np.concatenate([angles[:1], episode["commands"][:-1]])
     paddle, _ = Chain(metadata).paddle(angles)
     times = np.arange(len(angles)) * metadata.control_dt
@@ -110,8 +109,8 @@ def facts(metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray]) -
     balls = [np.where(i[:, None, None] < 0, np.nan, ball[i]) for i in (before, earlier)]
     between = np.maximum(taken - taken[before], metadata.control_dt)
     return {
-        "angles": windows(angles, steps + 1),
-        "commands": windows(sent, inputs),
+        "angles": windows(angles, bounds.window + 1),
+        "commands": windows(sent, bounds.window + 1),
         "velocities": episode["velocities"],
         "paddle": paddle,
         "ball": ball,

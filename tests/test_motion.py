@@ -357,10 +357,9 @@ def test_an_arm_is_home_when_its_angles_are() -> None:
 def test_the_table_judges_recorded_steps_as_single_ones() -> None:
     metadata, rng = load_policy("ur5e").metadata, np.random.default_rng(0)
     bounds = allowed(metadata, 0.1, 2.0, np.array([[-1.0] * 3, [1.0] * 3]))
-    _, steps, inputs = bounds.pull.shape
-    size = (2, 40)
+    size, steps = (2, 40), bounds.window + 1
     # Some joints rest, though they are asked to move.
-    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps + 1, 6)), axis=-2)
+    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps, 6)), axis=-2)
     angles = HOME + moves * rng.choice([0.0, 1.0], (*size, 1, 6), p=[0.1, 0.9])
     recorded = {
         "elapsed": rng.uniform(0.0, 0.021, size),
@@ -374,7 +373,7 @@ def test_the_table_judges_recorded_steps_as_single_ones() -> None:
         "paddle": rng.normal(0.0, 0.1, (*size, 3)),
         "velocities": rng.normal(0.0, 1.5, (*size, 6)),
         "angles": angles,
-        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, inputs, 6)),
+        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, steps, 6)),
         "target": rng.normal(0.0, 0.5, (*size, 3)),
     }
     found = faults(bounds, recorded)

@@ -11,8 +11,10 @@ from bounce_mjx.deploy.metadata import Metadata
 
 STUCK_SHARE = 0.25
 """Share of `action_scale` by which an arm must have been asked to move, to be stuck if it rests."""
-# Time for which it rests, s, and the range of an angle at rest without noise, rad.
-_STUCK_SECONDS, _STILL = 0.3, 1e-3
+# Time for which it rests at least, and for which the latest commands have arrived by then, s.
+_STUCK_SECONDS, _ASKED_SECONDS = 0.3, 0.2
+# Range of an angle at rest without noise, rad.
+_STILL = 1e-3
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
 _SAG = 0.01
 # Time by which an arm may be later than in the training's worlds, s.
@@ -31,7 +33,7 @@ _SYNCHRONOUS = 1e-3
 
 
 class Allowed(NamedTuple):
-    """The bounds of the table; T and K are the steps of the windows of angles and commands."""
+    """The bounds of the table."""
 
     elapsed: float
     """Time between two control steps, s."""
@@ -49,15 +51,15 @@ class Allowed(NamedTuple):
     """Lowest and highest position of the paddle [2, 3], m."""
     still: float
     """Range of a resting angle, rad."""
-    asked: float
-    """Motion after which an arm does not rest, rad."""
     offset: float
     """Distance of a resting joint from its command, rad."""
-    pull: np.ndarray
-    """Motion of each kind of arm [M, T] that rested at the start of the window, by commands in the
-    window [K]: [M, T, K]."""
-    settled: np.ndarray
-    """Share of an offset at the start that it has lost [M, T]."""
+    window: int
+    """Control steps that a stuck joint rests."""
+    weights: np.ndarray
+    """Mean command that moves the slowest arm until each of the window's first steps, as weights
+    of those steps [K, K]."""
+    room: np.ndarray
+    """Distance of this mean from the angle by which no arm moves visibly [K], rad."""
 
 
 def largest(metadata: Metadata, term: str, default: float = 0.0, end: int = 1) -> float:
@@ -90,32 +92,24 @@ def allowed(metadata: Metadata, age: float, steps_late: float, box: Any = None) 
         speed=speed,
         box=np.array([[-np.inf], [np.inf]]) if box is None else box,
         still=still,
-        asked=max(STUCK_SHARE * metadata.action_scale, 0.6 * still),
         offset=_SAG + largest(metadata, "encoder_bias"),
-        **_arms(metadata),
+        **_slowest_arm(metadata, max(STUCK_SHARE * metadata.action_scale, 0.6 * still)),
     )
 
 
-def _arms(metadata: Metadata) -> dict[str, np.ndarray]:
-    """How arms of the training's worlds follow: late by each latency, with the shortest and the
-    longest lag."""
-    dt, terms = metadata.control_dt, np.array(metadata.servo_stiffness)
-    servo = np.array(metadata.servo_damping) / terms
+def _slowest_arm(metadata: Metadata, least: float) -> dict[str, Any]:
+    """How an arm follows with the longest lag of the training's worlds: what its commands must be
+    to move it by less than a distance, rad. Any faster arm moves more."""
+    dt = metadata.control_dt
     slow = largest(metadata, "servo_damping", 1.0) / largest(metadata, "servo_gain", 1.0, end=0)
-    lags = np.min(servo), slow * np.max(servo) + largest(metadata, "servo_lag")
-    steps = max(round(_STUCK_SECONDS / dt), 1)
-    latest = math.ceil((largest(metadata, "action_latency") + _LATER) / dt - 1e-6)
-    times = np.unique(np.linspace(1, steps, min(steps, 30)).astype(int))
-    # The command of each step in the window counts once it has arrived.
-    since = times[:, None] - np.arange(1 - latest, steps + 1)
-    pull, settled = [], []
-    for late in np.unique(np.linspace(0, latest, min(latest, 10) + 1).astype(int)):
-        for lag in lags:
-            kept = math.exp(-dt / max(lag, 1e-6))
-            moves = (since >= late) & (since - late < times[:, None])
-            pull.append(np.where(moves, (1.0 - kept) * kept ** np.maximum(since - late, 0), 0.0))
-            settled.append(1.0 - kept**times)
-    return {"pull": np.array(pull), "settled": np.array(settled)}
+    lag = slow * np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness))
+    kept = math.exp(-dt / (lag + largest(metadata, "servo_lag") + 1e-6))
+    late = math.ceil((largest(metadata, "action_latency") + _LATER) / dt - 1e-6)
+    steps = max(round(_STUCK_SECONDS / dt) - late, math.ceil(_ASKED_SECONDS / dt))
+    since = np.arange(steps)[:, None] - np.arange(steps)
+    pull = np.tril((1.0 - kept) * kept ** np.abs(since))
+    settled = np.sum(pull, axis=1)
+    return {"window": steps + late, "weights": pull / settled[:, None], "room": least / settled}
 
 
 def _largest_norm(vectors: Any) -> Any:
@@ -157,17 +151,15 @@ def _fast(a: Allowed, velocities: Any) -> tuple[Any, Any]:
 
 def _stuck(a: Allowed, angles: Any, commands: Any) -> tuple[Any, Any]:
     """Whether a joint rests that no arm of the training would have rested, whatever its offset."""
-    still = np.ptp(angles, axis=-2) < a.still
-    rest = np.mean(angles, axis=-2)
-    led = np.moveaxis(commands - rest[..., None, :], -1, -2)[still]
-    # What each kind of arm would have done, for the joints that rest: [..., M, T].
-    pulled = np.tensordot(led, a.pull, (-1, -1))
-    least = np.max((-a.asked - pulled) / a.settled, axis=-1)
-    most = np.min((a.asked - pulled) / a.settled, axis=-1)
-    explained = np.maximum(least, -a.offset) <= np.minimum(most, a.offset)
-    lead = np.zeros(still.shape)
-    lead[still] = np.where(np.any(explained, axis=-1), 0.0, np.max(np.abs(led), axis=-1))
-    return np.any(lead > 0.0, axis=-1), np.max(lead, axis=-1)
+    # Later commands have not reached the latest arm.
+    arrived = commands[..., 1 : len(a.room) + 1, :] - np.mean(angles, axis=-2, keepdims=True)
+    lead = np.swapaxes(arrived, -1, -2)
+    mean = lead @ a.weights.T
+    least, most = np.max(mean - a.room, axis=-1), np.min(mean + a.room, axis=-1)
+    is_explained = np.maximum(least, -a.offset) <= np.minimum(most, a.offset)
+    is_stuck = (np.ptp(angles, axis=-2) < a.still) & ~is_explained
+    largest_lead = np.max(np.abs(lead), axis=-1)
+    return np.any(is_stuck, axis=-1), np.max(np.where(is_stuck, largest_lead, 0.0), axis=-1)
 
 
 def _outside(a: Allowed, target: Any) -> tuple[Any, Any]:
@@ -206,8 +198,8 @@ any batch [...]:
 - `age` [...] of the ball's picture, s; `ball` and `ball_velocity` [..., B, 3] in it, m and m/s;
   `last_ball` [..., B, 3] in the picture before, the time `between` them [...], s, and
   `earlier_ball` in the one `EARLIER` before; NaN for none;
-- `angles` [..., T + 1, J] and `commands` [..., K, J] of the last control steps, rad: a command is
-  that at the end of the step before its angle; `velocities` [..., J], rad/s; `paddle` [..., 3], m;
+- `angles` and `commands` [..., window + 1, J] of the last control steps, rad: a command is that at
+  the end of the step before its angle; `velocities` [..., J], rad/s; `paddle` [..., 3], m;
 - `target` [..., 3]: where the next command brings the paddle, m.
 """
 

@@ -148,9 +148,8 @@ class Supervisor:
             if policy.targets is None or not self._are_near(policy.targets, angles):
                 policy.reset(angles)
             self._is_new = False
-            _, steps, inputs = self._allowed.pull.shape
-            self._past = np.tile(angles, (round(steps) + 1, 1))
-            self._sent = np.tile(policy.targets, (inputs, 1))
+            rest = [[angles], [policy.targets]]
+            self._past = np.repeat(rest, self._allowed.window + 1, axis=1)
         fault = first_fault(self._allowed, self._window(angles))
         if fault is not None:
             return fault
@@ -187,9 +186,9 @@ class Supervisor:
 
     def _window(self, angles: np.ndarray) -> dict[str, np.ndarray]:
         """The last angles and commands, with those of this control step."""
-        self._past = np.concatenate([self._past[1:], angles[None]])
-        self._sent = np.concatenate([self._sent[1:], self._policy.targets[None]])
-        return {"angles": self._past, "commands": self._sent}
+        now = [[angles], [self._policy.targets]]
+        self._past = np.concatenate([self._past[:, 1:], now], axis=1)
+        return dict(zip(("angles", "commands"), self._past, strict=True))
 
     def _facts(self, measured: Measurements) -> dict[str, Any]:
         """The facts of a running episode, for the rules."""
