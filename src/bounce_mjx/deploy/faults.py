@@ -32,29 +32,15 @@ EARLIER = 5
 _SYNCHRONOUS = 1e-3
 
 
-class Allowed(NamedTuple):
-    """The bounds of the table."""
+class Rest(NamedTuple):
+    """When a joint rests, and which commands explain that."""
 
-    elapsed: float
-    """Time between two control steps, s."""
-    idle: float
-    """Calls in a row without a new step."""
-    age: float
-    """Age of a picture, s."""
-    ball: tuple[float, float]
-    """Distance from the base, m, and speed, m/s."""
-    ball_noise: float
-    """Error of the distance between two pictures, m."""
-    speed: np.ndarray
-    """Speed of each joint [J], rad/s."""
-    box: np.ndarray
-    """Lowest and highest position of the paddle [2, 3], m."""
+    window: int
+    """Control steps that a stuck joint rests."""
     still: float
     """Range of a resting angle, rad."""
     offset: float
     """Distance of a resting joint from its command, rad."""
-    window: int
-    """Control steps that a stuck joint rests."""
     weights: np.ndarray
     """Mean command that moves the slowest arm until each of the window's first steps, as weights
     of those steps [K, K]."""
@@ -77,29 +63,29 @@ def picture_age(metadata: Metadata) -> float:
     return min(max(largest(metadata, "ball_latency") + 5.0 / rate, 0.1), 1.0)
 
 
-def allowed(metadata: Metadata, age: float, steps_late: float, box: Any = None) -> Allowed:
-    """The bounds of a policy's worlds, with the settings of a supervisor."""
-    limits, dt = metadata.limits, metadata.control_dt
+def allowed(metadata: Metadata, age: float, steps_late: float, box: Any) -> dict[str, Any]:
+    """The bounds of a policy's worlds, with the settings of a supervisor (`box` [2, 3], m), by the
+    first fact of the rule that each is for."""
+    limits, dt, ball = metadata.limits, metadata.control_dt, metadata.ball
+    noise = 1.5 * _LARGEST_NOISE * largest(metadata, "ball_position_noise")
+    return {
+        "elapsed": steps_late * dt,
+        "idle": steps_late,
+        "age": age,
+        "ball": ball.distance,
+        "paddle": (_BELOW, _BESIDE),
+        "ball_velocity": ball.speed,
+        "ball_motion": ball.speed + noise / dt,
+        "velocities": FASTEST if limits is None else 1.2 * np.array(limits.velocity),
+        "angles": _rest(metadata),
+        "target": box,
+    }
+
+
+def _rest(metadata: Metadata) -> Rest:
+    """What the slowest arm of the training's worlds would have done; any faster arm moves more."""
     still = _STILL + 0.8 * _LARGEST_NOISE * largest(metadata, "joint_angle_noise")
-    count = len(metadata.joint_names)
-    speed = np.full(count, FASTEST) if limits is None else 1.2 * np.array(limits.velocity)
-    return Allowed(
-        elapsed=steps_late * dt,
-        idle=steps_late,
-        age=age,
-        ball=metadata.ball,
-        ball_noise=1.5 * _LARGEST_NOISE * largest(metadata, "ball_position_noise"),
-        speed=speed,
-        box=np.array([[-np.inf], [np.inf]]) if box is None else box,
-        still=still,
-        offset=_SAG + largest(metadata, "encoder_bias"),
-        **_slowest_arm(metadata, max(STUCK_SHARE * metadata.action_scale, 0.6 * still)),
-    )
-
-
-def _slowest_arm(metadata: Metadata, least: float) -> dict[str, Any]:
-    """How an arm follows with the longest lag of the training's worlds: what its commands must be
-    to move it by less than a distance, rad. Any faster arm moves more."""
+    visible = max(STUCK_SHARE * metadata.action_scale, 0.6 * still)
     dt = metadata.control_dt
     slow = largest(metadata, "servo_damping", 1.0) / largest(metadata, "servo_gain", 1.0, end=0)
     lag = slow * np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness))
@@ -109,62 +95,49 @@ def _slowest_arm(metadata: Metadata, least: float) -> dict[str, Any]:
     since = np.arange(steps)[:, None] - np.arange(steps)
     pull = np.tril((1.0 - kept) * kept ** np.abs(since))
     settled = np.sum(pull, axis=1)
-    return {"window": steps + late, "weights": pull / settled[:, None], "room": least / settled}
+    offset = _SAG + largest(metadata, "encoder_bias")
+    return Rest(steps + late, still, offset, pull / settled[:, None], visible / settled)
 
 
-def _largest_norm(vectors: Any) -> Any:
-    return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
+def _above(bound: float, number: Any) -> tuple[Any, Any]:
+    return number > bound, number
 
 
-def _late(a: Allowed, elapsed: Any) -> tuple[Any, Any]:
-    return elapsed > a.elapsed, 1e3 * elapsed
+def _long(bound: float, vectors: Any) -> tuple[Any, Any]:
+    return _above(bound, np.max(np.linalg.norm(vectors, axis=-1), axis=-1))
 
 
-def _picture(a: Allowed, age: Any) -> tuple[Any, Any]:
-    return (age > a.age) | (age < -_SYNCHRONOUS), 1e3 * age
+def _fast(bound: Any, velocities: Any) -> tuple[Any, Any]:
+    return np.any(np.abs(velocities) > bound, axis=-1), np.max(np.abs(velocities), axis=-1)
 
 
-def _place(a: Allowed, ball: Any) -> tuple[Any, Any]:
-    return (far := _largest_norm(ball)) > a.ball[0], far
+def _picture(bound: float, age: Any) -> tuple[Any, Any]:
+    return (age > bound) | (age < -_SYNCHRONOUS), 1e3 * age
 
 
-def _lost(a: Allowed, ball: Any, earlier_ball: Any, paddle: Any) -> tuple[Any, Any]:
+def _lost(bounds: Any, paddle: Any, ball: Any, earlier_ball: Any) -> tuple[Any, Any]:
     paddle = paddle[..., None, :]
     below = paddle[..., 2] - ball[..., 2]
     beside, before = (np.linalg.norm((b - paddle)[..., :2], axis=-1) for b in (ball, earlier_ball))
-    is_lost = (below > _BELOW) | ((beside > _BESIDE) & (beside >= before))
+    is_lost = (below > bounds[0]) | ((beside > bounds[1]) & (beside >= before))
     return np.any(is_lost, axis=-1), np.max(np.maximum(below, beside), axis=-1)
 
 
-def _velocity(a: Allowed, ball_velocity: Any) -> tuple[Any, Any]:
-    return (fast := _largest_norm(ball_velocity)) > a.ball[1], fast
-
-
-def _moved(a: Allowed, ball: Any, last_ball: Any, between: Any) -> tuple[Any, Any]:
-    moved = _largest_norm(ball - last_ball)
-    return moved > a.ball[1] * between + a.ball_noise, moved / between
-
-
-def _fast(a: Allowed, velocities: Any) -> tuple[Any, Any]:
-    return np.any(np.abs(velocities) > a.speed, axis=-1), np.max(np.abs(velocities), axis=-1)
-
-
-def _stuck(a: Allowed, angles: Any, commands: Any) -> tuple[Any, Any]:
+def _stuck(rest: Rest, angles: Any, commands: Any) -> tuple[Any, Any]:
     """Whether a joint rests that no arm of the training would have rested, whatever its offset."""
     # Later commands have not reached the latest arm.
-    arrived = commands[..., 1 : len(a.room) + 1, :] - np.mean(angles, axis=-2, keepdims=True)
+    arrived = commands[..., 1 : len(rest.room) + 1, :] - np.mean(angles, axis=-2, keepdims=True)
     lead = np.swapaxes(arrived, -1, -2)
-    mean = lead @ a.weights.T
-    least, most = np.max(mean - a.room, axis=-1), np.min(mean + a.room, axis=-1)
-    is_explained = np.maximum(least, -a.offset) <= np.minimum(most, a.offset)
-    is_stuck = (np.ptp(angles, axis=-2) < a.still) & ~is_explained
+    mean = lead @ rest.weights.T
+    least, most = np.max(mean - rest.room, axis=-1), np.min(mean + rest.room, axis=-1)
+    is_explained = np.maximum(least, -rest.offset) <= np.minimum(most, rest.offset)
+    is_stuck = (np.ptp(angles, axis=-2) < rest.still) & ~is_explained
     largest_lead = np.max(np.abs(lead), axis=-1)
     return np.any(is_stuck, axis=-1), np.max(np.where(is_stuck, largest_lead, 0.0), axis=-1)
 
 
-def _outside(a: Allowed, target: Any) -> tuple[Any, Any]:
-    over = np.max(np.maximum(a.box[0] - target, target - a.box[1]), axis=-1)
-    return over > 0.0, over
+def _outside(box: Any, target: Any) -> tuple[Any, Any]:
+    return _above(0.0, np.max(np.maximum(box[0] - target, target - box[1]), axis=-1))
 
 
 class Rule(NamedTuple):
@@ -175,18 +148,18 @@ class Rule(NamedTuple):
     needs: str
     """Names of the facts that it judges."""
     check: Callable[..., tuple[Any, Any]]
-    """Bounds and facts -> whether it is broken, and a number for the reason."""
+    """Bound and facts -> whether it is broken, and a number for the reason."""
     reason: str
 
 
 RULES = (
-    Rule("late_step", "elapsed", _late, "a control step came after {:.0f} ms"),
-    Rule("no_step", "idle", lambda a, n: (n > a.idle, n), "{} calls in a row are no new step"),
+    Rule("late_step", "elapsed", _above, "a control step came after {:.3g} s"),
+    Rule("no_step", "idle", _above, "{} calls in a row are no new step"),
     Rule("old_picture", "age", _picture, "the picture of the ball is {:.0f} ms old"),
-    Rule("ball_place", "ball", _place, "the ball is {:.3g} m from the base"),
-    Rule("ball_lost", "ball earlier_ball paddle", _lost, "the ball is lost"),
-    Rule("ball_speed", "ball_velocity", _velocity, "the ball has {:.3g} m/s"),
-    Rule("ball_speed", "ball last_ball between", _moved, "the ball has {:.3g} m/s"),
+    Rule("ball_place", "ball", _long, "the ball is {:.3g} m from the base"),
+    Rule("ball_lost", "paddle ball earlier_ball", _lost, "the ball is lost"),
+    Rule("ball_speed", "ball_velocity", _long, "the ball has {:.3g} m/s"),
+    Rule("ball_speed", "ball_motion", _long, "the ball has {:.3g} m/s"),
     Rule("joint_speed", "velocities", _fast, "a joint has {:.3g} rad/s"),
     Rule("joint_stuck", "angles commands", _stuck, "a joint is stuck {:.3g} rad from its command"),
     Rule("box", "target", _outside, "the paddle's command is {:.3g} m outside the box"),
@@ -196,25 +169,25 @@ any batch [...]:
 
 - `elapsed` [...]: time since the last control step, s; `idle` [...]: calls without a step;
 - `age` [...] of the ball's picture, s; `ball` and `ball_velocity` [..., B, 3] in it, m and m/s;
-  `last_ball` [..., B, 3] in the picture before, the time `between` them [...], s, and
-  `earlier_ball` in the one `EARLIER` before; NaN for none;
+  `ball_motion` [..., B, 3] between the last two pictures, m/s; `earlier_ball` [..., B, 3] in the
+  picture `EARLIER` before, NaN for none;
 - `angles` and `commands` [..., window + 1, J] of the last control steps, rad: a command is that at
   the end of the step before its angle; `velocities` [..., J], rad/s; `paddle` [..., 3], m;
 - `target` [..., 3]: where the next command brings the paddle, m.
 """
 
 
-def faults(bounds: Allowed, facts: dict[str, Any]) -> list[tuple[Rule, Any, Any]]:
+def faults(bounds: dict[str, Any], facts: dict[str, Any]) -> list[tuple[Rule, Any, Any]]:
     """The rules that the facts decide, each with whether it is broken and its number [...]."""
     rules = [(rule, rule.needs.split()) for rule in RULES]
     return [
-        (rule, *rule.check(bounds, *map(facts.get, needs)))
+        (rule, *rule.check(bounds[needs[0]], *map(facts.get, needs)))
         for rule, needs in rules
         if facts.keys() >= set(needs)
     ]
 
 
-def first_fault(bounds: Allowed, facts: dict[str, Any]) -> tuple[str, str] | None:
+def first_fault(bounds: dict[str, Any], facts: dict[str, Any]) -> tuple[str, str] | None:
     """Code and reason of the first rule that a single control step breaks."""
     broken = (x for x in faults(bounds, facts) if x[1])
     return next(((rule.fault, rule.reason.format(number)) for rule, _, number in broken), None)

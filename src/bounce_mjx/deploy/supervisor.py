@@ -39,7 +39,7 @@ class Supervisor:
         self,
         policy: "DeployedPolicy",
         rate: float,
-        box: Box | None = None,
+        box: Box = ((-math.inf,) * 3, (math.inf,) * 3),
         max_picture_age: float | None = None,
         max_steps_late: float = 2.0,
         home_speed: float = 0.3,
@@ -58,12 +58,10 @@ class Supervisor:
             if not (isinstance(value, Real) and 0.0 < value <= most and math.isfinite(value)):
                 limit = "" if most == math.inf else f" and at most {most:g}"
                 raise UserError(f"{name} is {value!r}; give a finite number above 0{limit}")
-        self._box = None if box is None else np.array(box, float)
-        if self._box is not None and (
-            self._box.shape != (2, 3) or not np.all(np.diff(self._box, axis=0) > 0.0)
-        ):
+        corners = np.array(box, float)
+        if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._allowed = allowed(metadata, age, max_steps_late, self._box)
+        self._allowed = allowed(metadata, age, max_steps_late, corners)
         self._home_speed, self._chain = home_speed, Chain(metadata)
         self.state: State = "homing"
         self.fault: str | None = None
@@ -149,7 +147,7 @@ class Supervisor:
                 policy.reset(angles)
             self._is_new = False
             rest = [[angles], [policy.targets]]
-            self._past = np.repeat(rest, self._allowed.window + 1, axis=1)
+            self._past = np.repeat(rest, self._allowed["angles"].window + 1, axis=1)
         fault = first_fault(self._allowed, self._window(angles))
         if fault is not None:
             return fault
@@ -162,7 +160,7 @@ class Supervisor:
         return None
 
     def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.max(np.abs(one - other)) <= self._allowed.offset)
+        return bool(np.max(np.abs(one - other)) <= self._allowed["angles"].offset)
 
     def _follow(self, measurements: Mapping[str, Any]) -> Fault:
         """A step of the policy, and what is wrong with it."""
@@ -223,6 +221,6 @@ class Supervisor:
         seen, facts = self._pictures, {"ball": ball, "age": age}
         if len(seen) > 1:
             between = max(seen[-1][1] - seen[-2][1], self._policy.metadata.control_dt)
-            facts |= {"last_ball": seen[-2][0], "between": between}
+            facts["ball_motion"] = (ball - seen[-2][0]) / between
         none = np.full(ball.shape, np.nan)
         return facts | {"earlier_ball": seen[0][0] if len(seen) > EARLIER else none}
