@@ -199,10 +199,10 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
 
 SETTINGS = {
     "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
-    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf, "0.1"],
+    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
     "max_steps_late": [0, -1, math.nan, math.inf],
     "home_speed": [0.0, -1.0, 2.5, 1e9, math.nan],
-    "rate": [125, 0, math.nan, "500"],
+    "rate": [125, 0, math.nan],
 }
 
 
