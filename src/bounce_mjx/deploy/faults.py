@@ -12,7 +12,7 @@ from bounce_mjx.deploy.metadata import Metadata
 STUCK_SHARE = 0.25
 """Share of `action_scale` by which an arm must have been asked to move, to be stuck if it rests."""
 # Time for which it rests at least, and for which the latest commands have arrived by then, s.
-_STUCK_SECONDS, _ASKED_SECONDS = 0.3, 0.2
+_STUCK_SECONDS, _ASKED_SECONDS = 0.3, 0.25
 # Range of an angle at rest without noise, rad.
 _STILL = 1e-3
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
