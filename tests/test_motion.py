@@ -399,7 +399,7 @@ def test_a_policy_can_be_copied_in_the_middle_of_an_episode() -> None:
 def test_targets_of_a_reset_are_finite_numbers_for_the_joints() -> None:
     policy = load_policy("robust")
     policy.step(measured() | {"ball_velocity": np.zeros(3)})
-    for wrong in (np.zeros(5), [[0.0] * 6], [math.nan] * 6, "home"):
+    for wrong in (np.zeros(5), [[0.0]] * 6, [math.nan] * 6, "home"):
         with pytest.raises(UserError, match=r"the targets .*; give .*numbers \(rad\)"):
             policy.reset(wrong)
     assert policy.step_number == 0
@@ -412,7 +412,7 @@ def test_targets_of_a_reset_are_finite_numbers_for_the_joints() -> None:
 def test_joints_may_have_the_names_of_the_driver() -> None:
     names = [f"fr3_joint{i}" for i in range(1, 8)]
     assert load_policy("panda", joint_names=names).metadata.joint_names == tuple(names)
-    for wrong in (names[:6], names[:6] + names[:1], [*names[:6], 7]):
+    for wrong in (names[:6], names[:6] + names[:1], names + names[:1]):
         with pytest.raises(UserError, match="joint_names are .*; give 7 different names"):
             load_policy("panda", joint_names=wrong)
 
