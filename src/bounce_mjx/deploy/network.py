@@ -1,5 +1,6 @@
 """The network of a policy's ONNX file, with what its task remembers of the measurements."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from bounce_mjx.errors import UserError, needed
 _LOG_ERRORS_ONLY = 3
 _FLOAT = "tensor(float)"
 _TYPES = {_FLOAT: np.float32, "tensor(int32)": np.int32, "tensor(bool)": np.bool_}
+# Numbers that a network may remember; a file states how many it does.
+_LARGEST_MEMORY = 1_000_000
 
 
 class OnnxNetwork:
@@ -75,23 +78,42 @@ class OnnxNetwork:
         rows |= {IS_FIRST: np.array([self._is_first])} | self.memory
         names = ["action", *(f"{NEXT}{name}" for name in self.memory)]
         action, *values = self._session.run(names, {name: rows[name] for name in self._inputs})
-        if not np.all(np.isfinite(action)):
-            raise UserError("the network returned an action that is not finite; stop the robot")
-        self._is_first, self.memory = False, dict(zip(self.memory, values, strict=True))
+        memory = dict(zip(self.memory, values, strict=True))
+        is_kept = all(memory[name].shape == past.shape for name, past in self.memory.items())
+        if not (is_kept and np.all(np.isfinite(action))):
+            raise UserError(
+                "the network returned an action that is not finite, or memory of the wrong shape; "
+                "stop the robot"
+            )
+        self._is_first, self.memory = False, memory
         return action[0].astype(float)
 
     def _check(self) -> None:
-        """Raises ValueError if the inputs are not those of the metadata, or the memory is not the
-        output of that name. Sizes and types of measurements show when the network runs."""
-        known = {*measurement_sizes(self.metadata), *self._remembered}
-        known |= {"paddle_position", "ball_picture", "action", "past_actions", "servo_lead"}
-        stated = {part.name for part in self.metadata.observation}
-        if stated - known:
-            raise ValueError(f"its input {min(stated - known)} is unknown here")
-        read = self._inputs.keys() - {IS_FIRST, *(f"{MEASURED}{name}" for name in known)}
-        is_kept = all(self._inputs.get(name) == kind for name, kind in self._remembered.items())
-        if read != stated | self._remembered.keys() or not is_kept:
+        """Raises ValueError if the inputs and the memory do not fit to the metadata."""
+        metadata, remembered = self.metadata, self._remembered
+        sizes = measurement_sizes(metadata) | {"paddle_position": 3}
+        sizes["ball_picture"] = sizes["ball_position"]
+        sizes |= dict.fromkeys(("action", "past_actions", "servo_lead"), len(metadata.joint_names))
+        stated = {}
+        for part in metadata.observation:
+            if part.name not in remembered and part.name not in sizes:
+                raise ValueError(f"its input {part.name} is unknown here")
+            if (size := sizes.get(part.name, part.size)) != part.size:
+                raise ValueError(f"its input {part.name} must have the size {size}")
+            stated[part.name] = _FLOAT, [part.history, part.size]
+        known = {f"{MEASURED}{name}": (_FLOAT, [size]) for name, size in sizes.items()}
+        known |= {IS_FIRST: ("tensor(bool)", [])} | remembered | stated
+        if (
+            len(stated) < len(metadata.observation)
+            or not stated.keys() - remembered.keys() <= self._inputs.keys()
+            or any(known.get(name) != kind for name, kind in self._inputs.items())
+            or any(known[name] != kind for name, kind in remembered.items())
+        ):
             raise ValueError("its inputs or outputs are not as its metadata states")
+        shapes = [shape for _, shape in remembered.values()]
+        is_fixed = all(type(n) is int and n > 0 for shape in shapes for n in shape)
+        if not is_fixed or sum(map(math.prod, shapes)) > _LARGEST_MEMORY:
+            raise ValueError("its memory has no fixed size, or is too large")
 
 
 def _session(model: bytes) -> Any:
