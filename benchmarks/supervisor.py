@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import EARLIER, FLYING, Allowed, allowed, faults, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FLYING, allowed, faults, picture_age
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
@@ -94,10 +94,9 @@ def windows(values: np.ndarray, steps: int) -> np.ndarray:
     return np.moveaxis(sliding_window_view(padded, steps, axis=0), -1, 1)
 
 
-def facts(metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray]) -> dict[str, Any]:
+def facts(metadata: Metadata, episode: dict[str, np.ndarray], window: int) -> dict[str, Any]:
     """The facts of each step [T] for the rules, as the supervisor finds them."""
     angles, ball, age = episode["angles"], episode["ball"], episode["age"]
-    _, steps, inputs = bounds.pull.shape
     sent = np.concatenate([angles[:1], episode["commands"][:-1]])
     paddle, _ = Chain(metadata).paddle(angles)
     times = np.arange(len(angles)) * metadata.control_dt
@@ -110,14 +109,13 @@ def facts(metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray]) -
     balls = [np.where(i[:, None, None] < 0, np.nan, ball[i]) for i in (before, earlier)]
     between = np.maximum(taken - taken[before], metadata.control_dt)
     return {
-        "angles": windows(angles, steps + 1),
-        "commands": windows(sent, inputs),
+        "angles": windows(angles, window + 1),
+        "commands": windows(sent, window + 1),
         "velocities": episode["velocities"],
         "paddle": paddle,
         "ball": ball,
-        "last_ball": balls[0],
+        "ball_motion": (ball - balls[0]) / between[:, None, None],
         "earlier_ball": balls[1],
-        "between": np.where(before < 0, np.nan, between),
         "age": np.where(flies, np.maximum(age, times - taken), age),
     }
 
@@ -133,7 +131,10 @@ def first(found: list, step: int = 0) -> tuple[int, str]:
 
 
 def delays(
-    metadata: Metadata, bounds: Allowed, episode: dict[str, np.ndarray], rng: np.random.Generator
+    metadata: Metadata,
+    bounds: dict[str, Any],
+    episode: dict[str, np.ndarray],
+    rng: np.random.Generator,
 ) -> dict[str, float]:
     """Times from a fault until a rule is broken, s; infinite where none is in 2 s."""
     length = int(np.sum(episode["running"]))
@@ -142,11 +143,13 @@ def delays(
     step, found = int(rng.integers(50, length - 100)), {}
     episode = {key: value[step - 50 : min(step + 200, length)] for key, value in episode.items()}
     step, length = 50, len(episode["age"])
-    repeated = {f"the angle of joint {j + 1}": ("angles", j) for j in range(len(bounds.speed))}
+    repeated = {
+        f"the angle of joint {j + 1}": ("angles", j) for j in range(len(metadata.joint_names))
+    }
     for name, (kind, entry) in ({"a picture": ("ball", ...)} | repeated).items():
         changed = {key: value.copy() for key, value in episode.items()}
         changed[kind][step:, entry] = changed[kind][step, entry]
-        at, _ = first(faults(bounds, facts(metadata, bounds, changed)), step)
+        at, _ = first(faults(bounds, facts(metadata, changed, bounds["angles"].window)), step)
         found[name] = (at - step) * metadata.control_dt if at < length else np.inf
     return found
 
@@ -154,7 +157,7 @@ def delays(
 def judge(name: str, given: argparse.Namespace, rng: np.random.Generator) -> None:
     """Prints the first alarms of a policy's episodes, and the times from faults."""
     metadata = load_policy(name).metadata
-    bounds = allowed(metadata, picture_age(metadata), 2.0)
+    bounds = allowed(metadata, picture_age(metadata), 2.0, None)
     run = recorder(name, min(_BATCH, given.episodes), given.latencies)
     alarms, late, lasted = Counter(), {}, 0
     for batch in range(-(-given.episodes // _BATCH)):
@@ -163,7 +166,7 @@ def judge(name: str, given: argparse.Namespace, rng: np.random.Generator) -> Non
             episode = {key: value[n] for key, value in rows.items()}
             length = int(np.sum(episode["running"]))
             lasted += length == len(episode["running"])
-            step, fault = first(faults(bounds, facts(metadata, bounds, episode)))
+            step, fault = first(faults(bounds, facts(metadata, episode, bounds["angles"].window)))
             alarms[fault if step < length else "none"] += 1
             for kind, delay in delays(metadata, bounds, episode, rng).items():
                 late.setdefault(kind, []).append(delay)

@@ -737,7 +737,7 @@ WRONG = {
     "missing": ({"ball_position": None}, "ball_position is missing", "needs joint_angles"),
     "unknown": ({"ball_positon": [0, 0, 0]}, "ball_positon is not a measurement", "ball_position"),
     "short": ({"joint_angles": [0.0] * 5}, "joint_angles has the shape [5]", "6 numbers (rad)"),
-    "batch": ({"ball_position": [[0, 0, 1]]}, "has the shape [1, 3]", "3 numbers (m)"),
+    "column": ({"ball_position": [[0], [0], [1]]}, "has the shape [3, 1]", "3 numbers (m)"),
     "words": ({"target_height": "high"}, "target_height is 'high'", "one number (m)"),
     "ragged": ({"ball_velocity": [[0], 1, 2]}, "ball_velocity is", "3 numbers (m/s)"),
     "nan": ({"joint_velocities": [0, 0, np.nan, 0, 0, 0]}, "holds nan", "finite", "rad/s"),
@@ -994,7 +994,7 @@ def test_an_unknown_output_is_refused(filtered: onnx.ModelProto) -> None:
 
 
 @pytest.mark.parametrize(
-    "action", [[np.nan] * 6, [np.inf] * 6, [0.0] * 5, [[0.0] * 6], "up", None, [5.0] * 6]
+    "action", [[np.nan] * 6, [np.inf] * 6, [0.0] * 5, [[0.0]] * 6, "up", None, [5.0] * 6]
 )
 def test_no_servo_targets_for_a_wrong_action(action, policies) -> None:
     policy = policies["all histories"]

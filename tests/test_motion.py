@@ -147,7 +147,6 @@ FAULTS = {
     "ball_speed": ({"ball_velocity": [0.0, 0.0, -2000.0]}, "the ball has 2e+03 m/s"),
     "ball_speed by position": ({"ball_position": [0.589, 0.5, 0.45]}, "the ball has 50 m/s"),
     "joint_speed": ({"joint_velocities": [9.0] * 6}, "a joint has 9 rad/s"),
-    "joint_jump": ({"joint_angles": HOME + 1.0}, "jumped by 1"),
 }
 
 
@@ -170,7 +169,7 @@ def test_a_fault_brakes_within_the_limits_and_says_why(name: str) -> None:
 def test_a_late_step_and_an_old_picture_without_an_age_are_faults() -> None:
     arm = running()
     arm.time += 0.03
-    assert arm.step() == "braking" and "came after 40 ms" in arm.supervisor.reason
+    assert arm.step() == "braking" and "came after 0.04 s" in arm.supervisor.reason
     arm = running()
     for _ in range(12):
         state = arm.step()
@@ -200,10 +199,10 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
 
 SETTINGS = {
     "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
-    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf, "0.1"],
+    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
     "max_steps_late": [0, -1, math.nan, math.inf],
     "home_speed": [0.0, -1.0, 2.5, 1e9, math.nan],
-    "rate": [125, 0, math.nan, "500"],
+    "rate": [125, 0, math.nan],
 }
 
 
@@ -358,10 +357,9 @@ def test_an_arm_is_home_when_its_angles_are() -> None:
 def test_the_table_judges_recorded_steps_as_single_ones() -> None:
     metadata, rng = load_policy("ur5e").metadata, np.random.default_rng(0)
     bounds = allowed(metadata, 0.1, 2.0, np.array([[-1.0] * 3, [1.0] * 3]))
-    _, steps, inputs = bounds.pull.shape
-    size = (2, 40)
+    size, steps = (2, 40), bounds["angles"].window + 1
     # Some joints rest, though they are asked to move.
-    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps + 1, 6)), axis=-2)
+    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps, 6)), axis=-2)
     angles = HOME + moves * rng.choice([0.0, 1.0], (*size, 1, 6), p=[0.1, 0.9])
     recorded = {
         "elapsed": rng.uniform(0.0, 0.021, size),
@@ -369,13 +367,12 @@ def test_the_table_judges_recorded_steps_as_single_ones() -> None:
         "age": rng.uniform(-0.002, 0.11, size),
         "ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
         "ball_velocity": rng.normal(0.0, 5.0, (*size, 1, 3)),
-        "last_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
+        "ball_motion": rng.normal(0.0, 10.0, (*size, 1, 3)),
         "earlier_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
-        "between": rng.uniform(0.01, 0.1, size),
         "paddle": rng.normal(0.0, 0.1, (*size, 3)),
         "velocities": rng.normal(0.0, 1.5, (*size, 6)),
         "angles": angles,
-        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, inputs, 6)),
+        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, steps, 6)),
         "target": rng.normal(0.0, 0.5, (*size, 3)),
     }
     found = faults(bounds, recorded)
@@ -402,7 +399,7 @@ def test_a_policy_can_be_copied_in_the_middle_of_an_episode() -> None:
 def test_targets_of_a_reset_are_finite_numbers_for_the_joints() -> None:
     policy = load_policy("robust")
     policy.step(measured() | {"ball_velocity": np.zeros(3)})
-    for wrong in (np.zeros(5), [[0.0] * 6], [math.nan] * 6, "home"):
+    for wrong in (np.zeros(5), [[0.0]] * 6, [math.nan] * 6, "home"):
         with pytest.raises(UserError, match=r"the targets .*; give .*numbers \(rad\)"):
             policy.reset(wrong)
     assert policy.step_number == 0
@@ -415,7 +412,7 @@ def test_targets_of_a_reset_are_finite_numbers_for_the_joints() -> None:
 def test_joints_may_have_the_names_of_the_driver() -> None:
     names = [f"fr3_joint{i}" for i in range(1, 8)]
     assert load_policy("panda", joint_names=names).metadata.joint_names == tuple(names)
-    for wrong in (names[:6], names[:6] + names[:1], [*names[:6], 7]):
+    for wrong in (names[:6], names[:6] + names[:1], names + names[:1]):
         with pytest.raises(UserError, match="joint_names are .*; give 7 different names"):
             load_policy("panda", joint_names=wrong)
 

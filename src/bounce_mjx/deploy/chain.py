@@ -1,6 +1,7 @@
 """Forward kinematics of the paddle in NumPy."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bounce_mjx.deploy.metadata import Metadata
 
@@ -15,10 +16,12 @@ class Chain:
         self._references = np.array([link.reference for link in links])
         self._positions = np.array([link.position for link in links])
         # Rodrigues' formula for a hinge's rotation: R (1 + sin(a) K + (1 - cos(a)) K K).
-        cross = np.array([_cross(link.axis) for link in links])
-        self._fixed = np.array([_matrix(link.quaternion) for link in links])
-        self._sine_term = self._fixed @ cross
-        self._cosine_term = self._sine_term @ cross
+        turn = _cross([link.axis for link in links])
+        quaternions = np.array([link.quaternion for link in links])
+        cross = _cross(quaternions[:, 1:])
+        self._fixed = np.eye(3) + 2.0 * (quaternions[:, :1, None] * cross + cross @ cross)
+        self._sine_term = self._fixed @ turn
+        self._cosine_term = self._sine_term @ turn
 
     def paddle(self, joint_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World position [..., 3] (m) of the paddle's centre, and upward unit normal [..., 3] of
@@ -34,14 +37,6 @@ class Chain:
         return position, normal
 
 
-def _matrix(quaternion: tuple[float, ...]) -> np.ndarray:
-    """Rotation matrix [3, 3] of a unit quaternion [w, x, y, z]."""
-    w, *v = quaternion
-    cross = _cross(v)
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
-
-
-def _cross(vector: tuple[float, ...]) -> np.ndarray:
-    """Matrix [3, 3] of the cross product with a vector [3]."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def _cross(vectors: ArrayLike) -> np.ndarray:
+    """Matrices [N, 3, 3] of the cross products with vectors [N, 3]."""
+    return np.cross(np.eye(3), np.array(vectors)[:, None])

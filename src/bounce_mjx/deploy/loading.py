@@ -28,10 +28,10 @@ def load_policy(
     Raises:
       UserError: there is no such policy, the file is damaged, or a name is missing or given twice.
     """
-    loaded = _loaded(policy, task)
+    loaded = DeployedPolicy(*_model(policy, task))
     if joint_names is not None:
         names, own = tuple(joint_names), loaded.metadata.joint_names
-        if len(set(names)) != len(own) or not all(isinstance(name, str) for name in names):
+        if not len(set(names)) == len(names) == len(own):
             raise UserError(
                 f"joint_names are {joint_names!r}; give {len(own)} different names, those of the "
                 f"joints {', '.join(own)} in this order"
@@ -40,15 +40,16 @@ def load_policy(
     return loaded
 
 
-def _loaded(policy: str | os.PathLike, task: str | None) -> DeployedPolicy:
-    if isinstance(policy, str) and policy in POLICIES:
+def _model(policy: str | os.PathLike, task: str | None) -> tuple[bytes, str]:
+    """The content of a policy's ONNX file, and the policy's name for messages."""
+    if policy in POLICIES:
         path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
-        return DeployedPolicy(path.read_bytes(), f"the policy {policy}")
+        return path.read_bytes(), f"the policy {policy}"
     path = Path(policy)
-    if os.path.isdir(path):
-        return DeployedPolicy(_exported(path, task), str(path))
+    if path.is_dir():
+        return _exported(path, task), str(path)
     try:
-        return DeployedPolicy(path.read_bytes(), str(path))
+        return path.read_bytes(), str(path)
     except OSError as error:
         raise UserError(
             f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "

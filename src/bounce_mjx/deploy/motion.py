@@ -29,8 +29,9 @@ class Motion:
         self._start = None
         self._end = None if angles is None else Setpoint(np.array(angles, float), still, still)
 
-    def begin(self, angles: np.ndarray) -> None:
-        """Begins a control step with the measured angles [J], where the last one ended."""
+    def begin(self, angles: np.ndarray | None = None) -> None:
+        """Begins a control step where the last one ended, the first one at the measured angles
+        [J]."""
         if self._end is None:
             self.rest(self.clipped(angles))
         self._start = self._end

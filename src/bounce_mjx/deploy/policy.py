@@ -1,8 +1,6 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
-import math
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -41,9 +39,8 @@ class DeployedPolicy:
         try:
             self._network = OnnxNetwork(model)
             self.metadata: Metadata = self._network.metadata
-            self.units = UNITS | {
-                name: c.unit or "no unit" for name, c in self.metadata.commands.items()
-            }
+            commands = self.metadata.commands.items()
+            self.units = UNITS | {name: c.unit or "no unit" for name, c in commands}
             """Measurements that a step accepts, and their units."""
             self._motion = Motion(self.metadata)
             self._sizes = measurement_sizes(self.metadata)
@@ -51,11 +48,11 @@ class DeployedPolicy:
             """Measurements required in every step."""
             # A network that fails or gives no numbers fails here, and not on the robot.
             self.reset()
-            zeros = {name: np.zeros(self._sizes[name]) for name in self.needs}
-            zeros |= {name: c.range[0] for name, c in self.metadata.commands.items()}
-            zeros["joint_angles"] = self.metadata.default_joint_angles
+            trial = {name: np.zeros(size) for name, size in self._sizes.items()}
+            trial |= {name: c.range[0] for name, c in commands}
+            trial["joint_angles"] = self.metadata.default_joint_angles
             for _ in range(2):
-                self.step({name: zeros[name] for name in self.needs})
+                self.step({name: trial[name] for name in self.needs})
         except MissingPackage:
             raise
         # onnxruntime raises exceptions of many types for a damaged file.
@@ -79,7 +76,7 @@ class DeployedPolicy:
         """
         count = len(self.metadata.joint_names)
         if targets is not None:
-            targets = _array("the targets", targets, (count,), "rad", _LARGEST)
+            targets = _array("the targets", targets, count, "rad", _LARGEST)
         self._histories: Histories | None = None
         self._network.reset()
         self._measured: Measurements = {}
@@ -116,8 +113,12 @@ class DeployedPolicy:
             unit or frame; or the time is more than 1 s from the last. The policy's state does
             not change. Or the network gives no finite action; then call `reset`.
         """
-        measured = self._with_lead(self.checked(measurements))
+        measured = self.checked(measurements)
         self._refuse_impossible(measured)
+        angles = measured.get("joint_angles")
+        if angles is not None and self.metadata.max_lead is not None:
+            last = self._motion.end if self._motion.is_known else angles
+            measured["servo_lead"] = last - angles
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
         if steps == 0:
@@ -126,13 +127,11 @@ class DeployedPolicy:
             self._histories = Histories(self.metadata, self._network.observed, measured)
         else:
             for i in range(1, steps):
-                share = i / steps
                 between = {
-                    name: (1.0 - share) * self._measured[name] + share * value
+                    name: value + (1.0 - i / steps) * (self._measured.get(name, value) - value)
                     for name, value in measured.items()
-                    if name in self._measured
                 }
-                self._histories.add(measured | between, self._action, is_real=False)
+                self._histories.add(between, self._action, is_real=False)
                 if self._network.memory:
                     self._network.step(self._histories.values, self._histories.newest)
             self._histories.add(measured, self._action)
@@ -141,8 +140,8 @@ class DeployedPolicy:
         self.step_number += steps
         if self._first is None and time is not None:
             self._first = time - self.step_number * self.metadata.control_dt
-        if "joint_angles" in measured:
-            self._motion.begin(measured["joint_angles"])
+        if angles is not None:
+            self._motion.begin(angles)
             self._act(action)
         return self._action.copy()
 
@@ -162,9 +161,7 @@ class DeployedPolicy:
                 "the servo targets start from the measured joint angles, and there are none; call "
                 "step with joint_angles first"
             )
-        count = len(self.metadata.joint_names)
-        action = _array("the action", action, (count,), "from -1 to 1", 1.0)
-        self._act(action)
+        self._act(_array("the action", action, len(self._action), "from -1 to 1", 1.0))
         return self.targets
 
     def commands(self, rate: float) -> np.ndarray:
@@ -183,7 +180,7 @@ class DeployedPolicy:
     def commands_per_step(self, rate: float) -> int:
         """Number of `commands` of a control step at a rate (Hz); UserError as there."""
         dt = self.metadata.control_dt
-        count = rate * dt if isinstance(rate, Real) else math.nan
+        count = rate * dt
         if not (0.999 < count < 10_000.5 and abs(count - round(count)) < 1e-3):
             raise UserError(
                 f"the rate is {rate!r} Hz, but must be a multiple of {1.0 / dt:g} Hz, one command "
@@ -203,22 +200,20 @@ class DeployedPolicy:
         """Whether the commands come to rest in this control step."""
         return self._motion.is_known and self._motion.is_still
 
-    def hold(self, joint_angles: np.ndarray | None = None) -> None:
+    def hold(self) -> None:
         """A control step without the policy, in which the commands brake, within the limits, or
-        rest; `joint_angles` [J] (rad) are where the arm is, for the first step."""
-        self._begin(joint_angles)
+        rest. Before the first step, call `reset` with the arm's joint angles."""
+        self._motion.begin()
         self._motion.aim(self._motion.position)
 
     def withdraw(self) -> None:
         """Takes back the commands of the last step, which were not sent."""
         self._motion.withdraw()
 
-    def move(
-        self, target: np.ndarray, speed: float, joint_angles: np.ndarray | None = None
-    ) -> None:
+    def move(self, target: np.ndarray, speed: float) -> None:
         """A control step without the policy, in which the commands move toward joint angles [J]
-        (rad) at a speed (rad/s); `joint_angles` as for `hold`."""
-        self._begin(joint_angles)
+        (rad) at a speed (rad/s). Before the first step, as for `hold`."""
+        self._motion.begin()
         self._motion.aim(self._motion.toward(target, speed))
 
     def supervise(self, rate: float, **settings: Any) -> Supervisor:
@@ -234,11 +229,6 @@ class DeployedPolicy:
           UserError: the rate is not a multiple of the policy's, or a setting is wrong.
         """
         return Supervisor(self, rate, **settings)
-
-    def _begin(self, joint_angles: np.ndarray | None) -> None:
-        if joint_angles is None and not self._motion.is_known:
-            raise UserError("there are no commands before the first step; give joint_angles")
-        self._motion.begin(joint_angles)
 
     def _act(self, action: np.ndarray) -> None:
         """Aims the commands of the control step where an action [J] wishes."""
@@ -268,14 +258,6 @@ class DeployedPolicy:
             users["joint_angles"] |= users["ball_position"]
         return tuple(name for name in users if users[name] & reads)
 
-    def _with_lead(self, measured: Measurements) -> Measurements:
-        """The measurements, and how far the last servo targets lead the measured angles."""
-        if self.metadata.max_lead is None or "joint_angles" not in measured:
-            return measured
-        angles = measured["joint_angles"]
-        last = self._motion.end if self._motion.is_known else angles
-        return measured | {"servo_lead": last - angles}
-
     def checked(
         self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
     ) -> Measurements:
@@ -287,26 +269,25 @@ class DeployedPolicy:
         Raises:
           UserError: as `step`.
         """
-        for name in measurements:
-            if name not in self.units:
-                raise UserError(
-                    f"{name} is not a measurement; a step takes {', '.join(self.units)}"
-                )
         needs = self.needs if needs is None else needs
-        missing = [name for name in needs if name not in measurements]
-        if missing:
-            raise UserError(
-                f"the measurement {missing[0]} is missing; this policy needs {', '.join(needs)} in "
-                "every step"
-            )
+        for name in needs:
+            if name not in measurements:
+                raise UserError(
+                    f"the measurement {name} is missing; this policy needs {', '.join(needs)} in "
+                    "every step"
+                )
         count = self.metadata.num_balls
         checked = {"ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], count)}
         checked["ball_angular_velocity"] = np.zeros(3 * count)
         for name, value in measurements.items():
-            limit = np.inf if name == "time" else _LARGEST
-            label = f"the measurement {name}"
-            size, rows = self._sizes[name], count if name in PER_BALL else 1
-            checked[name] = _array(label, value, (size,), self.units[name], limit, rows)
+            if name not in self.units:
+                raise UserError(
+                    f"{name} is not a measurement; a step takes {', '.join(self.units)}"
+                )
+            limit, rows = (np.inf if name == "time" else _LARGEST), count if name in PER_BALL else 1
+            checked[name] = _array(
+                f"the measurement {name}", value, self._sizes[name], self.units[name], limit, rows
+            )
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
         return checked
@@ -326,46 +307,44 @@ class DeployedPolicy:
 
     def _refuse_impossible(self, measured: Measurements) -> None:
         """Raises UserError for a measurement that no world of the training can hold."""
+        farthest = self.metadata.ball.distance
         far = np.linalg.norm(measured.get("ball_position", np.zeros(3)).reshape(-1, 3), axis=1)
-        if np.max(far) > 2.0 * self.metadata.ball.distance:
+        if np.max(far) > 2.0 * farthest:
             raise UserError(
                 f"the measurement ball_position is {np.max(far):.3g} m from the robot's base, but "
-                f"no ball of the training farther than {self.metadata.ball.distance:.3g} m; give "
-                "metres in the robot's frame"
+                f"no ball of the training farther than {farthest:.3g} m; give metres in the "
+                "robot's frame"
             )
         for name in self.metadata.commands.keys() & measured.keys():
-            (low, high), unit = self.metadata.commands[name]
+            low, high = self.metadata.commands[name].range
             room, value = max(high - low, _OUTSIDE), float(measured[name][0])
             if not low - room <= value <= high + room:
                 raise UserError(
                     f"the command {name} is {value:g}, but the training had {low:g} to {high:g} "
-                    f"({unit or 'no unit'}); give one near this range"
+                    f"({self.units[name]}); give one near this range"
                 )
         angles = measured.get("joint_angles", np.array(self.metadata.default_joint_angles))
         outside = np.abs(angles - self._motion.clipped(angles))
-        if np.max(outside) > _OUTSIDE:
-            joint = self.metadata.joint_names[int(np.argmax(outside))]
+        worst = np.argmax(outside)
+        if outside[worst] > _OUTSIDE:
             raise UserError(
-                f"the measurement joint_angles has {angles[np.argmax(outside)]:.3g} for {joint}, "
-                f"{np.max(outside):.2g} rad outside its range; give rad, in the policy's order"
+                f"the measurement joint_angles has {angles[worst]:.3g} for "
+                f"{self.metadata.joint_names[worst]}, {outside[worst]:.2g} rad outside its range; "
+                "give rad, in the policy's order"
             )
 
 
-def _array(
-    label: str, value: Any, shape: tuple[int], unit: str, limit: float, rows: int = 1
-) -> np.ndarray:
-    """A user's numbers, which may come in rows, as an array; UserError for another shape or numbers
-    beyond a limit."""
-    count = "one number" if shape == (1,) else f"{shape[0]} numbers"
+def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int = 1) -> np.ndarray:
+    """A user's numbers, which may come in rows, as an array [size]; UserError for another shape or
+    numbers beyond a limit."""
+    count = "one number" if size == 1 else f"{size} numbers"
     try:
-        array = np.array(value, float)
+        array = np.atleast_1d(np.array(value, float))
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
-    if rows > 1 and array.shape == (rows, shape[0] // rows):
-        array = array.ravel()
-    if array.shape != shape and not (shape == (1,) and array.shape == ()):
+    if array.shape not in ((size,), (rows, size // rows)):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
     wrong = ~(np.isfinite(array) & (np.abs(array) <= limit + 1e-6))
     if np.any(wrong):
         raise UserError(f"{label} holds {array[wrong].flat[0]}; give finite numbers ({unit})")
-    return array.reshape(shape)
+    return array.ravel()

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
 Box = tuple[Sequence[float], Sequence[float]]
-Fault = tuple[str, str] | None
 
 _HOME_TOLERANCE = 2e-3
 
@@ -39,7 +37,7 @@ class Supervisor:
         self,
         policy: "DeployedPolicy",
         rate: float,
-        box: Box | None = None,
+        box: Box = ((-math.inf,) * 3, (math.inf,) * 3),
         max_picture_age: float | None = None,
         max_steps_late: float = 2.0,
         home_speed: float = 0.3,
@@ -52,18 +50,15 @@ class Supervisor:
         fastest = FASTEST if limits is None else min(limits.velocity)
         for name, value, most in (
             ("max_picture_age", age, 1.0),
-            ("max_steps_late", max_steps_late, math.inf),
+            ("max_steps_late", max_steps_late, 1.0 / metadata.control_dt),
             ("home_speed", home_speed, fastest),
         ):
-            if not (isinstance(value, Real) and 0.0 < value <= most and math.isfinite(value)):
-                limit = "" if most == math.inf else f" and at most {most:g}"
-                raise UserError(f"{name} is {value!r}; give a finite number above 0{limit}")
-        self._box = None if box is None else np.array(box, float)
-        if self._box is not None and (
-            self._box.shape != (2, 3) or not np.all(np.diff(self._box, axis=0) > 0.0)
-        ):
+            if not 0.0 < value <= most:
+                raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
+        corners = np.array(box, float)
+        if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._allowed = allowed(metadata, age, max_steps_late, self._box)
+        self._allowed = allowed(metadata, age, max_steps_late, corners)
         self._home_speed, self._chain = home_speed, Chain(metadata)
         self.state: State = "homing"
         self.fault: str | None = None
@@ -71,7 +66,7 @@ class Supervisor:
         that the policy refuses, `stopped` after `stop`."""
         self.reason: str | None = None
         """Why the arm has stopped or brakes."""
-        self._is_new = True
+        self._past: np.ndarray | None = None
 
     def start(self) -> None:
         """Starts an episode.
@@ -86,7 +81,7 @@ class Supervisor:
             )
         self._policy.reset(self._policy.targets)
         self._time: float | None = None
-        self._clock, self._idle = 0.0, 0
+        self._idle = 0
         self._pictures: list[tuple[np.ndarray, float]] = []
         self.state = "running"
 
@@ -103,7 +98,7 @@ class Supervisor:
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        self.state, self.fault, self.reason, self._is_new = "homing", None, None, True
+        self.state, self.fault, self.reason, self._past = "homing", None, None, None
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad.
@@ -121,15 +116,15 @@ class Supervisor:
         if self.state not in ("braking", "stopped"):
             step = self._follow if self.state == "running" else self._go_home
             try:
-                fault = step(measurements)
+                step(measurements)
             except UserError as error:
                 if policy.targets is None:
                     raise
-                fault = "measurement", str(error)
-            if fault is not None:
-                self.stop(fault[1], fault[0])
+                self.stop(str(error), "measurement")
         if self.state in ("braking", "stopped"):
-            policy.hold(self._angles(measurements) if policy.targets is None else None)
+            if policy.targets is None:
+                policy.reset(self._angles(measurements))
+            policy.hold()
             if self.state == "braking" and policy.is_still:
                 self.state = "stopped"
         return policy.commands(self._rate)
@@ -139,72 +134,68 @@ class Supervisor:
         given = {k: v for k, v in measurements.items() if k == "joint_angles"}
         return self._policy.checked(given, ("joint_angles",))["joint_angles"]
 
-    def _go_home(self, measurements: Mapping[str, Any]) -> Fault:
-        """A step of the way home, and what is wrong with it."""
+    def _is_fine(self, facts: dict[str, Any]) -> bool:
+        """Brakes if the facts break a rule, and says whether they keep all."""
+        fault = first_fault(self._allowed, facts)
+        if fault is not None:
+            self.stop(fault[1], fault[0])
+        return fault is None
+
+    def _go_home(self, measurements: Mapping[str, Any]) -> None:
+        """A step of the way home."""
         policy, angles = self._policy, self._angles(measurements)
         home = np.array(policy.metadata.default_joint_angles)
-        if self._is_new:
+        if self._past is None:
             # A small distance is the arm's load, and needs no step of the command.
             if policy.targets is None or not self._are_near(policy.targets, angles):
                 policy.reset(angles)
-            self._is_new = False
-            _, steps, inputs = self._allowed.pull.shape
-            self._past = np.tile(angles, (round(steps) + 1, 1))
-            self._sent = np.tile(policy.targets, (inputs, 1))
-        fault = first_fault(self._allowed, self._window(angles))
-        if fault is not None:
-            return fault
+            rest = [[angles], [policy.targets]]
+            self._past = np.repeat(rest, self._allowed["angles"].window + 1, axis=1)
+        if not self._is_fine(self._window(angles)):
+            return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
             policy.move(home, self._home_speed)
-            return None
+            return
         policy.hold()
         is_home = policy.is_still and self._are_near(angles, home)
         self.state = "ready" if is_home else "homing"
-        return None
 
     def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.max(np.abs(one - other)) <= self._allowed.offset)
+        return bool(np.max(np.abs(one - other)) <= self._allowed["angles"].offset)
 
-    def _follow(self, measurements: Mapping[str, Any]) -> Fault:
-        """A step of the policy, and what is wrong with it."""
+    def _follow(self, measurements: Mapping[str, Any]) -> None:
+        """A step of the policy."""
         policy = self._policy
         measured = policy.checked(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
-        fault = first_fault(self._allowed, self._facts(measured))
-        if fault is not None:
-            return fault
+        if not self._is_fine(self._facts(measured)):
+            return
         last = policy.step_number
         policy.step(measurements)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
-            fault = first_fault(self._allowed, {"idle": self._idle})
-            if fault is None:
-                policy.hold()
-            return fault
-        fault = first_fault(self._allowed, {"target": self._chain.paddle(policy.targets)[0]})
-        if fault is not None:
+            policy.hold()
+        target = self._chain.paddle(policy.targets)[0]
+        if not self._is_fine({"idle": self._idle, "target": target}):
             policy.withdraw()
-        return fault
 
     def _window(self, angles: np.ndarray) -> dict[str, np.ndarray]:
         """The last angles and commands, with those of this control step."""
-        self._past = np.concatenate([self._past[1:], angles[None]])
-        self._sent = np.concatenate([self._sent[1:], self._policy.targets[None]])
-        return {"angles": self._past, "commands": self._sent}
+        now = [[angles], [self._policy.targets]]
+        self._past = np.concatenate([self._past[:, 1:], now], axis=1)
+        return {"angles": self._past[0], "commands": self._past[1]}
 
     def _facts(self, measured: Measurements) -> dict[str, Any]:
         """The facts of a running episode, for the rules."""
-        facts: dict[str, Any] = self._window(measured["joint_angles"])
-        facts["paddle"] = self._chain.paddle(measured["joint_angles"])[0]
+        angles, dt = measured["joint_angles"], self._policy.metadata.control_dt
+        facts: dict[str, Any] = self._window(angles)
+        facts["paddle"] = self._chain.paddle(angles)[0]
+        last = self._time
+        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + dt
+        if last is not None:
+            self._time = max(self._time, last)
+            facts["elapsed"] = self._time - last
         if "joint_velocities" in measured:
             facts["velocities"] = measured["joint_velocities"]
-        elapsed, time = self._policy.metadata.control_dt, None
-        if "time" in measured:
-            time = float(measured["time"][0])
-            if self._time is not None:
-                facts["elapsed"] = elapsed = max(time - self._time, 0.0)
-                time = self._time + elapsed
-        self._time = time
-        self._clock += elapsed
         if "ball_velocity" in measured:
             facts["ball_velocity"] = measured["ball_velocity"].reshape(-1, 3)
         if "ball_position" in measured:
@@ -213,17 +204,17 @@ class Supervisor:
         return facts
 
     def _picture(self, ball: np.ndarray, age: float | None, paddle: np.ndarray) -> dict[str, Any]:
-        """The facts of the ball's newest picture [B, 3] and of the one before."""
+        """The facts of the ball's newest picture [B, 3] and of the ones before."""
         if not self._pictures or np.any(ball != self._pictures[-1][0]):
-            taken = self._clock - (age or 0.0)
-            self._pictures = [*self._pictures[-EARLIER:], (ball, taken)]
-        held = self._clock - self._pictures[-1][1]
+            self._pictures = [*self._pictures[-EARLIER:], (ball, self._time - (age or 0.0))]
+        seen = self._pictures
         # A ball in flight that does not move is an old picture, whatever its age is said to be.
         if age is None or np.max(ball[:, 2]) > paddle[2] + FLYING:
-            age = held if age is None else max(held, age)
-        seen, facts = self._pictures, {"ball": ball, "age": age}
+            age = max(self._time - seen[-1][1], age or 0.0)
+        facts = {"ball": ball, "age": age, "earlier_ball": np.full(ball.shape, np.nan)}
+        if len(seen) > EARLIER:
+            facts["earlier_ball"] = seen[0][0]
         if len(seen) > 1:
             between = max(seen[-1][1] - seen[-2][1], self._policy.metadata.control_dt)
-            facts |= {"last_ball": seen[-2][0], "between": between}
-        none = np.full(ball.shape, np.nan)
-        return facts | {"earlier_ball": seen[0][0] if len(seen) > EARLIER else none}
+            facts["ball_motion"] = (ball - seen[-2][0]) / between
+        return facts
