@@ -33,7 +33,7 @@ DRIBBLE = f"{CHECKOUT / 'examples' / 'dribble_task.py'}:Dribble"
 
 # Words that stay outside of tasks/: public names, ids of other libraries, files of the package.
 PUBLIC = re.compile(
-    r"bounce_mjx|BOUNCE_MJX|bounce-mjx|BounceBall|bounce_ball|BounceConfig|tasks\.bounce\b|tasks/bounce\b"
+    r"bounce_mjx|BOUNCE_MJX|BounceMjx|bounce-mjx|BounceBall|bounce_ball|BounceConfig|tasks\.bounce\b|tasks/bounce\b"
 )
 # A row of the results of `REST`.
 RESULT = r"rests +episodes"

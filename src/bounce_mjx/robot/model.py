@@ -28,7 +28,7 @@ from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
 from bounce_mjx.robot.setpoints import JointLimits
 
-# With fewer physics steps in half a period of a contact, the ball can gain energy in a bounce.
+# With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
 _STEPS_OF_A_CONTACT = 4
 
 
