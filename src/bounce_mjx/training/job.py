@@ -311,6 +311,7 @@ class _Job:
 
     def _leave_untrained(self) -> NoReturn:
         """Ends the process as Ctrl-C would, without the folder of a new run."""
+        self.started = False
         self._remove_unstarted(KeyboardInterrupt)
         leave()
 
