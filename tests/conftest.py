@@ -26,6 +26,8 @@ from bounce_mjx.training.loop_fusion import OPTION
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
+# A folder that keeps the compiled programs from one run to the next.
+KEPT_CACHE = os.environ.get("BOUNCE_MJX_TESTS_CACHE")
 
 OPTIONAL = "CI" not in os.environ
 HAS_TORCH = all(importlib.util.find_spec(name) for name in ("torch", "rsl_rl", "skrl"))
@@ -47,12 +49,12 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGINT, lambda *args: signal.default_int_handler(*args))
     # The workers of pytest-xdist inherit the folder.
     if not hasattr(config, "workerinput"):
-        os.environ[CACHE] = tempfile.mkdtemp(prefix="bounce_mjx_tests_")
+        os.environ[CACHE] = KEPT_CACHE or tempfile.mkdtemp(prefix="bounce_mjx_tests_")
     jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    if not hasattr(config, "workerinput"):
+    if not hasattr(config, "workerinput") and not KEPT_CACHE:
         shutil.rmtree(os.environ[CACHE], ignore_errors=True)
 
 
