@@ -18,7 +18,6 @@ from bounce_mjx.errors import UserError, install_command, needed, reason_of, sho
 from bounce_mjx.files import check_name
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.limits import check_files
 from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
@@ -148,9 +147,8 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     """The spec of an MJCF file.
 
     Raises:
-      UserError: the file is no MJCF, or is too large.
+      UserError: the file is no MJCF.
     """
-    check_files(path)
     try:
         with _silent():
             spec = mujoco.MjSpec.from_file(str(path))
