@@ -17,8 +17,6 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from bounce_mjx.commands import view
-from bounce_mjx.evaluation.benchmark import Figures
-from bounce_mjx.reports import benchmark
 
 pytestmark = [
     pytest.mark.slow,
@@ -124,24 +122,6 @@ def test_replay_page_moves_and_makes_no_requests(
     strangers = [url for url in watched.requests if url != own and not url.startswith("blob:null")]
     assert not strangers
     assert not watched.complaints
-
-
-def test_the_benchmark_fits_a_phone(browser: Browser, tmp_path: Path) -> None:
-    figures = Figures(
-        suite_met=7, suite_conditions=9, latency_ms=20, push_m_s=0.1, hits=1.0, ranking={"RMS": 2.0}
-    )
-    others = figures.model_copy(update={"latency_ms": 110.0, "hits": 10_000.0})
-    row = benchmark.Row("runs/bounce_ball/a_long_name_of_a_run", "bounce", "arm", [figures, others])
-    shown = benchmark.Benchmark("1", "cpu", "fused", 64, 0, [row])
-    (tmp_path / "a.html").write_text(benchmark.page(shown))
-    phone = browser.new_page(viewport={"width": 390, "height": 800})
-    phone.goto((tmp_path / "a.html").as_uri())
-    beyond = "[...document.querySelectorAll('*')].filter(x => x.scrollWidth > x.clientWidth + 1)"
-    assert phone.evaluate(f"{beyond}.filter(x => x.clientWidth).length") == 0
-    for cell, title in zip(phone.locator("td").all(), shown.header, strict=True):
-        content = cell.evaluate("x => getComputedStyle(x, '::before').content")
-        assert content == f'"{title}"' and cell.is_visible()
-    phone.close()
 
 
 @pytest.fixture

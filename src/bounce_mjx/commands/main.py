@@ -1,6 +1,6 @@
 """The console script.
 
-`bounce-mjx train|eval|robustness|benchmark|play|view|adopt|plot|report|export|...`
+`bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|...`
 """
 
 import difflib
@@ -19,7 +19,6 @@ COMMANDS = {
     "train": "train a policy",
     "eval": "measure the results of a trained policy",
     "robustness": "measure the results in perturbed worlds",
-    "benchmark": "rank policies by figures beyond the results",
     "play": "show a trained policy",
     "view": "show the environment under random or zero actions, or the mirror law",
     "adopt": "write the config of another robot arm",

@@ -108,13 +108,8 @@ def run_until(
     policy: Policy | None,
     progress: UnderWay,
     last_step: int | jax.Array,
-    lasts: Callable[[Statistics], jax.Array | bool] = lambda statistics: True,
 ) -> UnderWay:
-    """Continues until all episodes have ended or `last_step` is reached.
-
-    Args:
-      lasts: whether each episode continues by its statistics so far [E], bool.
-    """
+    """Continues until all episodes have ended or `last_step` is reached."""
 
     def unfinished(now: UnderWay) -> jax.Array:
         return jnp.any(now.statistics.running) & (now.step < last_step)
@@ -122,10 +117,9 @@ def run_until(
     def advance(now: UnderWay) -> UnderWay:
         actions = actor.act(policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        statistics = accumulate(env, now.statistics, states, now.step)
         return UnderWay(
             states=states,
-            statistics=statistics._replace(running=statistics.running & lasts(statistics)),
+            statistics=accumulate(env, now.statistics, states, now.step),
             recording=record(env, now.recording, states, now.statistics.running, now.step),
             step=now.step + 1,
         )

@@ -162,24 +162,19 @@ def _standing(evaluation: Evaluation) -> str:
     return "screening" if evaluation.screening else "-"
 
 
-def table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], has_many_columns: bool = False
-) -> str:
-    """A table in HTML, with coloured verdicts. On a phone, it scrolls sideways by itself; with many
-    columns, each row becomes a list."""
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in HTML, with coloured verdicts. On a phone, it scrolls sideways by itself."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
         classes = [{"pass": "pass", "FAIL": "fail"}.get(cell, "") for cell in cells]
         inner = "".join(
-            f'<{tag} class="{name}"{title}>{html.escape(cell)}</{tag}>'
-            for title, name, cell in zip(titles, classes, cells, strict=True)
+            f'<{tag} class="{name}">{html.escape(cell)}</{tag}>'
+            for name, cell in zip(classes, cells, strict=True)
         )
         return f"<tr>{inner}</tr>\n"
 
-    titles = [f' title="{html.escape(name)}"' if has_many_columns else "" for name in header]
     body = "".join(row("td", cells) for cells in rows)
-    kind = ' class="many"' if has_many_columns else ""
-    return f'<div class="wide"><table{kind}>\n{row("th", header)}{body}</table></div>'
+    return f'<div class="wide"><table>\n{row("th", header)}{body}</table></div>'
 
 
 STYLE = """
@@ -196,11 +191,6 @@ code, pre { font-size: 13px; overflow-wrap: anywhere; white-space: pre-wrap; }
 summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
 @media (max-width: 30rem) {
   th, td { padding-right: 0.4rem; font-size: 13px; }
-  .many th { display: none; }
   .many, .many tbody, .many tr { display: block; }
-  .many tr { padding: 0.6rem 0; border-bottom: 1px solid #ddd; }
-  .many td { display: flex; justify-content: space-between; gap: 1rem; border: 0; padding: 0; }
-  .many td::before { content: attr(title); color: #666; font-weight: normal; }
-  .many td:first-child { font-weight: bold; overflow-wrap: anywhere; }
 }
 """

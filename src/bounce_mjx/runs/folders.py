@@ -190,13 +190,6 @@ def runs_in(folder: Path) -> list[Path]:
     return sorted(filter(_has_checkpoint, _runs(folder)), key=_started)
 
 
-def runs_of_row(path: Path) -> list[Path]:
-    """Runs whose figures a row of a table shows: those of a run's seeds or in a folder of runs, or
-    the path itself. Other runs in a run's folder, as in a clone's pretrained/, do not count."""
-    is_run = (path / CONFIG_FILE).is_file()
-    return runs_of_seeds(path) if is_run else runs_in(path) or [path]
-
-
 def find_checkpoint(path: Path) -> Checkpoint:
     """Finds a checkpoint.
 

@@ -99,8 +99,8 @@ class Task:
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset draws for the task."""
     hits: ClassVar[str] = ""
-    """The sum of `tally` that counts hits; the benchmark then measures episodes without a time
-    limit, up to a number of hits."""
+    """The sum of `tally` that counts hits; `benchmarks/rank.py` then measures episodes without a
+    time limit, up to a number of hits."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
     """Metrics that the value network sees by default, because the reward depends on them and the
     observation does not contain them."""
@@ -184,8 +184,8 @@ class Task:
         return {}
 
     def ranking(self, episodes: Episodes) -> dict[str, Figure]:
-        """Further figures for the benchmark, which rank policies that meet all results; a unit
-        follows a comma."""
+        """Further figures for `benchmarks/rank.py`, which rank policies that meet all results; a
+        unit follows a comma."""
         return {}
 
     def recorded(self, moment: Moment) -> Values:
