@@ -17,17 +17,6 @@ from test_physics import XML, edited
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
     # edit, text that the message must contain
-    "timestep 0": ('timestep="0.001"', 'timestep="0"', "timestep 0.0"),
-    "timestep nan": ('timestep="0.001"', 'timestep="nan"', "timestep nan"),
-    "timestep negative": ('timestep="0.001"', 'timestep="-0.1"', "timestep -0.1"),
-    "position nan": (
-        '<body name="Link1" pos="0 0 0.1">',
-        '<body name="Link1" pos="0 0 nan">',
-        "nan in body_pos",
-    ),
-    "mass inf": ('mass="0.0027"', 'mass="inf"', "inf in body_mass"),
-    "gravity nan": ('gravity="0 0 -9.81"', 'gravity="0 0 nan"', "nan in gravity"),
-    "armature inf": ('armature="0.02"', 'armature="inf"', "inf in dof_armature"),
     "velocity servo": (SERVO_2, '<velocity name="act2" joint="Joint2" kv="200"/>', "Joint2"),
     "motor": (SERVO_2, '<motor name="act2" joint="Joint2"/>', "Joint2"),
     "integrated velocity": (
@@ -42,13 +31,11 @@ REFUSED = {
         'biasprm="0 -20000 -200"/>',
         "Joint2",
     ),
-    "damping negative": ('armature="0.02"', 'damping="-1"', "-1 in dof_damping"),
-    "armature negative": ('armature="0.02"', 'armature="-0.1"', "-0.1 in dof_armature"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_models_that_cannot_be_simulated_are_refused(tmp_path, name):
+def test_models_without_position_servos_are_refused(tmp_path, name):
     old, new, text = REFUSED[name]
     assert old in XML
     mjcf = tmp_path / "robot.xml"

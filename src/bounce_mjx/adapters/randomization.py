@@ -40,8 +40,23 @@ from bounce_mjx.physics.parameters import (
     to_direct_solref,
 )
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.robot.numbers import DERIVED_FIELDS
 from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
+
+# Fields that MuJoCo's compiler can compute from others.
+_DERIVED_FIELDS = frozenset(
+    (
+        "actuator_acc0",
+        "actuator_length0",
+        "body_inertia",
+        "body_invweight0",
+        "body_subtreemass",
+        "dof_M0",
+        "dof_invweight0",
+        "dof_length",
+        "geom_aabb",
+        "geom_rbound",
+    )
+)
 
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
@@ -116,7 +131,7 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
         )
     sources = _sources(mj_model, contact_pair(mj_model) if contact else None)
     known = {source.field for source in sources}
-    for name in sorted(varied.keys() - known - DERIVED_FIELDS):
+    for name in sorted(varied.keys() - known - _DERIVED_FIELDS):
         raise UserError(
             f"randomization_fn changes {name}, which this physics cannot vary between "
             f"environments; leave it out, or change {', '.join(sorted(known))}"

@@ -18,7 +18,6 @@ from bounce_mjx.errors import UserError, install_command, needed, reason_of, sho
 from bounce_mjx.files import check_name
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
@@ -133,7 +132,6 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     """
     arm = read_spec(path)
     model = compile_spec(arm, path)
-    check_numbers(model)
     try:
         return _Builder(arm, model, config).build()
     except (ValueError, mujoco.FatalError) as error:
