@@ -254,11 +254,10 @@ def reward_terms():
 
 
 def sensors():
-    """A camera's pictures and the filter's estimates of the same flight."""
+    """A camera's pictures of a flight."""
     camera = {"camera_rate": (60.0, 60.0), "ball_latency": (0.02, 0.02)}
     camera |= {"ball_position_noise": (0.005, 0.005)}
     time, seen, layout, truth, _ = rollout({}, camera)
-    filtered = rollout({"position": "filter", "velocity": "filter"}, camera)
     rough = rollout({"velocity": "differences"}, camera)
     part = (time > 1.0) & (time < 2.2)
     figure, (top, bottom) = plt.subplots(
@@ -273,8 +272,7 @@ def sensors():
         where = layout[name].start + 2
         axes.plot(time[part], true[part], color="black", lw=2, label="true")
         axes.plot(time[part], measured[part, where], ".", color=LINES[1], ms=4, label=label)
-        axes.plot(time[part], filtered[1][part, where], color=LINES[0], lw=1.4, label="filter")
-        axes.legend(loc="upper right", bbox_to_anchor=(1.0, 1.17), ncols=3)
+        axes.legend(loc="upper right", bbox_to_anchor=(1.0, 1.17), ncols=2)
     top.set(ylabel="height of the ball, m")
     bottom.set(ylabel="vertical velocity, m/s", xlabel="time, s", xlim=(1.0, 2.2))
     return figure

@@ -807,7 +807,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     older = onnx.load_from_string(shipped)
     entries = {prop.key: prop for prop in older.metadata_props}
     entries["format"].value = "1"
-    older.metadata_props.remove(entries["estimator"])
+    older.metadata_props.remove(entries["chain"])
     unknown = onnx.load_from_string(shipped)
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
@@ -842,8 +842,6 @@ WRONG_ENTRIES = {
     "servo_stiffness": [[1.0] * 5, 3.0],
     "torque_limits": [[None] * 7],
     "velocity": ["guessed", ["filter"], None],
-    "position": ["differences", 3],
-    "estimator": [None, {}, []],
     "paddle": [[0.0, 0.0], [1e300, 0.0, 0.0]],
     "ball": [[3.0, 20.0], {"distance": -1.0, "speed": 9.0}, {"distance": 3.0}],
     "paddle_normal": [[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
@@ -855,10 +853,10 @@ WRONG_ENTRIES = {
 
 
 @pytest.fixture(scope="module")
-def filtered(tmp_path_factory: pytest.TempPathFactory) -> onnx.ModelProto:
-    """A policy that sees every kind of quantity, the ball by the Kalman filter."""
-    observation = ALL | {"position": "filter", "velocity": "filter", "ball_velocity": 2}
-    run = make_run(tmp_path_factory.mktemp("filtered") / "run", {"observation": observation})
+def curious(tmp_path_factory: pytest.TempPathFactory) -> onnx.ModelProto:
+    """A policy that sees every kind of quantity."""
+    observation = ALL | {"velocity": "differences", "ball_velocity": 2}
+    run = make_run(tmp_path_factory.mktemp("curious") / "run", {"observation": observation})
     model = export_onnx(find_checkpoint(run))
     DeployedPolicy(model, "the file before the edits")
     return onnx.load_from_string(model)
@@ -873,13 +871,19 @@ def edited(model: onnx.ModelProto, name: str, text: str) -> bytes:
 
 
 @pytest.mark.parametrize("name", WRONG_ENTRIES)
-def test_a_wrong_entry_is_refused_by_name(name: str, filtered: onnx.ModelProto) -> None:
+def test_a_wrong_entry_is_refused_by_name(name: str, curious: onnx.ModelProto) -> None:
     for value in WRONG_ENTRIES[name]:
         with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file") as refusal:
-            DeployedPolicy(edited(filtered, name, json.dumps(value)), "a.onnx")
+            DeployedPolicy(edited(curious, name, json.dumps(value)), "a.onnx")
         reason = str(refusal.value)
-        words = (name, "estimator", "joints", "input", "length than 1", "measurement")
+        words = (name, "joints", "input", "length than 1", "measurement")
         assert len(reason) < 400 and any(word in reason for word in words), (value, reason)
+
+
+@pytest.mark.parametrize("name", ["position", "velocity"])
+def test_a_policy_with_a_filter_is_refused(name: str, curious: onnx.ModelProto) -> None:
+    with pytest.raises(UserError, match="a.onnx is not a policy .*Kalman filter, .* 0.1.0"):
+        DeployedPolicy(edited(curious, name, '"filter"'), "a.onnx")
 
 
 def nodes(value: object) -> list[tuple[object, object]]:
@@ -911,14 +915,14 @@ def random_edit(rng: random.Random, text: str) -> str:
 
 
 @pytest.mark.slow
-def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.ModelProto) -> None:
+def test_an_edited_file_is_refused_or_acts_within_the_ranges(curious: onnx.ModelProto) -> None:
     rng, acting = random.Random(0), 0
-    entries = {prop.key: prop.value for prop in filtered.metadata_props}
+    entries = {prop.key: prop.value for prop in curious.metadata_props}
     for _ in range(500):
         name = rng.choice(list(entries))
         text = random_edit(rng, entries[name])
         try:
-            policy = DeployedPolicy(edited(filtered, name, text), "a.onnx")
+            policy = DeployedPolicy(edited(curious, name, text), "a.onnx")
         except UserError as error:
             assert "a.onnx is not a policy" in str(error) and "\n" not in str(error), (name, text)
             continue
@@ -935,8 +939,8 @@ def test_an_edited_file_is_refused_or_acts_within_the_ranges(filtered: onnx.Mode
     assert 20 < acting < 400
 
 
-def test_a_network_that_gives_no_number_is_refused(filtered: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+def test_a_network_that_gives_no_number_is_refused(curious: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(curious.SerializeToString())
     for tensor in copy.graph.initializer:
         array = onnx.numpy_helper.to_array(tensor).copy()
         # The biases of the last layer are among them.
@@ -978,15 +982,15 @@ def retype(model: onnx.ModelProto, kind: int) -> None:
 
 
 @pytest.mark.parametrize("edit", HOSTILE_MEMORY.values(), ids=HOSTILE_MEMORY)
-def test_a_memory_of_another_size_is_refused(edit, filtered: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+def test_a_memory_of_another_size_is_refused(edit, curious: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(curious.SerializeToString())
     edit(copy)
     with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
-def test_an_unknown_output_is_refused(filtered: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(filtered.SerializeToString())
+def test_an_unknown_output_is_refused(curious: onnx.ModelProto) -> None:
+    copy = onnx.ModelProto.FromString(curious.SerializeToString())
     copy.graph.output.append(onnx.helper.make_empty_tensor_value_info("more"))
     copy.graph.node.append(onnx.helper.make_node("Identity", ["action"], ["more"]))
     with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):

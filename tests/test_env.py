@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.tasks.bounce import Bounce, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
@@ -264,6 +266,14 @@ def test_a_reset_has_its_noise_in_one_place() -> None:
     assert EnvConfig(**FORMER_NO_NOISE) == EnvConfig(reset=NO_NOISE)
     both = EnvConfig(joint_angle_noise=0.5, reset={"ball_position": 0.3}).reset
     assert (both.joint_angles, both.ball_position) == (0.5, 0.3)
+
+
+def test_a_config_of_an_earlier_version_has_no_filter() -> None:
+    former = EnvConfig(estimator={"restitution": 0.8}, observation={"position": "measured"})
+    assert former == EnvConfig()
+    for name in ("position", "velocity"):
+        with pytest.raises(UserError, match="a.yaml: observation: the Kalman filter is gone; set"):
+            validate(EnvConfig, {"observation": {name: "filter"}}, "a.yaml")
 
 
 def test_noise_free_reset_has_the_paddle_at_home():

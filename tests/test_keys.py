@@ -54,8 +54,7 @@ VALUES = {
     "warm_start": "nowhere", "log_dir": "elsewhere",
     "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.num_balls": 2,
     "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0], "env.ball_init_pos": [0.5, 0, 0.4],
-    "env.target_height_range": [0.4, 0.5], "env.estimator.latency": 0.01,
-    "env.estimator.air_drag": 0.1, "env.control_dt": 0.02,
+    "env.target_height_range": [0.4, 0.5], "env.control_dt": 0.02,
     "env.robot.site": "nowhere", "env.robot.joints": ["Joint1"],
     "env.robot.paddle.quaternion": [1, 0, 0, 0], "env.robot.ball.mass": 0.003,
     "env.robot.ball.radius": 0.02, "env.robot.servo_stiffness": [100.0] * 6,
@@ -95,11 +94,6 @@ NEEDED = {
 WITH = {
     "env.randomization.share": {"randomization": {"restitution": [0.8, 0.9]}},
     "env.randomization.shares": {"randomization": {"restitution": [0.8, 0.9]}},
-    **{
-        key: {"observation": {"position": "filter", "velocity": "filter"}}
-        for key in KEYS
-        if key.startswith("env.estimator.")
-    },
 }
 
 

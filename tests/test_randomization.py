@@ -263,11 +263,10 @@ def test_bad_range(values: dict, words: str) -> None:
 
 
 def test_off_is_the_program_without_randomisation() -> None:
-    """The settings of the warm-up and of an unused estimator do not matter; an active term changes
-    the program."""
+    """The settings of the warm-up do not matter; an active term changes the program."""
 
-    def program(estimator: dict | None = None, **settings) -> tuple[str, int]:
-        env = BounceBall(EnvConfig(randomization=settings, estimator=estimator or {}))
+    def program(**settings) -> tuple[str, int]:
+        env = BounceBall(EnvConfig(randomization=settings))
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
         jaxpr = jax.make_jaxpr(env.step)(state, jnp.zeros(6))
         return str(jaxpr), len(jaxpr.in_avals)
@@ -275,7 +274,6 @@ def test_off_is_the_program_without_randomisation() -> None:
     off, inputs = program()
     assert "shift_right_logical" not in off
     assert program(warmup_steps=1000, share=0.5) == (off, inputs)
-    assert program(estimator={"restitution": 0.7, "latency": 0.1}) == (off, inputs)
     on, more = program(ball_position_noise=(0.0, 0.01))
     assert "shift_right_logical" in on and more > inputs
 

@@ -45,7 +45,7 @@ ALLOWED = {
     "commands/main.py", "commands/play.py", "commands/train.py",
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
-    "world/ball_filter.py", "world/observation.py", "world/randomization.py",
+    "world/observation.py", "world/randomization.py",
     "identify/fit.py", "identify/replay.py", "identify/stages.py",
     "identify/unknowns.py", "identify/windows.py", "identify/words.py", "identify/world.py",
 }  # fmt: skip

@@ -53,6 +53,7 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
     [
         ({"name": "mine"}, "unknown key name"),
         ({"env": {"observation": {"action": 3}}}, "unknown key env.observation"),
+        ({"env": {"estimator": {"latency": 0.01}}}, "unknown key env.estimator"),
         ({"env": {"randomization": {"latency": [0, 1]}}}, "unknown key env.randomization.latency"),
         ({"env": {"randomization": {"frame_drop": [0.5, 0.1]}}}, "frame_drop"),
         ({"sources": {"randomization": "x", "robot": "y"}}, "robot has a source, but env has no"),

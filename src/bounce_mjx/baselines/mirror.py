@@ -9,6 +9,8 @@ laws", ICRA 1994). The arm's inverse kinematics turn the paddle's pose into join
 Like a policy, the law sees only the observation. It knows the nominal model.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,8 +21,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.estimator import filter_constants, upper_face
 
+# Restitution of the ball on the paddle.
+_RESTITUTION = 0.85
 # Share of the way back to its place that a ball makes in one flight.
 _RETURN = 0.7
 # Bounds of the paddle's velocity over the ball's, and of its tilt (rad) and its distance from its
@@ -71,12 +74,14 @@ class MirrorLaw:
         self._env, at = env, find_addresses(model)
         self._arm, self._servos = list(at.arm_qpos), list(at.actuators)
         self._home = np.array(config.default_joint_angles)
-        normal, _ = upper_face(model, self._home)
+        normal, height = upper_face(model, self._home)
         self._above = model.geom_pos[at.paddle_geom] + normal
         home = self._pose(jnp.asarray(self._home))
         self._inverse = np.linalg.pinv(jax.jacfwd(self._pose)(jnp.asarray(self._home)))
         self._place = np.array([*config.ball_init_pos[:2], float(home[2])])
-        self._constants = filter_constants(config, model)
+        self._gravity = model.opt.gravity.copy()
+        # From the paddle's centre to that of a ball that touches it, m.
+        self._contact_distance = float(height + model.geom_size[at.ball_geom, 0])
         self._read_servos(model, list(at.arm_qvel))
 
     def _read_servos(self, model: mujoco.MjModel, dofs: list[int]) -> None:
@@ -108,7 +113,7 @@ class MirrorLaw:
         def joints(ball: jax.Array, velocity: jax.Array) -> jax.Array:
             return self._joints(self._paddle(ball, velocity, place, seen["target_height"][0]))
 
-        fall = velocity, jnp.asarray(self._constants.gravity)
+        fall = velocity, jnp.asarray(self._gravity)
         angles, speeds = jax.jvp(joints, (ball, velocity), fall)
         # While the ball rises there is time; a sudden turn would disturb the impact that ends.
         speeds = jnp.where(velocity[2] < 0.0, speeds, 0.0)
@@ -133,21 +138,20 @@ class MirrorLaw:
           place: where the ball bounces: the paddle's centre at an impact [3], m.
           target: height of the ball's apex [], m.
         """
-        known, gravity = self._constants, -self._constants.gravity[2]
-        contact = place[2] + known.contact_distance
+        gravity, contact = float(-self._gravity[2]), place[2] + self._contact_distance
         height = ball[2] - contact
         leaving = jnp.sqrt(2.0 * gravity * jnp.maximum(target - contact, _LEAST_HEIGHT))
         square = jnp.maximum(velocity[2] ** 2 + 2.0 * gravity * height, _LEAST_SQUARE)
         # A ball that touches the paddle does not show its energy.
         arriving = jnp.where(height > 0.0, jnp.sqrt(square), leaving)
-        mirroring = (leaving / arriving - known.restitution) / (1.0 + known.restitution)
+        mirroring = (leaving / arriving - _RESTITUTION) / (1.0 + _RESTITUTION)
         mirroring = jnp.clip(mirroring, *_MIRRORING)
         flight = (velocity[2] + arriving) / gravity
         offset = ball[:2] + flight * velocity[:2] - place[:2]
         wanted = -_RETURN * offset * gravity / (2.0 * leaving)
         tilt = jnp.clip((wanted - velocity[:2]) / (leaving + arriving), -_MAX_TILT, _MAX_TILT)
         centre = place[:2] + jnp.clip(offset, -_MAX_DISTANCE, _MAX_DISTANCE)
-        lift = place[2] - mirroring * jnp.maximum(height, -known.contact_distance)
+        lift = place[2] - mirroring * jnp.maximum(height, -self._contact_distance)
         return jnp.concatenate([centre, lift[None], tilt])
 
     def _pose(self, angles: jax.Array) -> jax.Array:
@@ -177,3 +181,17 @@ class MirrorLaw:
         # pose again for each entry of a sum over an axis, in each of the steps before it. XLA
         # aborts on a small product of matrices with its option of `join_loops`.
         return jnp.stack(jax.lax.fori_loop(0, _ITERATIONS, improve, home))
+
+
+def upper_face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[np.ndarray, float]:
+    """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
+    the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
+    data, addresses = mujoco.MjData(mj_model), find_addresses(mj_model)
+    data.qpos[list(addresses.arm_qpos)] = joint_angles
+    mujoco.mj_kinematics(mj_model, data)
+    paddle, normal = addresses.paddle_geom, np.zeros(3)
+    upward = data.geom_xmat[paddle].reshape(3, 3)[2]
+    axis = int(np.argmax(abs(upward)))
+    face = np.sign(upward[axis]) * np.eye(3)[axis]
+    mujoco.mju_rotVecQuat(normal, face, mj_model.geom_quat[paddle])
+    return normal, float(mj_model.geom_aabb[paddle, 3 + axis])

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bounce_mjx.baselines.mirror import upper_face
 from bounce_mjx.deploy.graph import EXTRA, onnx_graph
 from bounce_mjx.deploy.metadata import (
     FORMAT,
@@ -34,7 +35,6 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.estimator import filter_constants, upper_face
 from bounce_mjx.world.observation import ObservationConfig
 from bounce_mjx.world.randomization import entries
 
@@ -130,7 +130,6 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
     addresses = find_addresses(m)
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
-    filtered, velocity = env.observation.is_filtered, env.observation.velocity
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
     torques, limited = m.actuator_forcerange[servos, 1] * gear, m.actuator_forcelimited[servos]
@@ -141,10 +140,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         num_balls=env.num_balls,
         ball=BallBounds(*env.ball_bounds),
         observation=_inputs(env),
-        # Without a quantity that sees it, there is no filter.
-        position=env.observation.position if filtered else "measured",
-        velocity=velocity if filtered or velocity != "filter" else "measured",
-        estimator=filter_constants(env, m) if filtered else None,
+        position="measured",
+        velocity=env.observation.velocity,
+        estimator=None,
         control_dt=env.control_dt,
         action=_ACTION if env.robot.limits.velocity is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.estimator import RobotEstimator
 from bounce_mjx.deploy.metadata import Input, Metadata
 
 Measurements = dict[str, np.ndarray]
@@ -35,29 +34,18 @@ class Histories:
         self._no_joints = np.zeros(len(metadata.joint_names))
         self._ball_velocity = np.zeros(3 * metadata.num_balls)
         self._ball = measured.get("ball_position", self._ball_velocity)
-        # Without time stamps, each picture arrives after the latency that the filter expects.
-        self._latency = (metadata.estimator and metadata.estimator.latency) or 0.0
-        self._age = float(measured["ball_age"][0]) if "ball_age" in measured else self._latency
-        self._estimator = None
-        if metadata.estimator is not None:
-            self._estimator = RobotEstimator(
-                metadata, self._ball, measured["joint_angles"], self._age
-            )
+        self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
         start = {"ball_velocity": self._ball_velocity}
         self.newest = start | self._completed(measured, self._no_joints)
         """Newest value of each quantity, also of those that the policy does not see."""
         self.values = {i.name: np.tile(self.newest[i.name], (i.history, 1)) for i in inputs}
         """Last values of each input [history, size], the newest first."""
 
-    def add(self, measured: Measurements, action: np.ndarray, is_real: bool = True) -> None:
-        """Adds the measurements of the next control step, and the action [J] of the step before.
-
-        Args:
-          is_real: False for measurements that were interpolated, which the state estimator ignores.
-        """
+    def add(self, measured: Measurements, action: np.ndarray) -> None:
+        """Adds the measurements of the next control step, and the action [J] of the step before."""
         self.newest = self._completed(measured, action)
-        if "ball_position" in measured:
-            self.newest |= self._ball_now(measured, is_real)
+        if "ball_position" in measured and self._metadata.velocity == "differences":
+            self.newest["ball_velocity"] = self._difference(measured)
         for name, past in self.values.items():
             past[1:] = past[:-1].copy()
             past[0] = self.newest[name]
@@ -72,8 +60,8 @@ class Histories:
             "ball_picture": measured.get("ball_position", self._ball),
         } | measured
 
-    def _ball_now(self, measured: Measurements, is_real: bool) -> Measurements:
-        """Position and velocity of the ball if they are not measured; updates the last picture.
+    def _difference(self, measured: Measurements) -> np.ndarray:
+        """Velocity of the ball by the difference of its last two pictures; updates the last one.
         Without a measured age, a picture is new as soon as the position differs."""
         held_age = self._age + self._metadata.control_dt
         position = measured["ball_position"]
@@ -82,23 +70,10 @@ class Histories:
             is_new = held_age - age > _SAME_PICTURE
         else:
             is_new = bool(np.any(position != self._ball))
-            age = self._latency if is_new else held_age
+            age = 0.0 if is_new else held_age
         if is_new:
             elapsed = max(held_age - age, _SHORTEST)
             self._ball_velocity = (position - self._ball) / elapsed
             self._ball = position
         self._age = age
-        sources = {"differences": {"ball_velocity": self._ball_velocity}}
-        if self._estimator is not None:
-            estimate = self._estimator.add(
-                position if is_new and is_real else None, age, measured["joint_angles"]
-            )
-            sources["filter"] = dict(zip(("ball_position", "ball_velocity"), estimate, strict=True))
-        return {
-            name: sources[source][name]
-            for name, source in (
-                ("ball_position", self._metadata.position),
-                ("ball_velocity", self._metadata.velocity),
-            )
-            if source in sources
-        }
+        return self._ball_velocity

@@ -8,7 +8,6 @@ import math
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from bounce_mjx.deploy.strict import read
-from bounce_mjx.world.ball_filter import Constants
 
 FORMAT = 3
 """Version of the entries; readers refuse other versions."""
@@ -39,7 +38,6 @@ Limit = Annotated[float, (1e-6, 1e9)]
 
 # Entries that files may lack: their targets jump, they are of one ball, and its bounds are usual.
 _LATER = {"limits": "null", "num_balls": "1", "ball": '{"distance": 3.0, "speed": 20.0}'}
-
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
 first step; what precedes a quantity's newest value; and what precedes an output for the input of
@@ -117,12 +115,12 @@ class Metadata(NamedTuple):
     """Bounds of each ball."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
-    position: Literal["measured", "filter"]
-    """Source of ball_position: `measured`, or `filter` for the estimate of the Kalman filter."""
-    velocity: Literal["measured", "differences", "filter"]
-    """Source of ball_velocity: `measured`, `differences` of the measured positions, or `filter`."""
-    estimator: Constants | None
-    """Constants of the Kalman filter; None without one."""
+    position: Literal["measured"]
+    """Source of ball_position; a policy of 0.1 may see the ball through a Kalman filter."""
+    velocity: Literal["measured", "differences"]
+    """Source of ball_velocity: `measured`, or `differences` of the measured positions."""
+    estimator: dict[str, float] | None
+    """Constants of that filter; None without one."""
     control_dt: Annotated[float, (1e-3, 1.0)]
     """Time between two actions, s."""
     action: str
@@ -181,6 +179,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
+    if '"filter"' in (entries.get("position"), entries.get("velocity")):
+        raise ValueError("it sees the ball through a Kalman filter, for which use bounce-mjx 0.1.0")
     entries = _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
     if missing:
@@ -237,7 +237,3 @@ def _check(metadata: Metadata) -> None:
         part.name == "servo_lead" for part in metadata.observation
     ):
         raise ValueError("its policy sees servo_lead, but it has no max_lead")
-    sources = {"ball_position": metadata.position, "ball_velocity": metadata.velocity}
-    is_filtered = any(sources.get(part.name) == "filter" for part in metadata.observation)
-    if is_filtered != (metadata.estimator is not None):
-        raise ValueError("its estimator does not match the sources of its observation")

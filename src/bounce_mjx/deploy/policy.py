@@ -131,7 +131,7 @@ class DeployedPolicy:
                     name: value + (1.0 - i / steps) * (self._measured.get(name, value) - value)
                     for name, value in measured.items()
                 }
-                self._histories.add(between, self._action, is_real=False)
+                self._histories.add(between, self._action)
                 if self._network.memory:
                     self._network.step(self._histories.values, self._histories.newest)
             self._histories.add(measured, self._action)
@@ -254,8 +254,6 @@ class DeployedPolicy:
         users["ball_position"].add("ball_picture")
         if self.metadata.velocity != "measured":
             users["ball_position"] |= users.pop("ball_velocity")
-        if self.metadata.estimator is not None:
-            users["joint_angles"] |= users["ball_position"]
         return tuple(name for name in users if users[name] & reads)
 
     def checked(

@@ -37,7 +37,6 @@ from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import actuation, impact, noise, sensing
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.estimator import Estimate, Estimator
 from bounce_mjx.world.impact import Impact
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import (
@@ -72,7 +71,6 @@ class Memory(NamedTuple):
     """Ranges of later commands; None if they do not change."""
     actuation: Actuation | None
     sensing: Sensing | None
-    estimate: Estimate | None = None
     impact: Impact | None = None
     """For a restitution that depends on the speed."""
 
@@ -137,11 +135,6 @@ class Env:
         self._randomize = randomize
         self.layout = self.config.layout
         self._fingerprint = fingerprint(self.mj_model)
-        self._estimator = (
-            Estimator(self.config, self.mj_model, self.engine)
-            if self.config.observation.is_filtered
-            else None
-        )
 
     def __reduce__(self) -> tuple:
         """Pickled as its settings; a copy is built again."""
@@ -634,10 +627,7 @@ class Env:
         config = self.config
         balls = sensing.resting_ball(config.randomization, config.control_dt, truth)
         picture = self._picture(state.world, balls, sensing.picture_long_ago(truth), memory)
-        angles, measured = self._measured(state, truth, memory, picture)
-        if self._estimator is not None:
-            plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
-            memory = memory._replace(estimate=self._estimator.start(picture, state.world, plane))
+        measured = self._measured(state, truth, memory, picture)
         task, own = self.task.first_quantities(measured)
         values = measured | own
         seen = {
@@ -658,17 +648,7 @@ class Env:
         ball = sensing.position_and_velocity(truth)
         balls = jnp.concatenate([ball[None], past.balls[:-1]])
         picture = self._picture(state.world, balls, past.picture, memory)
-        angles, measured = self._measured(state, truth, memory, picture)
-        if self._estimator is not None:
-            plane = self._estimator.plane(self._measured_qpos(state.physics, angles))
-            estimate = self._estimator.next(
-                memory.estimate, state.world, past.picture, picture, plane
-            )
-            memory = memory._replace(estimate=estimate)
-            if config.observation.position == "filter":
-                measured["ball_position"] = estimate.position
-            if config.observation.velocity == "filter":
-                measured["ball_velocity"] = estimate.velocity
+        measured = self._measured(state, truth, memory, picture)
         seen = sensing.remember(config.observation, past.seen, measured)
         own = {name: past.seen[name] for name in config.observation.seen("task")}
         task, own = self.task.next_quantities(past.task, own, measured)
@@ -739,16 +719,15 @@ class Env:
 
     def _measured(
         self, state: EnvState, truth: Kinematics, memory: Memory, picture: sensing.Picture
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Measured joint angles [n], and the measured value [size] of each quantity of the world
-        and of each command."""
+    ) -> dict[str, jax.Array]:
+        """The measured value [size] of each quantity of the world and of each command."""
         angles, velocities = sensing.measured_joints(state.world, memory.counter, truth)
         paddle = truth.paddle_position
         if self._misjudges_paddle:
             paddle = self.engine.paddle_position(
                 MODEL_PARAMETERS, self._measured_qpos(state.physics, angles)
             )
-        return angles, truth._asdict() | {
+        return truth._asdict() | {
             "joint_angles": angles,
             "joint_velocities": velocities,
             "ball_position": picture.position,

@@ -21,7 +21,7 @@ from bounce_mjx.config.settings import (
 )
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import OF_SITE, RobotConfig, is_packaged
-from bounce_mjx.world.observation import EstimatorConfig, ObservationConfig, ObservationLayout
+from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, entries
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
@@ -144,20 +144,20 @@ class WorldConfig(StrictModel):
     """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
-    estimator: EstimatorConfig = EstimatorConfig()
-    """The state estimator between camera and policy."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode draws."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
-    def _read_former_reset(cls, values: Any) -> Any:
-        """The configs of 0.1.0 have the noise of a reset among the other settings."""
-        if not isinstance(values, dict) or not _FORMER_RESET_KEYS.keys() & values.keys():
+    def _read_former(cls, values: Any) -> Any:
+        """The configs of 0.1 have the constants of a Kalman filter, and those of 0.1.0 the noise of
+        a reset among the other settings."""
+        former = {"estimator", *_FORMER_RESET_KEYS}
+        if not isinstance(values, dict) or not former & values.keys():
             return values
         moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}
-        kept = {key: value for key, value in values.items() if key not in _FORMER_RESET_KEYS}
-        return kept | {"reset": moved | dict(kept.get("reset", {}))}
+        kept = {key: value for key, value in values.items() if key not in former}
+        return kept | ({"reset": moved | dict(kept.get("reset", {}))} if moved else {})
 
     @pydantic.model_validator(mode="after")
     def _check_times(self):

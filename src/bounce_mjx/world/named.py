@@ -21,7 +21,6 @@ KEYS = (
     "action_scale",
     "max_joint_velocity",
     "robot",
-    "estimator",
     "randomization",
 )
 """The settings of `env` that a world may have: those of the robot and its sensors, and none of the

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
+import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import NonNegative, Positive, StrictModel
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
@@ -59,7 +60,7 @@ class ObservationConfig(StrictModel):
     joint_velocities: Annotated[History, Quantity(None, "rad/s", "state")] = 1
     """Measured velocities of the acting joints."""
     ball_velocity: Annotated[History, Quantity(3, "m/s", "state", True)] = 1
-    """Measured or estimated velocity of the ball."""
+    """Measured velocity of the ball."""
     ball_angular_velocity: Annotated[History, Quantity(3, "rad/s", "state", True)] = 1
     """Spin of the ball, which no sensor of a robot measures."""
     paddle_position: Annotated[History, Quantity(3, "m", "state")] = 1
@@ -71,12 +72,21 @@ class ObservationConfig(StrictModel):
     target."""
     ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
     """Time since the camera image of the ball was taken."""
-    position: Literal["measured", "filter"] = "measured"
-    """Source of ball_position: the last camera image, or the estimate of the Kalman filter
-    (env.estimator)."""
-    velocity: Literal["measured", "differences", "filter"] = "measured"
-    """Source of ball_velocity: a sensor, the differences between camera images, or the estimate of
-    the Kalman filter (env.estimator)."""
+    velocity: Literal["measured", "differences"] = "measured"
+    """Source of ball_velocity: a sensor, or the differences between camera images."""
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _read_former(cls, values: Any) -> Any:
+        """The configs of 0.1 have a source of ball_position, and a Kalman filter as a source."""
+        if not isinstance(values, dict):
+            return values
+        if "filter" in (values.get("position"), values.get("velocity")):
+            raise ValueError(
+                "the Kalman filter is gone; set velocity to differences and leave position out, "
+                "or use bounce-mjx 0.1.0"
+            )
+        return {name: x for name, x in values.items() if (name, x) != ("position", "measured")}
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
@@ -122,39 +132,7 @@ class ObservationConfig(StrictModel):
         observation."""
         past = any(count > 1 for count in self.seen().values())
         remembered = self.seen("past") or self.seen("task")
-        return not past and not remembered and {self.position, self.velocity} == {"measured"}
-
-    @property
-    def is_filtered(self) -> bool:
-        """Whether the policy sees an estimate of the Kalman filter."""
-        return bool(
-            (self.ball_position and self.position == "filter")
-            or (self.ball_velocity and self.velocity == "filter")
-        )
-
-
-class EstimatorConfig(StrictModel):
-    """The Kalman filter of a bouncing ball between camera and policy, which computes the sources
-    `filter` of env.observation."""
-
-    measurement_noise: Positive = 0.002
-    """Standard deviation of each measured ball coordinate, m."""
-    process_noise: NonNegative = 0.2
-    """Standard deviation that unknown forces give to each component of the ball's velocity within
-    1 s, m/s; it grows with the square root of the time."""
-    restitution: Annotated[float, Field(ge=0.1, le=1.0)] = 0.85
-    """Restitution of the ball on the paddle."""
-    restitution_noise: NonNegative = 0.05
-    """Standard deviation of the restitution."""
-    contact_time: Annotated[float, Field(ge=0.002, le=0.05)] = 0.01
-    """Time that the ball touches the paddle in a bounce, s."""
-    paddle_noise: NonNegative = 0.002
-    """Standard deviation of the paddle's height by forward kinematics, m."""
-    air_drag: NonNegative = 0.0
-    """Deceleration of the ball by the air divided by its squared speed, 1/m."""
-    latency: NonNegative | None = None
-    """Expected time from a camera image to its arrival, s, if the camera does not stamp its images;
-    null for images with the time at which they were taken."""
+        return not past and not remembered and self.velocity == "measured"
 
 
 @dataclasses.dataclass(frozen=True)
