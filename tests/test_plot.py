@@ -43,7 +43,6 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
-from bounce_mjx.training import log as training_log
 from bounce_mjx.training.log import WandbLog, open_log
 from tiny_runs import TINY
 
@@ -133,16 +132,6 @@ def test_a_label_tells_settings_of_one_name_apart(tmp_path: Path) -> None:
         runs.append(write_run(tmp_path / str(height), config, logs))
     labels = [group.label for group in group_runs(runs)]
     assert labels[1] == "position.weight 4.0, height.weight 3.0 (one seed)"
-
-
-def test_a_resumed_run_logs_later_though_the_clock_went_back(tmp_path: Path, monkeypatch) -> None:
-    config = TrainConfig()
-    for seconds, value in ((7200.0, 1.0), (3600.0, 2.0)):
-        monkeypatch.setattr(training_log.time, "time", lambda seconds=seconds: seconds)
-        with contextlib.closing(open_log(tmp_path, first_step=0, config=config)) as log:
-            log.add_scalar("episode/return", value, 64)
-    points = EventAccumulator(str(tmp_path)).Reload().Scalars("episode/return")
-    assert [(point.step, point.value) for point in points] == [(64, 2.0)]
 
 
 def test_a_report_that_cannot_be_written_names_no_flag(

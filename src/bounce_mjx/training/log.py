@@ -2,9 +2,6 @@
 
 import contextlib
 import hashlib
-import socket
-import struct
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,29 +41,23 @@ def open_log(
 
 
 class TensorBoardLog:
-    """A file for TensorBoard. While the disk is full, its data waits in memory.
+    """A log for TensorBoard. What cannot be written, as on a full disk, is lost up to the next
+    `flush` that succeeds.
 
-    TensorboardX's own writer has a queue, which its `flush` does not empty, and a thread, which the
-    first error of a full disk ends.
+    TensorboardX's `SummaryWriter` has a thread, which the first error ends, and then its queue
+    blocks for ever.
     """
 
     def __init__(self, run: Path, suffix: str = ""):
-        with _not_importable("torch"):
-            from tensorboardX import summary
-            from tensorboardX.proto import event_pb2
-            from tensorboardX.record_writer import masked_crc32c
-        self._summary, self._events, self._checksum = summary, event_pb2, masked_crc32c
+        from tensorboardX import event_file_writer, summary
+        from tensorboardX.proto import event_pb2
+
+        self._summary, self._events = summary, event_pb2
+        self._new_writer = event_file_writer.EventsWriter
+        self._run, self._suffix, self._files = run, suffix, 0
+        self._writer, self._flushed = None, time.monotonic()
         run.mkdir(parents=True, exist_ok=True)
-        # TensorBoard reads the files in the order of these numbers, and a clock may go back.
-        earlier = [
-            int(n)
-            for path in run.glob("events.out.tfevents.*")
-            if (n := path.name.split(".")[3]).isdecimal()
-        ]
-        started = max([int(time.time()), *(number + 1 for number in earlier)])
-        self._path = run / f"events.out.tfevents.{started}.{socket.gethostname()}{suffix}"
-        self._waiting, self._flushed = bytearray(), time.monotonic()
-        self._add(file_version="brain.Event:2")
+        self.flush()
 
     def add_scalar(self, name: str, value: float, steps: int) -> None:
         self._add(step=steps, summary=self._summary.scalar(name, value))
@@ -84,22 +75,34 @@ class TensorBoardLog:
         self._add(step=steps, session_log=start)
 
     def flush(self) -> None:
-        """Writes everything to the file, as far as there is room."""
+        """Writes everything to the file. A file with a point that is only half written ends there
+        for its readers, so that a new one follows it."""
         self._flushed = time.monotonic()
-        with contextlib.suppress(OSError), self._path.open("ab", buffering=0) as file:
-            while self._waiting:
-                del self._waiting[: file.write(self._waiting)]
+        with self._losing():
+            if self._writer is None:
+                number = f".{self._files}" if self._files else ""
+                self._files += 1
+                self._writer = self._new_writer(f"{self._run / 'events'}", self._suffix + number)
+            self._writer.flush()
 
     def close(self) -> None:
         self.flush()
 
     def _add(self, **content: Any) -> None:
-        """Adds an event as a TFRecord: its length and its bytes, each with a checksum."""
-        event = self._events.Event(wall_time=time.time(), **content).SerializeToString()
-        for part in (struct.pack("<Q", len(event)), event):
-            self._waiting += part + struct.pack("<I", self._checksum(part))
+        event = self._events.Event(wall_time=time.time(), **content)
+        with self._losing():
+            if self._writer is not None:
+                self._writer.write_event(event)
         if time.monotonic() - self._flushed > _FLUSH_SECONDS:
             self.flush()
+
+    @contextlib.contextmanager
+    def _losing(self) -> Iterator[None]:
+        """Around an operation on the file; after an error, nothing more goes there."""
+        try:
+            yield
+        except OSError:
+            self._writer = None
 
 
 class WandbLog(TensorBoardLog):
@@ -139,18 +142,3 @@ class WandbLog(TensorBoardLog):
     def close(self) -> None:
         super().close()
         self._run.finish()
-
-
-@contextlib.contextmanager
-def _not_importable(module: str) -> Iterator[None]:
-    """Hides an installed module that is not imported yet. TensorBoardX imports PyTorch, for seconds
-    in which a short training would wait for its log, only to recognise tensors."""
-    if module in sys.modules:
-        yield
-        return
-    # Python's own mark of a module that cannot be imported.
-    sys.modules[module] = None
-    try:
-        yield
-    finally:
-        del sys.modules[module]
