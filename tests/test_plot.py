@@ -1,7 +1,6 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
-import contextlib
 import dataclasses
 import importlib.util
 import io

@@ -8,13 +8,13 @@ from pydantic import Field
 from rich.console import Console
 
 from bounce_mjx.config.settings import HostName, whole_number
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
 from bounce_mjx.training.command import TrainingCommand, config_of, early_flag, read_training
-from bounce_mjx.training.peers import DEFAULT_TIMEOUT
 
 PROG = "bounce-mjx train"
+_HOST_TIMEOUT = 300
 
 
 class TrainCommand(TrainingCommand):
@@ -37,24 +37,18 @@ class TrainCommand(TrainingCommand):
     """Other names under which a browser may open that page, such as a proxy's."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""
-    host_timeout: Annotated[int, Field(ge=1, le=10**6)] = DEFAULT_TIMEOUT
-    """Seconds that the processes wait for each other at the start, and after which a silent one
-    counts as dead."""
+    host_timeout: Annotated[int, Field(ge=1, le=10**6)] = _HOST_TIMEOUT
+    """Seconds that the processes wait for each other at the start."""
 
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     several_hosts = _hosts(args)
     with exit_on_user_error():
-        try:
-            command = read_command(args, default_preset(has_plugin()))
-            from bounce_mjx.training.setup import find_devices, set_up_jax
+        command = read_command(args, default_preset(has_plugin()))
+        from bounce_mjx.training.setup import find_devices, set_up_jax
 
-            set_up_jax(command.env)
-        except UserError:
-            # The other hosts learn of the mistake below, once they are joined.
-            if several_hosts is None:
-                raise
+        set_up_jax(command.env)
         if several_hosts is None:
             # CUDA starts during the imports.
             find_devices()
@@ -104,4 +98,4 @@ def _hosts(args: Sequence[str]) -> tuple[str | None, int | None, int | None, int
         return None
     if not {"-h", "--help"}.isdisjoint(args):
         return None
-    return address, processes, process, timeout or DEFAULT_TIMEOUT
+    return address, processes, process, timeout or _HOST_TIMEOUT

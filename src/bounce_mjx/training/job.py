@@ -128,9 +128,6 @@ def train(
             job.train()
             job.finish()
         except jax.errors.JaxRuntimeError as error:
-            if jax.process_count() > 1:
-                # It may be the death of another process, which `hosts` reports.
-                raise
             raise UserError(job.failure(error)) from error
         return job.members
 
@@ -171,7 +168,6 @@ class _Job:
         self.run = folders.find_run(options.resume) if self.resumed else self._create()
         self.started = False
         stack.push(self._remove_unstarted)
-        hosts.advise(self._advice)
         if hosts.is_leader():
             stack.enter_context(lock_run(self.run))
         self.members = self._seed_runs()
@@ -358,13 +354,13 @@ class _Job:
         """
         stopping = self._stopping()
         if stopping and not (self.resumed or self.steps or self._evaluated()):
-            hosts.disconnect()
+            jax.distributed.shutdown()
             self._leave_untrained()
         if stopping and not self._evaluated():
             self._save(best=[])
         self._wait_until_saved()
         evaluated = not stopping and self._evaluate_best()
-        hosts.disconnect()
+        jax.distributed.shutdown()
         self.trainer.save_models([member.run for member in self.members])
         if not evaluated:
             where = "" if stopping else ", before the final evaluation"
