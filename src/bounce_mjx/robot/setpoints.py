@@ -1,10 +1,33 @@
 """Setpoints between two actions, within an arm's limits of velocity, acceleration and jerk.
 
-The simulation and a deployed policy compute them with these functions, one with JAX's arrays and
-the other with NumPy's. An action wishes a velocity for the end of its control step. The velocity
-changes linearly until then, as far as the limits allow; and the command is never so fast that it
-could not stop within the joint's range. The mean of these commands over the last `smoothing`
-seconds has a limited jerk too; a mean keeps all other limits.
+The simulation computes them with JAX's arrays, and a deployed policy with NumPy's.
+
+**Velocity and acceleration.** An action asks for a position at the end of its control step, of the
+duration T. The command's velocity changes linearly from v0 to v1 within the step. v1 is the
+velocity that covers the distance in T, clipped to the limit of velocity, then to v0 -/+ a T.
+
+**Range.** The command must be able to stop in the `room` between its position and the end of the
+joint's range. The step itself takes (v0 + v1) T / 2 of it; `left = room - v0 T / 2`. A stop from v1
+brakes with a in each step and with less in the last one, from r <= a T to 0 over r T / 2 instead of
+r^2 / 2a. The excess r T / 2 - r^2 / 2a is at most a T^2 / 8. A stop of several steps thus fits if
+
+    v1 T / 2 + v1^2 / 2a + a T^2 / 8 = (v1 + a T / 2)^2 / 2a <= left
+
+so v1 <= sqrt(2 a left) - a T / 2; a stop of one step (v1 <= a T) takes v1 T / 2, so v1 <= left / T.
+
+**Jerk.** A jump of the acceleration is at most 2 a. The mean of the command over the last
+s = 2 a / j seconds turns it into a ramp of the slope j, the jerk's limit. A mean keeps all limits
+(Biagiotti and Melchiorri 2012, "FIR filters for online trajectory planning"). s is at most T, as
+otherwise two jumps would add up.
+
+**Mean and lag of a parabola.** In a step the command is a parabola p of the acceleration a. A mean
+over s weights the past evenly: its delay has the expectation s / 2 and the variance s^2 / 12. A
+first-order lag of the time constant l weights it by exp(-t / l) / l: l and l^2. Both together have
+the sums d and w of these, and average the parabola to
+
+    p(t - d) + a w / 2
+
+A jump b of the acceleration at the time 0 adds b times the averaged and lagged t^2 / 2 (`_kink`).
 """
 
 from types import ModuleType
@@ -15,7 +38,7 @@ Number = Any
 
 
 class JointLimits(NamedTuple):
-    """Limits of one joint's command, or of several."""
+    """Limits of the command of one joint, or of several."""
 
     velocity: Number
     """rad/s."""
@@ -46,19 +69,19 @@ def next_setpoint(
 
     Args:
       start: that at the step's start.
-      target: where the joint is wished at the step's end, rad.
+      target: the position that the action asks for, rad.
       duration: of a control step, s.
       xp: `numpy` or `jax.numpy`.
     """
     position, velocity, _ = start
-    wished = (target - position) / duration
+    asked = (target - position) / duration
     least, most = -limits.velocity, limits.velocity
     if limits.range is not None:
         low, high = limits.range
         most = xp.minimum(most, _stoppable(high - position, velocity, limits, duration, xp))
         least = xp.maximum(least, -_stoppable(position - low, -velocity, limits, duration, xp))
     change = limits.acceleration * duration
-    after = xp.clip(wished, least, most)
+    after = xp.clip(asked, least, most)
     after = xp.clip(after, velocity - change, velocity + change)
     return Setpoint(
         position + 0.5 * (velocity + after) * duration, after, (after - velocity) / duration
@@ -68,12 +91,8 @@ def next_setpoint(
 def _stoppable(
     room: Number, velocity: Number, limits: JointLimits, duration: float, xp: ModuleType
 ) -> Number:
-    """Highest velocity at the end of a step from which a command can stop within some room (rad)
-    from its present position.
-
-    A stop from v takes v / (a T) steps, of which the last brakes with less than a. It needs at most
-    v^2 / 2a + a T^2 / 8, and v T / 2 if it takes one step.
-    """
+    """Highest velocity at the end of a step from which a command can stop within the `room` (rad)
+    from its position at the step's start."""
     change = limits.acceleration * duration
     left = room - 0.5 * velocity * duration
     in_one = xp.minimum(left / duration, change)
@@ -97,14 +116,12 @@ def command(
       acceleration: in the step.
       time: since the step's start; negative for the step before.
       smoothing: as `JointLimits.smoothing`.
-      lag: time constant of a first-order lag that follows the command; it has done so forever.
+      lag: time constant of a first-order lag behind the command, whose transient is over.
       earlier: duration of a step, and the acceleration two steps before `acceleration`; needed for
         a negative time with a smoothing.
     """
     half, variance = (0.0, 0.0) if smoothing is None else (0.5 * smoothing, smoothing**2 / 12.0)
     delay = 0.0 if lag is None else lag
-    # A parabola, averaged and delayed, is one again; an acceleration that changes at a time adds
-    # the response to a kink.
     spread = variance + delay * delay
     x = time - half - delay
     result = start.position + start.velocity * x + 0.5 * start.acceleration * (x * x + spread)
@@ -118,7 +135,10 @@ def command(
 
 
 def _kink(time: Number, smoothing: Number | None, lag: Number | None, xp: ModuleType) -> Number:
-    """Averaged and delayed t^2 / 2 from the time 0 on, and 0 before."""
+    """The function that is t^2 / 2 from the time 0 on and 0 before, averaged and lagged.
+
+    The lag's y solves l y' = t^2 / 2 - y with y(0) = 0; the mean is a difference of integrals.
+    """
     if smoothing is None:
         x = xp.maximum(time, 0.0)
         square = 0.5 * x * x
