@@ -46,7 +46,7 @@ ALLOWED = {
     "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
     "world/observation.py", "world/randomization.py",
-    "identify/fit.py", "identify/replay.py", "identify/stages.py",
+    "identify/fit.py", "identify/stages.py",
     "identify/unknowns.py", "identify/windows.py", "identify/words.py", "identify/world.py",
 }  # fmt: skip
 

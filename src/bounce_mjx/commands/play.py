@@ -1,25 +1,18 @@
-"""Shows a trained policy, or a robot's log: `bounce-mjx play [CHECKPOINT]`."""
+"""Shows a trained policy: `bounce-mjx play [CHECKPOINT ...]`."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import (
-    MIRROR,
-    TopicsConfig,
-    WorldCommand,
-    parse_with_commands,
-)
+from bounce_mjx.commands.run_options import MIRROR, WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
-from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
@@ -48,12 +41,6 @@ class PlayCommand(WorldCommand):
     """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
-    log: Path | None = None
-    """Log of a robot's run, as for bounce-mjx identify; writes a page (--html, by default the log's
-    name with _replay.html) with the measured run next to its simulation in --world. --robot is the
-    robot's config."""
-    topics: TopicsConfig = TopicsConfig()
-    """Topics of a log that is a bag."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
 
 
@@ -61,9 +48,6 @@ class PlayCommand(WorldCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
-    if command.log is not None:
-        _replay_log(command, given_commands)
-        return
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     from bounce_mjx.training.setup import set_up_jax
@@ -96,58 +80,6 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
         changes["randomization"] = command.randomization
     env = validate(type(config.env), dict(config.env) | changes, "play")
     return config.model_copy(update={"env": env})
-
-
-def _replay_log(
-    command: PlayCommand, given_commands: Callable[[WorldConfig], dict[str, float]]
-) -> None:
-    """Writes the page of a log."""
-    viewing = command.viewing
-    others = {
-        "a checkpoint": command.checkpoints,
-        "--actions": command.actions != "policy",
-        "--task": command.task,
-        "--physics": command.physics != "config",
-        "--randomization": command.randomization.terms,
-        "--viewer": viewing.viewer != "auto",
-        "--video": viewing.video,
-        "--num-envs": viewing.num_envs > 1,
-    }
-    if refused := [name for name, given in others.items() if given]:
-        raise UserError(
-            f"--log writes a page of the recorded run, and {' and '.join(refused)} cannot be "
-            "combined with it; omit one of the two"
-        )
-    page = viewing.html or Path(f"{command.log.stem}_replay.html")
-    from bounce_mjx.env.env import Env
-    from bounce_mjx.identify.bags import Topics
-    from bounce_mjx.identify.reading import read_log
-    from bounce_mjx.identify.replay import replay_log
-    from bounce_mjx.runs.files import check_output
-    from bounce_mjx.training.setup import set_up_jax
-    from bounce_mjx.viewers.comparison import recording
-    from bounce_mjx.viewers.page import SUFFIXES, write_page
-
-    check_output(page, "--html", SUFFIXES)
-    preset = read_preset(Path("default"), command.robot, world=command.world)
-    estimates, shown = {}, "the model's own world"
-    if command.world is not None:
-        estimates = in_world(preset, command.world)[1].estimates
-        kind = "the estimates" if estimates else "the middle of each range"
-        shown = f"{kind} of {command.world}"
-    commands, console = given_commands(preset.env), stdout(highlight=False)
-    set_up_jax(preset.env)
-    env, topics = Env(preset.env), Topics(**command.topics.model_dump())
-    log, _ = read_log(command.log, env.mj_model, topics)
-    with console.status("simulating"):
-        found = replay_log(preset.env, log, estimates, viewing.seconds)
-        frames = recording(env, found, commands)
-        write_page(page, env, frames, viewing.fps, ("measured", "simulated"))
-    angles, ball = found.distances
-    off = f"joint angles differ by {1e3 * angles:.2f} mrad"
-    off += " (no bounce is shown)" if math.isnan(ball) else f", the ball by {1e3 * ball:.1f} mm"
-    console.out(f"simulated in {shown}; root mean square: {off}")
-    console.out(f"written: {page}")
 
 
 def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":

@@ -21,6 +21,7 @@ _BEFORE, _AFTER = 0.55, 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
+_MOST = 240
 _PADDING = 8
 _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
@@ -69,12 +70,11 @@ class Windows(NamedTuple):
         return np.isfinite(self.bounces)
 
 
-def cut(log: Log, physics_dt: float, min_windows: int = 1, max_windows: int = 240) -> Windows:
-    """Cuts a log into windows.
+def cut(log: Log, physics_dt: float, min_windows: int = 1) -> Windows:
+    """Cuts a log into windows, `_MOST` at most: of more, every k-th is used.
 
     Args:
       min_windows: the smallest number.
-      max_windows: the largest number; of more, every k-th is used.
 
     Raises:
       UserError: there are fewer.
@@ -87,8 +87,8 @@ def cut(log: Log, physics_dt: float, min_windows: int = 1, max_windows: int = 24
             "record at least 5 s"
         )
     spans.sort()
-    if len(spans) > max_windows:
-        keep = np.linspace(0, len(spans) - 1, max_windows).round().astype(int)
+    if len(spans) > _MOST:
+        keep = np.linspace(0, len(spans) - 1, _MOST).round().astype(int)
         spans = [spans[i] for i in keep]
     origin = float(min(log.times[0], log.target_times[0]))
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]

@@ -1,4 +1,4 @@
-"""The identified world in a file: the estimates, and ranges for training with their sources."""
+"""The identified world in a file: ranges for training, with their sources."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ _TOGETHER = 0.1
 
 
 def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
-    """YAML text of the identified world: the estimates, and ranges for training.
+    """YAML text of the identified world: ranges for training, with their sources.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent draws from the whole intervals of terms that the
@@ -35,15 +35,12 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     for name, place in places.items():
         by_term[name] = listed[place]
     ranges: dict[str, list[Any]] = {}
-    identified: dict[str, float | list[float]] = {}
     sources: dict[str, str] = {}
     assumed = []
     for name, entries in by_term.items():
         if name == CAMERA_ROTATION:
             continue
         ranges[name] = _range(name, entries)
-        each = [float(f"{entry.value:.5g}") for entry in entries]
-        identified[name] = each if len(each) > 1 else each[0]
         shown = [entry for entry in entries if entry.seen]
         if len(shown) < len(entries):
             assumed.append(name)
@@ -63,13 +60,12 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
     content["env"] = {"randomization": ranges}
     content["sources"] = {f"randomization.{name}": text for name, text in sources.items()}
     content["assumed"] = [f"randomization.{name}" for name in assumed]
-    content["estimates"] = identified
     head = f"# Identified from {log.source}: bounce-mjx train --world FILE\n"
     # The numbers of an end on one line, and sources below one another.
     parts = [
         yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
         for key, value in content.items()
-        for style in [None if key in ("env", "estimates") else False]
+        for style in [None if key == "env" else False]
     ]
     return head + "".join(parts)
 

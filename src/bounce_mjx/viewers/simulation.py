@@ -67,9 +67,7 @@ def pose_of(frame: EnvFrame, index: int) -> tuple[np.ndarray, dict[str, float], 
 
 
 def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
-    """The task's readings of one environment of a frame; none without metrics."""
-    if not frame.metrics:
-        return {}
+    """The task's readings of one environment of a frame."""
     return env.task.readings(
         of_environment(frame.command, index), of_environment(frame.metrics, index)
     )

@@ -8,7 +8,7 @@ from typing import Any
 import pydantic
 
 from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.settings import Finite, StrictModel, merged
+from bounce_mjx.config.settings import StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import shorten
 from bounce_mjx.world.config import WorldConfig
@@ -53,9 +53,8 @@ class NamedWorld(StrictModel):
     """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
     """Keys whose numbers nobody has measured; their source is the reason for the number."""
-    estimates: dict[str, Finite | tuple[Finite, ...]] = {}
-    """Identified value of each term of the randomisation, one for each joint or axis, that `play
-    --log` simulates."""
+    estimates: dict[str, Any] = {}
+    """Ignored; worlds that version 0.1 identified have it."""
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):
