@@ -48,8 +48,8 @@ def with_own_friction() -> mujoco.MjModel:
 WORLDS = {
     "frictionless contact": (frictionless, False),
     "all parameters": (frictionless, True),
-    "pyramidal cone": (lambda: frictional("pyramidal"), False),
-    "elliptic cone, heavy ball": (lambda: frictional("elliptic", *HEAVY_BALL), False),
+    "sliding friction": (frictional, False),
+    "sliding friction, heavy ball": (lambda: frictional(*HEAVY_BALL), False),
     "of the model": (with_own_friction, None),
 }
 
@@ -157,7 +157,7 @@ def test_the_noslip_solver_is_refused_only_with_friction():
     model = frictionless()
     model.opt.noslip_iterations = 3
     assert fused.unsupported_feature(model) is None
-    for with_friction in (with_own_friction(), frictional("elliptic")):
+    for with_friction in (with_own_friction(), frictional()):
         with_friction.opt.noslip_iterations = 3
         assert "noslip_iterations" in fused.unsupported_feature(with_friction)
 

@@ -103,6 +103,13 @@ def _check_supported_parameters(
             "(frictionloss), as MJX's solver does not always converge with it; use --physics "
             "fused or mujoco"
         )
+    if engine == "fused" and parameters.contact_friction is not None:
+        if fused.is_elliptic(mj_model):
+            raise UserError(
+                "the fused physics does not compute friction that differs between environments "
+                '(contact_friction) with the MJCF\'s cone="elliptic"; use --physics mjx, or write '
+                'cone="pyramidal"'
+            )
     if engine == "fused" and mj_model.opt.noslip_iterations:
         for name in ("contact_friction", "frictionloss"):
             if getattr(parameters, name) is not None:

@@ -8,10 +8,11 @@ compiled `mujoco.MjModel` has beyond that; `read_model` reads the constants of o
 
 from bounce_mjx.physics.fused.dynamics import paddle_position, step
 from bounce_mjx.physics.fused.model import FusedModel, read_model
-from bounce_mjx.physics.fused.support import unsupported_feature
+from bounce_mjx.physics.fused.support import is_elliptic, unsupported_feature
 
 __all__ = [
     "FusedModel",
+    "is_elliptic",
     "paddle_position",
     "read_model",
     "step",

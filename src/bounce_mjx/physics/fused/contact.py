@@ -44,12 +44,8 @@ class ContactModel:
     ball, and of the last ball."""
     friction: tuple[Scalar, Scalar] | None = None
     """Coefficients of sliding friction along the two tangents; None for a frictionless contact."""
-    elliptic: bool = False
-    """Shape of the friction cone: elliptic if true, pyramidal if false."""
     impratio: float = 1.0
     """Ratio of the tangential to the normal impedance (the option `impratio`)."""
-    tangent_damping: float | None = None
-    """b of the reference acceleration along the tangents, 1/s; None if equal to `damping`."""
 
 
 class Contact(NamedTuple):

@@ -2,7 +2,7 @@
 
 In the units of the cones (`friction.py`), the forces x minimise
 
-    1/2 x.(Q + R) x + x.c    over the product of the cones
+    1/2 x.(Q + R) x + x.c    over the product of the pyramidal cones
 
 with Q = J M^-1 J^T, which couples the contacts, and the regulariser R. Under an acceleration y,
 each contact has the force f(y) that minimises 1/2 f.R f + f.y over its cone, so the solution is
@@ -44,29 +44,20 @@ _ROOT = math.sqrt(2.0)
 class Cone(NamedTuple):
     """One contact in the units of its cone."""
 
-    elliptic: bool
     touches: jax.Array
     """Whether there is a contact."""
-    normal: Scalar
-    """Regulariser along the normal, 1/kg; of the elliptic cone only."""
-    tangential: Scalar
-    """Regulariser along the tangents, or of each edge of the pyramid, 1/kg."""
+    regulariser: Scalar
+    """Regulariser of each edge of the pyramid, 1/kg."""
 
 
-def tangential_regulariser(model: ContactModel, regulariser: Scalar) -> Scalar:
-    """Regulariser of both tangential forces in the units of the cone, 1/kg.
+def edge_regulariser(model: ContactModel, regulariser: Scalar) -> Scalar:
+    """Regulariser of the coefficient of a pyramid's edge, 1/kg.
 
     Args:
       regulariser: of the normal force without friction, 1/kg.
     """
-    friction = model.friction[0]
-    return mul(mul(friction, friction), 1.0 / model.impratio) * regulariser
-
-
-def edge_regulariser(model: ContactModel, tangential: Scalar) -> Scalar:
-    """Regulariser of the coefficient of a pyramid's edge, 1/kg."""
-    friction = model.friction[0]
-    return 2.0 * tangential * add(1.0, mul(friction, friction))
+    squared = mul(model.friction[0], model.friction[0])
+    return 2.0 * (mul(squared, 1.0 / model.impratio) * regulariser) * add(1.0, squared)
 
 
 def coupled_forces(
@@ -92,12 +83,10 @@ def coupled_forces(
         for i in range(size)
     ]
     c = list(map(mul, offsets, units))
-    cones = []
-    for model, touches, normal in zip(models, touching, regularisers, strict=True):
-        tangential = tangential_regulariser(model, normal)
-        if not model.elliptic:
-            tangential = edge_regulariser(model, tangential)
-        cones.append(Cone(model.elliptic, touches, normal, tangential))
+    cones = [
+        Cone(touches, edge_regulariser(model, regulariser))
+        for model, touches, regulariser in zip(models, touching, regularisers, strict=True)
+    ]
     q, c = stored((q, c))
 
     def newton_step(_, x: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
@@ -145,8 +134,8 @@ def _line_search(
     """Length, from 0 to 2, of a step of the forces x and the accelerations y to the minimum of
     MuJoCo's primal objective along it, where its increasing slope is 0.
 
-    The slope has kinks with the pyramidal cone, and Newton's method within a bracket finds its zero
-    exactly; with the elliptic cone it is curved, and the Illinois method needs fewer steps.
+    Between its kinks the slope is straight, so Newton's method within a bracket finds its zero
+    exactly.
     """
     (x, y), (x_step, y_step) = start, step
 
@@ -169,38 +158,12 @@ def _line_search(
         inside = (length > low) & (length < high)
         return low, high, jnp.where(inside, length, 0.5 * (low + high))
 
-    def illinois(_, bracket: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-        low, high, at_low, at_high, last = bracket
-        length = _crossing(*bracket[:4])
-        here, _ = slope(length)
-        rises = here < 0.0
-        # The slope at an end that stays twice counts half.
-        return (
-            jnp.where(rises, length, low),
-            jnp.where(rises, high, length),
-            jnp.where(rises, here, jnp.where(last > 0.0, 0.5 * at_low, at_low)),
-            jnp.where(rises, jnp.where(last < 0.0, 0.5 * at_high, at_high), here),
-            jnp.where(rises, -1.0, last - last + 1.0),
-        )
-
     zero = y_step[0] - y_step[0]
-    if not cones[0].elliptic:
-        return lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))[2]
-    bracket = zero, zero + 2.0, slope(zero)[0], slope(zero + 2.0)[0], zero
-    return _crossing(*lax.fori_loop(0, _SEARCH_STEPS, illinois, bracket)[:4])
+    return lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))[2]
 
 
 def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scalar]:
     return [add(a, mul(length, b)) for a, b in zip(start, step, strict=True)]
-
-
-def _crossing(low: Scalar, high: Scalar, at_low: Scalar, at_high: Scalar) -> Scalar:
-    """Where the line between the values at both ends of a bracket is 0; the higher end if there is
-    no such place."""
-    change = at_high - at_low
-    crosses = (at_high > 0.0) & (change > 0.0)
-    place = (low * at_high - high * at_low) / jnp.where(crosses, change, 1.0)
-    return jnp.where(crosses, jnp.clip(place, low, high), high)
 
 
 def _response(
@@ -209,8 +172,7 @@ def _response(
     """f(y) [3 k], and for each contact the three columns of L."""
     forces, factors = [], []
     for k, cone in enumerate(cones):
-        respond = _of_ellipse if cone.elliptic else _of_pyramid
-        force, factor = respond(cone, tuple(y[3 * k : 3 * k + 3]))
+        force, factor = _pyramid_response(cone, tuple(y[3 * k : 3 * k + 3]))
         forces += [jnp.where(cone.touches, f, 0.0) for f in force]
         factors.append(
             tuple(
@@ -221,39 +183,9 @@ def _response(
     return forces, factors
 
 
-def _of_ellipse(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
-    pull, a, b = y
-    squared = a * a + b * b
-    tiny = float(jnp.finfo(squared.dtype).tiny)
-    inverse = lax.rsqrt(jnp.maximum(squared, tiny))
-    size, u, v = squared * inverse, a * inverse, b * inverse
-    open_ = pull >= size
-    sticks = cone.normal * size <= -cone.tangential * pull
-    slips = ~(open_ | sticks)
-    normal_root, root = lax.rsqrt(cone.normal), lax.rsqrt(cone.tangential)
-    both_root = lax.rsqrt(cone.normal + cone.tangential)
-    pressure = (size - pull) * (both_root * both_root)
-
-    def chosen(stuck: Scalar, slipping: Scalar) -> Scalar:
-        return jnp.where(open_, 0.0, jnp.where(sticks, stuck, slipping))
-
-    force = (
-        chosen(-pull * (normal_root * normal_root), pressure),
-        chosen(-a * (root * root), -pressure * u),
-        chosen(-b * (root * root), -pressure * v),
-    )
-    squared = jnp.where(slips, (1.0 - pull * inverse), 1.0)
-    across = squared * lax.rsqrt(squared) * both_root
-    return force, (
-        (chosen(normal_root, both_root), chosen(0.0, -both_root * u), chosen(0.0, -both_root * v)),
-        (0.0, chosen(root, -across * v), chosen(0.0, across * u)),
-        (0.0, 0.0, chosen(root, 0.0)),
-    )
-
-
-def _of_pyramid(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+def _pyramid_response(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
     pull, *tangential = y
-    root = lax.rsqrt(cone.tangential)
+    root = lax.rsqrt(cone.regulariser)
     normal, forces, columns, both = 0.0, [], [], []
     for a in tangential:
         plus, minus = (jnp.maximum(-x, 0.0) * (root * root) for x in (pull + a, pull - a))

@@ -1,15 +1,15 @@
 """Contact force with sliding friction (`condim="3"`), as MuJoCo computes it.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: friction cones, the dual problem,
-impedance, diagonal regulariser), and its source code for the regulariser of each cone. The force f
-along the normal and the two tangents minimises
+impedance, diagonal regulariser), and its source code for the regulariser. The force f along the
+normal and the two tangents minimises
 
-    1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)    over the friction cone
+    1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)    over the pyramidal friction cone
 
 with a0 the acceleration without the contact. In units of the cone, x = (f_n, f_1 / mu_1,
-f_2 / mu_2), the elliptic cone is |(x_1, x_2)| <= x_0, and the pyramidal cone consists of the
-nonnegative combinations of the four edges (1, +-1, 0), (1, 0, +-1). Both solvers run the same
-operations in every state, so that the threads of a GPU kernel do not diverge.
+f_2 / mu_2), it consists of the nonnegative combinations of the four edges (1, +-1, 0), (1, 0, +-1).
+The solver runs the same operations in every state, so that the threads of a GPU kernel do not
+diverge.
 """
 
 from collections.abc import Sequence
@@ -29,11 +29,7 @@ from bounce_mjx.physics.fused.contact import (
     side,
     softness,
 )
-from bounce_mjx.physics.fused.coupled import (
-    coupled_forces,
-    edge_regulariser,
-    tangential_regulariser,
-)
+from bounce_mjx.physics.fused.coupled import coupled_forces, edge_regulariser
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.scalars import (
     ZERO3,
@@ -55,12 +51,6 @@ from bounce_mjx.physics.fused.scalars import (
     vadd,
     vsub,
 )
-
-# Newton iterations for the slip direction, and the longest step (rad). In the states of
-# test_friction.py two iterations reach rounding error with the shipped ball, and four with a ball
-# as heavy as the arm.
-_SLIP_ITERATIONS = 6
-_LONGEST_STEP = 0.5
 
 
 class Turning(NamedTuple):
@@ -246,9 +236,8 @@ def _offsets(
       free: relative acceleration without the contacts, and `half_applied`.
     """
     model, (along, spins, joint_velocity) = touch.model, velocity
-    damping = model.damping if model.tangent_damping is None else model.tangent_damping
     offsets = []
-    for a, b in enumerate((model.damping, damping, damping)):
+    for a in range(3):
         speed, acceleration = dot(touch.axes[a], along), dot(touch.axes[a], free[0])
         if a > 0:
             for i, torques in touch.torques.items():
@@ -257,7 +246,7 @@ def _offsets(
             touch.rows[a], joint_velocity, half[a], free[1], strict=True
         ):
             speed, acceleration = add(speed, mul(j, v)), add(acceleration, mul(half_j, half_a))
-        offsets.append(acceleration + b * speed)
+        offsets.append(acceleration + model.damping * speed)
     normal, *tangential = offsets
     return normal + model.stiffness * d * touch.distance, *tangential
 
@@ -319,64 +308,8 @@ def contact_force(
         ),
         tuple(map(mul, offsets, units)),
     )
-    tangential = tangential_regulariser(model, regulariser)
-    if model.elliptic:
-        x = in_elliptic_cone(problem, regulariser, tangential)
-    else:
-        x = in_pyramidal_cone(problem, edge_regulariser(model, tangential))
+    x = in_pyramidal_cone(problem, edge_regulariser(model, regulariser))
     return tuple(map(mul, x, units))
-
-
-def in_elliptic_cone(problem: ConeProblem, normal: Scalar, tangential: Scalar) -> Vec3:
-    """Minimum x in the cone |(x_1, x_2)| <= x_0, with regularisers of x_0 and of (x_1, x_2)."""
-    (q00, q01, q02, q11, q12, q22), (c0, c1, c2) = problem
-    q00, q11, q22 = q00 + normal, q11 + tangential, q22 + tangential
-    squared = c1 * c1 + c2 * c2
-    open_ = (c0 >= 0.0) & (c0 * c0 >= squared)
-
-    # The ball sticks: the unconstrained minimum.
-    inverse = 1.0 / q00
-    a, b = q01 * inverse, q02 * inverse
-    k11, k12, k22 = q11 - a * q01, q12 - a * q02, q22 - b * q02
-    e1, e2 = c1 - a * c0, c2 - b * c0
-    inverse_determinant = 1.0 / (k11 * k22 - k12 * k12)
-    s1 = (k12 * e2 - k22 * e1) * inverse_determinant
-    s2 = (k12 * e1 - k11 * e2) * inverse_determinant
-    s0 = -(c0 * inverse + a * s1 + b * s2)
-    sticks = (s0 >= 0.0) & (s1 * s1 + s2 * s2 <= s0 * s0)
-
-    # The ball slips: x = n (1, u) lies on the cone's surface. The unit vector u minimises
-    # c.w / sqrt(w.Q w) over w = (1, u); Newton's method finds its angle.
-    pressed = c0 < 0.0
-    u1, u2 = -jnp.where(pressed, e1, c1), -jnp.where(pressed, e2, c2)
-    u1, u2 = _unit(u1, u2)
-
-    def newton_step(_, u: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        u1, u2 = u
-        r1, r2 = q01 + q11 * u1 + q12 * u2, q02 + q12 * u1 + q22 * u2
-        along, across = u1 * r1 + u2 * r2, u1 * r2 - u2 * r1
-        size = q00 + q01 * u1 + q02 * u2 + along
-        c_along, c_across = c1 * u1 + c2 * u2, c2 * u1 - c1 * u2
-        value = c0 + c_along
-        curved = q11 * u2 * u2 - 2.0 * q12 * u1 * u2 + q22 * u1 * u1
-        slope = c_across * size - value * across
-        curvature = c_across * across - c_along * size - value * (curved - along)
-        least = jnp.maximum(jnp.abs(slope) * (1.0 / _LONGEST_STEP), _tiny(slope))
-        step = -slope / jnp.maximum(curvature, least)
-        u1, u2 = u1 - step * u2, u2 + step * u1
-        longer = lax.rsqrt(1.0 + step * step)
-        return u1 * longer, u2 * longer
-
-    u1, u2 = lax.fori_loop(0, _SLIP_ITERATIONS, newton_step, (u1, u2))
-    size = (q00 + 2.0 * (q01 * u1 + q02 * u2)) + (
-        q11 * u1 * u1 + 2.0 * q12 * u1 * u2 + q22 * u2 * u2
-    )
-    n = jnp.maximum(-(c0 + c1 * u1 + c2 * u2) / size, 0.0)
-
-    def chosen(stuck: jax.Array, slipping: jax.Array) -> jax.Array:
-        return jnp.where(open_, 0.0, jnp.where(sticks, stuck, slipping))
-
-    return chosen(s0, n), chosen(s1, n * u1), chosen(s2, n * u2)
 
 
 def in_pyramidal_cone(problem: ConeProblem, regulariser: Scalar) -> Vec3:
@@ -457,14 +390,6 @@ def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
     s_one = jnp.where(first, plus, minus)
     t_one = jnp.where(first, plus, -minus)
     return jnp.where(both, s, s_one), jnp.where(both, t, t_one)
-
-
-def _unit(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Unit vector along (x, y); (1, 0) for a zero vector."""
-    squared = x * x + y * y
-    short = squared < _tiny(squared)
-    inverse = lax.rsqrt(jnp.where(short, 1.0, squared))
-    return jnp.where(short, 1.0, x * inverse), jnp.where(short, 0.0, y * inverse)
 
 
 def _tiny(x: jax.Array) -> float:

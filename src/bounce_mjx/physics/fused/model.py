@@ -449,7 +449,6 @@ def _read_contact(mj_model: mujoco.MjModel, pair: int, balls: tuple[int, ...]) -
     power = max(1.0, float(solimp[4]))
     frictional = m.pair_dim[pair] > 1
     friction = np.maximum(m.pair_friction[pair, :2], MIN_FRICTION)
-    elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     bodies = [addresses.balls[i].body for i in balls]
     bodies = [m.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
     return ContactModel(
@@ -465,9 +464,7 @@ def _read_contact(mj_model: mujoco.MjModel, pair: int, balls: tuple[int, ...]) -
         ),
         inverse_weights=floats(m.body_invweight0[bodies, 0]),
         friction=floats(friction) if frictional else None,
-        elliptic=bool(elliptic),
         impratio=max(_MIN_VALUE, float(m.opt.impratio)),
-        tangent_damping=_tangent_damping(m, pair, float(dmax)) if elliptic else None,
     )
 
 
@@ -494,11 +491,3 @@ def _time_constant(mj_model: mujoco.MjModel, solref: np.ndarray) -> float:
 def _has_dry_friction(mj_model: mujoco.MjModel) -> bool:
     """Whether the flag `frictionloss` lets the joints' dry friction act."""
     return not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-
-
-def _tangent_damping(mj_model: mujoco.MjModel, pair: int, max_impedance: float) -> float | None:
-    """b of the pair's `solreffriction`; None if the pair's `solref` applies."""
-    solref = mj_model.pair_solreffriction[pair]
-    if (solref[0] > 0.0) != (solref[1] > 0.0) or not np.any(solref):
-        return None
-    return _reference_damping(mj_model, solref, max_impedance)

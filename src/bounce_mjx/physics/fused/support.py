@@ -49,6 +49,11 @@ def _options(m: mujoco.MjModel) -> dict[str, bool]:
     }
 
 
+def is_elliptic(m: mujoco.MjModel) -> bool:
+    """Whether the model's friction cone is elliptic."""
+    return m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
 def _flags(bits: int, kind: type) -> set[str]:
     """Names of the flags set in `bits`, as the MJCF writes them."""
     return {
@@ -133,6 +138,7 @@ def _constraints(m: mujoco.MjModel, addresses: Addresses) -> dict[str, bool]:
         ),
         "a solimp without a width": np.any(m.pair_solimp[:, 2] <= _MIN_WIDTH),
         "sliding friction of some contact pairs only": frictional and np.any(m.pair_dim == 1),
+        'sliding friction with the elliptic cone (cone="elliptic")': frictional and is_elliptic(m),
         "the noslip solver (noslip_iterations)": friction and m.opt.noslip_iterations > 0,
     }
 
