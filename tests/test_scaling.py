@@ -291,17 +291,17 @@ MESSAGES = """
 import functools, jax, re, sys
 from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise, rows
-from bounce_mjx.env import vector
+from bounce_mjx.physics.fused import dynamics
 from bounce_mjx.training import devices
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 if sys.argv[1] == "kernel":
     rows.has_kernels = lambda: True
-    vector.in_one_kernel = functools.partial(elementwise.in_one_kernel, interpret=True)
+    dynamics.elementwise = functools.partial(elementwise.elementwise, interpret=True)
 # No other size of the program is a multiple of 104.
 config = PPOConfig(num_envs=104, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
 env = BounceBall()
-trainer = ppo.make_trainer(config, env, 100, num_devices=8)
+trainer = ppo.make_trainer(config, env, 100)
 mesh = devices.make_mesh(8, config)
 shapes = jax.eval_shape(trainer.init, jax.random.PRNGKey(0))
 sharding = devices.state_sharding(mesh, shapes)
@@ -318,13 +318,13 @@ print(*[shape for shape in arrays if any(n and n % config.num_envs == 0 for n in
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("control_step", ["kernel", "program"])
-def test_devices_exchange_only_sums(control_step: str, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("physics", ["kernel", "program"])
+def test_devices_exchange_only_sums(physics: str, monkeypatch: pytest.MonkeyPatch):
     """No device sends samples or environments to another, or computes those of another; each
-    minibatch needs one message. On a GPU the control step is a kernel, here in Pallas' interpreter,
+    minibatch needs one message. On a GPU the physics is a kernel, here in Pallas' interpreter,
     and the loop carries rows."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
-    command = [sys.executable, "-c", MESSAGES, control_step]
+    command = [sys.executable, "-c", MESSAGES, physics]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     messages, whole_batches = done.stdout.splitlines()

@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from bounce_mjx.env import vector
 from bounce_mjx.env.state import AnyEnv
 from bounce_mjx.errors import UserError
-from bounce_mjx.gpu.rows import pack, pack_steps, unpack
+from bounce_mjx.gpu.rows import pack, unpack
 from bounce_mjx.learning import statistics
 from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
@@ -57,8 +57,6 @@ class PPO(NamedTuple):
     networks: Networks
     optimizer: optax.GradientTransformation
     """Gradient of the parameters -> direction in which the learning rate scales a step."""
-    num_devices: int
-    """Devices that share the environments."""
 
 
 class Params(NamedTuple):
@@ -129,13 +127,8 @@ class TrainingFunctions(NamedTuple):
     result of `first_fault`."""
 
 
-def make_trainer(
-    config: PPOConfig, env: AnyEnv, episode_steps: int, num_devices: int = 1
-) -> TrainingFunctions:
+def make_trainer(config: PPOConfig, env: AnyEnv, episode_steps: int) -> TrainingFunctions:
     """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
-
-    Args:
-      num_devices: devices that share the environments of one training run.
 
     Raises:
       UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
@@ -148,9 +141,7 @@ def make_trainer(
     critic_metrics = names_of_critic_metrics(config, env)
     sizes = env.observation_size, env.action_size, len(critic_metrics)
     networks = make_networks(config, *sizes, dtype=config.compute_dtype)
-    ppo = PPO(
-        config, env, episode_steps, critic_metrics, networks, make_optimizer(config), num_devices
-    )
+    ppo = PPO(config, env, episode_steps, critic_metrics, networks, make_optimizer(config))
     return TrainingFunctions(functools.partial(init, ppo), functools.partial(run, ppo))
 
 
@@ -261,20 +252,17 @@ def collect(
     shape = (config.rollout_length, config.num_envs, env.action_size)
     noise = jax.random.normal(noise_key, shape, jnp.float32)
     ranges = vector.ranges_after(env, state.iteration, config.batch_steps)
-    fresh = jax.vmap(lambda key: vector.first_states(env, key, config.num_envs, ranges))(
-        jax.random.split(reset_key, config.rollout_length)
-    )
+    # One start for each environment: one that ends twice within a rollout starts twice alike.
+    fresh = vector.first_states(env, reset_key, config.num_envs, ranges)
 
-    def step(carry, draws):
-        (packed, timeout_inputs), (noise, fresh) = carry, draws
+    def step(carry, noise):
+        packed, timeout_inputs = carry
         env_state = unpack(packed)
         inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)
         normalized = normalize(inputs, state.statistics.normalizer)
         policy = distribution(ppo, state.params, normalized, noise_bounds(config))
         action = policy.mean + policy.std * noise
-        env_state, result = vector.step_with(
-            env, env_state, action, unpack(fresh), ppo.episode_steps
-        )
+        env_state, result = vector.step_with(env, env_state, action, fresh, ppo.episode_steps)
         # An environment times out at most once in a rollout, because no time limit is shorter.
         final_inputs = network_inputs(ppo, result.final_observation, result.metrics)
         timeout_inputs = jnp.where(result.truncated[:, None], final_inputs, timeout_inputs)
@@ -290,9 +278,8 @@ def collect(
         return (pack(env_state), timeout_inputs), (step, pack(metrics))
 
     no_inputs = jnp.zeros((config.num_envs, state.statistics.mean.size))
-    draws = noise, pack_steps(fresh, ppo.num_devices)
     (packed, timeout_inputs), (rollout, metrics) = jax.lax.scan(
-        step, (pack(state.env), no_inputs), draws
+        step, (pack(state.env), no_inputs), noise
     )
     env_state = unpack(packed)
     last_inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)

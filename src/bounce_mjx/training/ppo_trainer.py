@@ -40,8 +40,7 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self._compiled_iterations = _iterations_at_once(config, env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        sharing = self.mesh.size if config.num_seeds == 1 else 1
-        trainer = make_trainer(config.ppo, env, episode_steps(config), sharing)
+        trainer = make_trainer(config.ppo, env, episode_steps(config))
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self._seeds = seeds[0] if config.num_seeds == 1 else seeds
