@@ -81,18 +81,6 @@ def pytest_report_header() -> list[str]:
     return [f"skipped, as a library is missing: {name}" for name in collect_ignore]
 
 
-@pytest.fixture(scope="session")
-def interpret():
-    """Parameters of Pallas' interpreter for GPU kernels."""
-    from jax.experimental.pallas import mosaic_gpu as plgpu
-
-    if hasattr(plgpu, "InterpretGPUParams"):
-        return plgpu.InterpretGPUParams()
-    from jax._src.pallas.mosaic_gpu.interpret.params import InterpretGPUParams
-
-    return InterpretGPUParams()
-
-
 @pytest.fixture
 def float64() -> Iterator[None]:
     """Runs the whole test in float64."""

@@ -1,4 +1,4 @@
-"""The GPU kernel of the fused physics, in Pallas' interpreter, against XLA's own program."""
+"""The GPU kernel of the fused physics, in Pallas' interpreter, against XLA's own program; rows."""
 
 import subprocess
 import sys
@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.gpu import availability
+from bounce_mjx.gpu import availability, rows
 from bounce_mjx.gpu import elementwise as kernel
+from bounce_mjx.learning import ppo
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, fused
 from bounce_mjx.physics.fused import dynamics
 from random_worlds import random_parameters
@@ -152,6 +154,7 @@ import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx import BounceBall
 from bounce_mjx.gpu import elementwise as kernel
+from bounce_mjx.gpu import rows
 from bounce_mjx.physics.fused import dynamics
 from test_kernel import assert_equal, batched, moving
 
@@ -243,6 +246,52 @@ def test_the_kernel_with_parameters_is_lowered_for_a_gpu(env, monkeypatch):
     traced = jax.jit(in_worlds(env)).trace(*moving(env, BATCH), random_worlds(env, BATCH))
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert on_gpu.count("custom_call @mosaic_gpu") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_a_training_is_lowered_for_a_gpu(monkeypatch, num_seeds: int):
+    """With kernels of the physics in it, and with rows, here of one iteration."""
+    for module in (kernel, rows):
+        monkeypatch.setattr(module, "has_kernels", lambda: True)
+    config = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(8,))
+    env = BounceBall()
+    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    key = jax.random.PRNGKey(0)
+    if num_seeds > 1:
+        trainer, key = ppo.population(trainer), jax.random.split(key, num_seeds)
+    state = jax.eval_shape(trainer.init, key)
+    traced = jax.jit(lambda state: trainer.run(state, 1)).trace(state)
+    assert "custom_call @mosaic_gpu" in traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert jax.tree.structure(traced.out_info[0]) == jax.tree.structure(state)
+
+
+def test_rows_hold_every_type(monkeypatch):
+    tree = {
+        "float": jax.random.normal(jax.random.PRNGKey(0), (2, 3, 5)),
+        "int": jnp.array([0, 1, -7, 2**31 - 1, -(2**31)], jnp.int32),
+        "uint": jnp.array([0, 1, 7, 2**31, 2**32 - 1], jnp.uint32),
+        "bool": jnp.array([[True, False, True, True, False]]),
+        "single": jnp.arange(5.0),
+    }
+    numbers = {"float": jnp.float32(0.5), "int": jnp.int32(-7)}
+    assert rows.pack(tree) is tree and rows.unpack(tree) is tree
+    monkeypatch.setattr(rows, "has_kernels", lambda: True)
+    assert rows.unpack(rows.pack(numbers)) == numbers
+    packed = rows.pack(tree)
+    assert packed.rows.shape == (10, 5) and packed.rows.dtype == jnp.float32
+    _, stacked = jax.jit(lambda packed: jax.lax.scan(lambda c, _: (c, c), packed, length=2))(packed)
+    twice = rows.unpack(stacked)
+    for name, expected in tree.items():
+        assert twice[name].dtype == expected.dtype
+        np.testing.assert_array_equal(twice[name][1], expected)
+
+
+@pytest.mark.parametrize("other", [jax.random.key(0), jnp.zeros(1, jnp.bfloat16)])
+def test_rows_leave_other_types_alone(monkeypatch, other):
+    monkeypatch.setattr(rows, "has_kernels", lambda: True)
+    tree = {"float": jnp.zeros(1), "other": other}
+    assert rows.pack(tree) is tree
 
 
 def test_there_is_no_kernel_on_a_cpu(monkeypatch):

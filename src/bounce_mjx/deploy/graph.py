@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
+from bounce_mjx.deploy.places import INDICES, evaluated, source_places
 from bounce_mjx.errors import UserError, needed
-from bounce_mjx.gpu.places import INDICES, evaluated, source_places
 
 EXTRA = "bounce_mjx[export]"
 """What pip installs for an export."""

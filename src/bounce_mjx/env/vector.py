@@ -4,14 +4,12 @@ Internally the batch is the last axis of every array, so that the physics works 
 coordinates. Observations [B, N] and actions [B, A] have the batch first.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env.state import AnyEnv, State
-from bounce_mjx.gpu.elementwise import in_one_kernel
 
 
 class VectorState(NamedTuple):
@@ -110,25 +108,13 @@ def step(
 def step_with(
     env: AnyEnv, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
 ) -> tuple[VectorState, VectorStep]:
-    """`step` with initial states that were drawn in advance; on a GPU, one draw for many steps
-    costs less.
+    """`step` with initial states that were drawn in advance; one draw for many steps costs less.
 
     Args:
-      fresh: result of `first_states`, which replaces the states of ended episodes.
+      fresh: result of `first_states`, which replaces the states of ended episodes. An environment
+        that ends twice with the same `fresh` starts twice alike.
     """
-    # The whole step is one function of one environment, so that it becomes one kernel on a GPU.
-    step_one = in_one_kernel(functools.partial(_step_one, env, episode_steps))
-    state, result = jax.vmap(step_one, in_axes=-1, out_axes=-1)(state, action.T, fresh)
-    return state, result._replace(
-        observation=result.observation.T, final_observation=result.final_observation.T
-    )
-
-
-def _step_one(
-    env: AnyEnv, episode_steps: int, state: VectorState, action: jax.Array, fresh: State
-) -> tuple[VectorState, VectorStep]:
-    """`step_with` of one environment, without the batch axis."""
-    stepped = env.step(state.env, action)
+    stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
     clock, length = state.clock + 1, state.length + 1
     episode_return = state.episode_return + stepped.reward
     terminated = stepped.done > 0
@@ -136,9 +122,15 @@ def _step_one(
     ended = terminated | truncated
 
     env_state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, stepped)
-    result = VectorStep(
-        observation=env_state.obs,
-        final_observation=stepped.obs,
+    next_state = VectorState(
+        env=env_state,
+        clock=jnp.where(ended, 0, clock),
+        length=jnp.where(ended, 0, length),
+        episode_return=jnp.where(ended, 0.0, episode_return),
+    )
+    return next_state, VectorStep(
+        observation=env_state.obs.T,
+        final_observation=stepped.obs.T,
         reward=stepped.reward,
         terminated=terminated,
         truncated=truncated,
@@ -146,10 +138,3 @@ def _step_one(
         episode_return=episode_return,
         episode_length=length,
     )
-    next_state = VectorState(
-        env=env_state,
-        clock=jnp.where(ended, 0, clock),
-        length=jnp.where(ended, 0, length),
-        episode_return=jnp.where(ended, 0.0, episode_return),
-    )
-    return next_state, result

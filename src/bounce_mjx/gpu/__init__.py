@@ -1,1 +1,1 @@
-"""GPU kernels of elementwise functions, and where they run."""
+"""The package's GPU kernels, and where they run."""

@@ -3,20 +3,20 @@ one kernel per iteration."""
 
 import dataclasses
 import functools
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bounce_mjx.gpu.availability import has_kernels
-from bounce_mjx.gpu.elementwise import KERNEL_TYPES, from_float, to_float
+
+# Rows are float32; another number of 32 bits keeps its bits.
+_TYPES = (jnp.float32, jnp.int32, jnp.uint32, jnp.bool_)
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["rows"],
-    meta_fields=["structure", "types", "flat"],
+    jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["structure", "arrays"]
 )
 @dataclasses.dataclass(frozen=True)
 class Rows:
@@ -25,52 +25,41 @@ class Rows:
     rows: jax.Array
     """The numbers [R, B] of the pytree, float32. A number on its own is an array [1]."""
     structure: Any
-    types: tuple[tuple[tuple[int, ...], jnp.dtype], ...]
+    arrays: tuple[jax.ShapeDtypeStruct, ...]
     """Shape and type of each array of the pytree."""
-    flat: bool = False
-    """Whether the rows are one axis [R * B] (`pack_steps`)."""
-
-    @classmethod
-    def of(cls, tree: Any) -> "Rows":
-        """Packs a pytree of float32, int32 and bool."""
-        leaves, structure = jax.tree.flatten(tree)
-        unknown = {x.dtype for x in leaves} - KERNEL_TYPES
-        if unknown:
-            raise TypeError(f"rows hold {', '.join(map(str, KERNEL_TYPES))}, but not {unknown}")
-        rows = [to_float(x).reshape(-1, x.shape[-1] if x.ndim else 1) for x in leaves]
-        return cls(jnp.concatenate(rows), structure, tuple((x.shape, x.dtype) for x in leaves))
-
-    def tree(self) -> Any:
-        """The pytree. Axes that a loop has added before the rows come first in each array."""
-        arrays, start, rows = [], 0, self.rows
-        if self.flat:
-            first, _ = self.types[0]
-            rows = rows.reshape(*rows.shape[:-1], -1, first[-1])
-        for shape, dtype in self.types:
-            stop = start + math.prod(shape[:-1])
-            array = rows[..., start:stop, :].reshape(*rows.shape[:-2], *shape)
-            arrays.append(from_float(array, dtype))
-            start = stop
-        return self.structure.unflatten(arrays)
 
 
 def pack(tree: Any) -> Any:
-    """The pytree as `Rows` where the package's GPU kernels run; elsewhere unchanged."""
-    return Rows.of(tree) if has_kernels() else tree
-
-
-def pack_steps(tree: Any, num_devices: int) -> Any:
-    """Packs a pytree of arrays [T, ..., B], whose T parts a loop unpacks one after another.
-
-    The rows of a part are one axis: from [T, R, B], XLA would cut each row in the loop on its own,
-    instead of all of them at once. Several devices that share the axis B keep the arrays.
-    """
-    if not has_kernels() or num_devices > 1:
+    """The pytree as `Rows` where the package's GPU kernels run and rows can hold it; elsewhere
+    unchanged."""
+    leaves, structure = jax.tree.flatten(tree)
+    if not has_kernels() or any(x.dtype not in _TYPES for x in leaves):
         return tree
-    packed = jax.vmap(Rows.of)(tree)
-    return dataclasses.replace(packed, rows=packed.rows.reshape(len(packed.rows), -1), flat=True)
+    rows = [to_float(x).reshape(-1, x.shape[-1] if x.ndim else 1) for x in leaves]
+    arrays = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
+    return Rows(jnp.concatenate(rows), structure, arrays)
 
 
 def unpack(packed: Any) -> Any:
-    """The pytree that was packed."""
-    return packed.tree() if isinstance(packed, Rows) else packed
+    """The pytree that was packed. Axes that a loop has added come first in each array."""
+    if not isinstance(packed, Rows):
+        return packed
+    ends = np.cumsum([np.prod(x.shape[:-1], dtype=int) for x in packed.arrays])
+    parts = jnp.split(packed.rows, ends[:-1], axis=-2)
+    added = packed.rows.shape[:-2]
+    return packed.structure.unflatten(
+        from_float(part.reshape(added + x.shape), x.dtype)
+        for part, x in zip(parts, packed.arrays, strict=True)
+    )
+
+
+def to_float(x: jax.Array) -> jax.Array:
+    """A number of at most 32 bits as float32; an integer keeps its bits."""
+    if x.dtype == jnp.bool_:
+        return x.astype(jnp.float32)
+    return jax.lax.bitcast_convert_type(x, jnp.float32)
+
+
+def from_float(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """The inverse of `to_float`."""
+    return x > 0.5 if dtype == jnp.bool_ else jax.lax.bitcast_convert_type(x, dtype)

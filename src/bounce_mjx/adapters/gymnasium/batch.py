@@ -19,7 +19,6 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
-from bounce_mjx.gpu.elementwise import in_one_kernel
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import task_config
 from bounce_mjx.training.setup import cache_compilations
@@ -283,8 +282,7 @@ def _step(
     """`Batch.step`; its results come as one array, as every transfer from a GPU costs time."""
     keys, now = _split(episodes.key)
     fresh = jax.vmap(task.reset, out_axes=-1)(now)
-    step_one = in_one_kernel(task.step)
-    stepped = jax.vmap(step_one, in_axes=-1, out_axes=-1)(episodes.env, actions.T)
+    stepped = jax.vmap(task.step, in_axes=-1, out_axes=-1)(episodes.env, actions.T)
     length = episodes.length + 1
     terminated = (stepped.done > 0) & ~reset_before
     # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
