@@ -37,7 +37,8 @@ from pydantic import Field
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import parse, parse_first
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
@@ -48,7 +49,6 @@ from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
-from bounce_mjx.training.command import path_flag
 from bounce_mjx.training.setup import compiler_options
 
 METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
@@ -93,6 +93,12 @@ class Command(TrainConfig):
     """Folder for jax_vs_torch.jsonl, .md and .png."""
 
 
+class _FirstFlag(StrictModel):
+    """The flag that decides the config on which the others lie."""
+
+    config: Path | None = None
+
+
 def main() -> None:
     """Runs the command line."""
     with exit_on_user_error():
@@ -115,7 +121,8 @@ def main() -> None:
 
 def read_command(args: list[str]) -> Command:
     """Reads the command line on top of the preset."""
-    base = dict(read_preset(path_flag(args, "--config")))
+    first = parse_first(_FirstFlag, args, prog="benchmarks/jax_vs_torch.py")
+    base = dict(read_preset(first.config))
     for key in ("total_steps", "eval_every"):
         del base[key]
     default = Command(**base)

@@ -2,11 +2,10 @@
 
 import sys
 
-from bounce_mjx.training.command import early_flag
 from bounce_mjx.training.setup import find_devices, set_up_gpu
 
 set_up_gpu()
-if early_flag(sys.argv, "--methods") == "ours":
+if sys.argv[sys.argv.index("--methods") + 1] == "ours":
     find_devices()
 
 import jax_vs_torch  # noqa: E402

@@ -103,10 +103,9 @@ BAD_FLAGS = {
     "with its group": ("--ppo.num-envs 3", "did you mean --num-envs?"),
     "stray word": ("seed.yaml", "seed.yaml", "--help"),
     "no environments": ("--num-envs 0", "--num-envs is 0", "greater than or equal to 1"),
-    "not a number": ("--num-envs abc", "--num-envs", "INT", "abc"),
-    "not a number after =": ("--num_envs=abc --seed 3", "--num-envs", "INT", "given abc "),
-    "no value": ("--num-envs --seed 3", "--num-envs", "INT", "nothing"),
-    "fraction": ("--num-envs 1.5", "--num-envs", "INT", "1.5"),
+    "not a number": ("--num-envs abc", "--num-envs is abc", "integer"),
+    "not a number after =": ("--num_envs=abc --seed 3", "--num-envs is abc", "integer"),
+    "fraction": ("--num-envs 1.5", "--num-envs is 1.5", "integer"),
     "minibatches": (
         "--num-envs 8 --rollout-length 8 --num-minibatches 7",
         "num_minibatches 7",
@@ -114,8 +113,8 @@ BAD_FLAGS = {
         "choose a divisor of 64",
     ),
     "targets reversed": ("--target-height-range 0.6 0.4", "(0.6, 0.4)", "lower end first"),
-    "one target": ("--target-height-range 0.6", "--target-height-range", "FLOAT FLOAT"),
-    "target below the floor": ("--target-height-range -1 0.4", "is -1.0", "greater than 0 m"),
+    "one target": ("--target-height-range 0.6", "--target-height-range is 0.6", "item is missing"),
+    "target below the floor": ("--target-height-range -1 0.4", "is -1,", "greater than 0 m"),
     "target nan": ("--target-height-range nan 0.4", "is nan", "greater than 0 m"),
     "control step": ("--control-dt 0.0105", "control_dt 0.0105", "multiple of physics_dt"),
     "short episode": ("--episode-seconds 0.001", "episode_seconds 0.001", "longer episode"),
@@ -129,14 +128,14 @@ BAD_FLAGS = {
     "angle nan": ("--default-joint-angles 0 0 nan 0 0 0", "--default-joint-angles", "finite"),
     "ball at infinity": ("--ball-init-pos 0 0 inf", "--ball-init-pos is inf", "finite"),
     "weight nan": ("--reward.height.weight nan", "--reward.height.weight is nan", "finite"),
-    "width zero": ("--reward.height.scale 0", "--reward.height.scale is 0.0", "greater than 0"),
+    "width zero": ("--reward.height.scale 0", "--reward.height.scale is 0,", "greater than 0"),
     "negative noise": ("--reset.joint-angles -0.1", "--reset.joint-angles is -0.1", "equal to 0"),
-    "negative rate": ("--learning-rate -1", "--learning-rate is -1.0", "greater than 0"),
+    "negative rate": ("--learning-rate -1", "--learning-rate is -1,", "greater than 0"),
     "discount": ("--discount 1.5", "--discount is 1.5", "less than or equal to 1"),
     "negative seed": ("--seed -1", "--seed is -1", "greater than or equal to 0"),
-    "no layers": ("--hidden-layers", "--hidden-layers is ()", "at least 1 item"),
+    "no layers": ("--hidden-layers", "--hidden-layers is empty", "at least 1 item"),
     "empty layer": ("--hidden-layers 16 0", "--hidden-layers is 0", "equal to 1"),
-    "unknown engine": ("--physics warp", "--physics", "warp", "{auto,fused,mjx}"),
+    "unknown engine": ("--physics warp", "--physics is warp", "'fused'"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     "no such preset": ("--config nope", "no preset is named nope", "cpu, default, finetune"),
@@ -150,6 +149,13 @@ BAD_FLAGS = {
 def test_bad_flag(fails: Fails, case: tuple[str, ...]) -> None:
     flags, *words = case
     assert_says(fails(train_command.main, flags.split()), words)
+
+
+def test_a_flag_without_its_value_is_named(capfd) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--num-envs", "--seed", "3"])
+    assert exit_info.value.code == 2
+    assert "Missing value for argument '--num-envs'" in capfd.readouterr().err
 
 
 BAD_YAML = {
@@ -169,7 +175,7 @@ BAD_YAML = {
     ),
     "wrong level": (b"num_envs: 3", "unknown key num_envs", "did you mean ppo.num_envs?"),
     "number as a key": (b"1: 2", "unknown key 1", "known keys here are"),
-    "group missing": (b"ppo: 3", "ppo is 3", "group of keys and values"),
+    "group missing": (b"ppo: 3", "ppo is 3", "valid dictionary"),
     "no environments": (b"ppo: {num_envs: 0}", "ppo.num_envs is 0", "equal to 1"),
     "minibatches": (
         b"ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 7}",
@@ -178,9 +184,9 @@ BAD_YAML = {
     ),
     "nan": (b"env: {action_scale: .nan}", "env.action_scale is nan", "0 rad"),
     "word": (b"env: {default_joint_angles: [a, 0, 0, 0, 0, 0]}", "'a'", "valid number"),
-    "too few": (b"env: {target_height_range: [0.4]}", "[0.4]", "have 2 items"),
-    "too many": (b"env: {target_height_range: [0.4, 0.5, 0.6]}", "0.6]", "have 2 items"),
-    "no list": (b"env: {target_height_range: 0.4}", "target_height_range is 0.4", "list"),
+    "too few": (b"env: {target_height_range: [0.4]}", "[0.4]", "item is missing"),
+    "too many": (b"env: {target_height_range: [0.4, 0.5, 0.6]}", "0.6]", "at most 2 items"),
+    "no list": (b"env: {target_height_range: 0.4}", "target_height_range is 0.4", "tuple"),
     "no layers": (b"ppo: {hidden_layers: []}", "ppo.hidden_layers is []", "at least 1 item"),
     "unknown engine": (b"env: {physics: warp}", "env.physics is 'warp'", "'fused'"),
 }
@@ -262,9 +268,9 @@ BAD_EVAL_FLAGS = {
     "near miss": ("--target-hight 0.5", "did you mean --target-height?"),
     "near miss of a renamed flag": ("--jsn a", "did you mean --json?"),
     "no episodes": ("--episodes 0", "--episodes is 0", "equal to 1"),
-    "target below the floor": ("--target-height -1", "--target-height is '-1'", ">= 0.001"),
-    "target nan": ("--target-height nan", "--target-height is 'nan'", "finite"),
-    "unknown engine": ("--physics warp", "--physics", "{config,fused,mjx,mujoco}", "warp"),
+    "target below the floor": ("--target-height -1", "--target-height is -1.0", ">= 0.001"),
+    "target nan": ("--target-height nan", "--target-height is nan", "finite"),
+    "unknown engine": ("--physics warp", "--physics", "'mujoco'", "warp"),
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
     "json is a folder": ("--json .", "is a folder", "give a file"),
     "checkpoint missing": ("nowhere", "nowhere", "give a run's folder", "pretrained, robust, "),

@@ -326,7 +326,6 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: 
 USUAL_SPELLINGS = {
     "--stop-when-solved=false": (False, "stop_when_solved"),
     "--stop_when_solved=True": (True, "stop_when_solved"),
-    "--stop-when-solved false": (False, "stop_when_solved"),
     "--no-stop-when-solved": (False, "stop_when_solved"),
     "--total-steps 1e6": (10**6, "total_steps"),
     "--total-steps=1.5e6": (1_500_000, "total_steps"),

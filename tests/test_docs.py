@@ -36,6 +36,7 @@ from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
+from bounce_mjx.training.command import TrainCommand
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -180,6 +181,7 @@ def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
     flags = {"--help", *cli.flags_of(ship["ShipCommand"])}
+    flags |= set(cli.flags_of(train_config(Bounce, TrainCommand)))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
@@ -225,7 +227,7 @@ def leaves(plain: dict, prefix: str = "") -> dict:
 def test_config_reference_has_every_key_with_its_default_and_flag() -> None:
     rows, flags = (
         reference_rows(),
-        set(cli.flags_of(train_config(Bounce, train_command.TrainCommand))),
+        set(cli.flags_of(train_config(Bounce, TrainCommand))),
     )
     defaults = leaves(TrainConfig().model_dump(mode="json"))
     assert rows.keys() == defaults.keys()

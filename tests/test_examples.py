@@ -52,9 +52,9 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.training.command import TrainingCommand, config_of, read_training
+from bounce_mjx.training.command import config_of, read_command
 
-config = config_of(read_training(TrainingCommand, sys.argv[1:], prog="train"))
+config = config_of(read_command(sys.argv[1:]))
 layers = {"hidden_layers": load_run_config(pretrained_checkpoint().run).ppo.hidden_layers}
 config = config.model_copy(update={"ppo": config.ppo.model_copy(update=layers)})
 run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())

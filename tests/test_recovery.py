@@ -54,7 +54,7 @@ from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
-from bounce_mjx.training.command import config_of
+from bounce_mjx.training.command import TrainCommand, config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
@@ -255,7 +255,7 @@ def test_lost_evaluation_is_repeated(tmp_path: Path, straight: Path) -> None:
 
 
 def test_help_lists_what_a_resumed_run_may_change() -> None:
-    text = " ".join(train_command.TrainCommand.model_fields["resume"].description.split())
+    text = " ".join(TrainCommand.model_fields["resume"].description.split())
     for key in RESUMABLE_KEYS:
         assert key.split(".")[-1].replace("_", "-") in text, key
 

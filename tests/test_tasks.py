@@ -278,7 +278,7 @@ def test_a_run_keeps_its_task_which_runs_only_if_the_user_names_it(
 def test_another_file_than_the_runs_is_told(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from bounce_mjx.training.command import TrainingCommand, read_training
+    from bounce_mjx.training.command import read_command
 
     config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
     run_folder = create_run(config)
@@ -286,11 +286,11 @@ def test_another_file_than_the_runs_is_told(
     changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
     flags = ["--resume", str(run_folder), "--task", f"{changed}:Dribble"]
     with pytest.raises(UserError, match=r"--resume cannot change the task, and .*changed\.py"):
-        read_training(TrainingCommand, flags, prog="train")
+        read_command(flags)
     assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
     assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
     flags[-1] = f"{mine}:Dribble"
-    assert read_training(TrainingCommand, flags, prog="train").env == config.env
+    assert read_command(flags).env == config.env
 
 
 def test_another_class_of_the_same_file_is_another_task(

@@ -1,14 +1,16 @@
 """Shared by the commands about a run: whose run it is, and the commands of its task as flags."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
+import pydantic
 import tyro
+from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.command_line import flag_of, flags_of, parse, unknown_argument
+from bounce_mjx.config.command_line import flag_of, flags_of, parse, parse_first
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import (
@@ -19,7 +21,6 @@ from bounce_mjx.runs.config import (
     runs_folder,
 )
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
-from bounce_mjx.training.command import early_flag
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
@@ -143,6 +144,12 @@ class PolicyCommand(RunCommand):
     run."""
 
 
+class _FirstFlags(StrictModel):
+    """The flag that decides which commands there are."""
+
+    task: str | None = None
+
+
 def parse_with_commands(
     command_class: type[CommandT], args: Sequence[str], *, prog: str
 ) -> tuple[CommandT, Callable[[WorldConfig], dict[str, float]]]:
@@ -157,38 +164,31 @@ def parse_with_commands(
     Raises:
       UserError: a flag has a bad value, or no task has it.
     """
-    known = {*flags_of(command_class), "--help"}
-    words, given = [], {}
-    rest = iter(args)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-")
-        if name.startswith("--") and name not in known:
-            given[name] = value if equals else next(rest, "")
-        else:
-            words.append(word)
-    task = early_flag(words, "--task")
-    commands = find_task(task or DEFAULT).Config().commands
-    # Python's option -OO leaves out docstrings.
-    description = command_class.__doc__ or ""
-    if commands:
-        flags = ", ".join(f"{flag_of(name)} {c.unit.upper()}" for name, c in commands.items())
-        description += f" The commands of the task {task or DEFAULT} are flags too: {flags}."
-
-    def check(flags: Iterable[str]) -> None:
-        for flag in given.keys() - flags:
-            unknown = unknown_argument(flag, sorted({*known, *flags}))
-            raise UserError(f"{unknown} (see {prog} --help)")
+    task, known = parse_first(_FirstFlags, args, prog=prog).task, flags_of(command_class)
+    words = {word.partition("=")[0].replace("_", "-") for word in args if word.startswith("--")}
+    # Without --task, the run may be of any task.
+    names = [task or DEFAULT] if task or words <= {*known, "--help"} else registered_tasks()
+    commands = {
+        name: Annotated[float | None, tyro.conf.arg(metavar=command.unit.upper() or None)]
+        for task in names
+        for name, command in find_task(task).Config().commands.items()
+        if flag_of(name) not in known
+    }
+    about = f"Command of the task {' or '.join(names)}"
+    fields = {name: (kind, Field(None, description=about)) for name, kind in commands.items()}
+    own_class = pydantic.create_model(
+        command_class.__name__, __base__=command_class, __doc__=command_class.__doc__, **fields
+    )
+    command = parse(own_class, args, prog=prog)
+    given = {name: getattr(command, name) for name in commands}
+    given = {name: value for name, value in given.items() if value is not None}
 
     def values(env: WorldConfig) -> dict[str, float]:
-        flags = {flag_of(name): name for name in env.commands}
-        check(flags.keys())
-        return {
-            flags[flag]: env.commands[flags[flag]].checked(text, flag)
-            for flag, text in given.items()
-        }
+        for name in given.keys() - env.commands.keys():
+            raise UserError(
+                f"{flag_of(name)} is not a command of the run's task; it has "
+                f"{', '.join(map(flag_of, env.commands)) or 'none'}"
+            )
+        return {name: env.commands[name].checked(x, flag_of(name)) for name, x in given.items()}
 
-    # Without --task, the run may be of any registered task.
-    tasks = [task] if task else registered_tasks() if given else []
-    check({flag_of(name) for task in tasks for name in find_task(task).Config().commands})
-    return parse(command_class, words, prog=prog, description=description), values
+    return command, values

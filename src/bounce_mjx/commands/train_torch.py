@@ -12,14 +12,14 @@ from typing import Literal, get_args
 
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import TrainingCommand, read_training
+from bounce_mjx.training.command import TrainCommand, read_command
 
 PROG = "bounce-mjx train-torch"
 
 Library = Literal["rsl_rl", "skrl"]
 
 
-class TorchTrainCommand(TrainingCommand):
+class TorchTrainCommand(TrainCommand):
     """Trains a policy with PyTorch; by default, one that keeps the ball bouncing."""
 
     library: Library | None = None
@@ -29,7 +29,7 @@ class TorchTrainCommand(TrainingCommand):
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    read = functools.partial(read_training, TorchTrainCommand, args, prog=PROG)
+    read = functools.partial(read_command, args, kind=TorchTrainCommand, prog=PROG)
     command = read(machine=default_preset(has_plugin()))
     from bounce_mjx.runs.folders import latest_checkpoint
     from bounce_mjx.training.job import library_of

@@ -7,14 +7,20 @@ from typing import Annotated, Literal
 import pydantic
 import tyro
 
-from bounce_mjx.config.command_line import parse, stdout
+from bounce_mjx.config.command_line import parse, parse_first, stdout
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import read_preset, train_config
 from bounce_mjx.tasks.registry import DEFAULT
-from bounce_mjx.training.command import early_flag, path_flag
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.world.config import WorldConfig
+
+
+class _FirstFlags(StrictModel):
+    """The flags that decide the environment."""
+
+    task: str | None = None
+    robot: Path | None = None
 
 
 class ViewCommand(StrictModel):
@@ -35,15 +41,10 @@ class ViewCommand(StrictModel):
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    robot, task = path_flag(args, "--robot"), early_flag(args, "--task")
-    env = read_preset(Path("default"), robot, task).env
-    command_class = train_config(env.task, ViewCommand)
-    command = parse(
-        command_class,
-        args,
-        prog="bounce-mjx view",
-        default=command_class(env=env, robot=robot),
-    )
+    first = parse_first(_FirstFlags, args, prog="bounce-mjx view")
+    env = read_preset(Path("default"), first.robot, first.task).env
+    own_class = train_config(env.task, ViewCommand)
+    command = parse(own_class, args, prog="bounce-mjx view", default=own_class(env=env))
     from bounce_mjx.baselines.mirror import MirrorLaw, observing
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.viewers import controllers

@@ -1,40 +1,34 @@
-"""Command lines made from config types, with one-sentence errors."""
+"""Command lines made from the types of settings: tyro reads words, and pydantic their values."""
 
 import contextlib
-import dataclasses
 import difflib
-import itertools
 import re
-import sys
 import time
+import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 import tyro
 from pydantic.fields import FieldInfo
 from rich.console import Console
 from rich.progress import Progress
-
-# tyro's own hook for replacing its error boxes; unstable, so pyproject.toml bounds the version.
-from tyro import _errors as tyro_errors
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
     PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
     StructConstructorSpec,
     StructFieldSpec,
     StructTypeInfo,
 )
 
-from bounce_mjx.config.settings import whole_number
+from bounce_mjx.config.settings import is_group, leaves
 from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError
 
-CommandT = TypeVar("CommandT")
+CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
 
 # Lines about the progress are left out where less time than this is left.
 _SILENT_SECONDS = 10.0
@@ -109,104 +103,103 @@ def parse(
     Raises:
       UserError: a flag is unknown or has a bad value.
     """
+    # Python's option -OO leaves out docstrings.
+    options = {"description": description or command_class.__doc__ or ""}
+    if default is not None:
+        options["default"] = default
+    values, unknown = _read(command_class, args, prog, **options)
+    if unknown:
+        word = unknown[0].partition("=")[0].replace("_", "-")
+        near = difflib.get_close_matches(word, flags_of(command_class), n=1)
+        advice = f"; did you mean {near[0]}?" if near else ""
+        raise UserError(f"unknown argument {unknown[0]}{advice} (see {prog} --help)")
+    return _validate(command_class, values, prog)
 
-    words = _usual_spelling(args, flags_of(command_class))
 
-    def raise_user_error(event: tyro_errors.ParseErrorEvent) -> None:
-        raise UserError(f"{_mistake(event, command_class, args)} (see {prog} --help)")
+def parse_first(command_class: type[CommandT], args: Sequence[str], *, prog: str) -> CommandT:
+    """Reads the flags that must be known before the others, which it leaves alone.
 
-    with tyro_errors.on_parse_error(raise_user_error):
-        try:
-            return tyro.cli(
-                command_class,
-                args=words,
-                prog=prog,
-                description=description,
-                registry=_REGISTRY,
-                **({} if default is None else {"default": default}),
-            )
-        # tyro raises the errors of groups without a prefix, and reports the others as an event.
-        except pydantic.ValidationError as error:
-            raise UserError(f"{_bad_value(error, command_class)} (see {prog} --help)") from error
+    Raises:
+      UserError: one of these flags has a bad value.
+    """
+    return _validate(command_class, _read(command_class, args, prog, add_help=False)[0], prog)
+
+
+def _validate(command_class: type[CommandT], values: dict[str, Any], prog: str) -> CommandT:
+    try:
+        return command_class.model_validate(values)
+    except pydantic.ValidationError as error:
+        flags = {".".join(name for name, _ in path): _flag(path) for path in leaves(command_class)}
+        sentence = describe(error, command_class, lambda key: flags.get(key, key), _on_one_line)
+        raise UserError(f"{sentence} (see {prog} --help)") from error
+
+
+def _on_one_line(value: Any) -> str:
+    """The words of a value."""
+    return " ".join(map(str, value)) or "empty" if isinstance(value, list) else str(value)
+
+
+def _read(
+    command_class: type[pydantic.BaseModel], args: Sequence[str], prog: str, **options: Any
+) -> tuple[dict[str, Any], list[str]]:
+    """The values of a command's flags, nested, and the words that are none of its flags."""
+    args = [re.sub(r"^--(.*?)([^.=]+)=false$", r"--\1no-\2", word, flags=re.I) for word in args]
+    args = [re.sub(r"^(--[^=]+)=true$", r"\1", word, flags=re.I) for word in args]
+    return tyro.cli(
+        command_class,
+        args=args,
+        prog=prog,
+        return_unknown_args=True,
+        registry=_REGISTRY,
+        **options,
+    )
 
 
 @_REGISTRY.struct_rule
-def _described(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A group of settings with help that reads well: tyro's own rule keeps the line breaks of the
-    docstrings, and shows `{None}|PATH` and `(default: )`."""
-    if not (isinstance(info.type, type) and issubclass(info.type, pydantic.BaseModel)):
+def _arguments(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """The arguments of a group of settings, which become a mapping of words."""
+    if not is_group(info.type):
         return None
     fields = []
     for name, field in info.type.model_fields.items():
         default = getattr(info.default, name, MISSING_NONPROP)
         if default is MISSING_NONPROP and not field.is_required():
             default = field.get_default(call_default_factory=True)
-        kind, spec = field.annotation, _spec(field)
-        if spec is not None and isinstance(default, tuple) and spec.is_instance(default) is False:
-            # A file may give what a flag cannot, such as a range for each joint.
-            shown = {"is_instance": lambda _: True, "str_from_instance": lambda given: [str(given)]}
-            kind = Annotated[Any, dataclasses.replace(spec, **shown)]
-        hint = "" if default in (None, (), MISSING_NONPROP) else "(default: {})".format
-        # The field's own marks follow, and win.
-        mark = tyro.conf.arg(metavar=_metavar(field, spec), help_behavior_hint=hint)
-        kind = Annotated[kind, mark, *field.metadata]
+        hint = "" if default in (None, (), {}, MISSING_NONPROP) else "(default: {})".format
+        marks = [tyro.conf.arg(help_behavior_hint=hint), *field.metadata]
+        kind = field.annotation
+        if tyro.conf.UseAppendAction in field.metadata:
+            kind = tuple[str, ...]
+        elif not (is_group(kind) or kind is bool):
+            marks.append(_words(kind))
         text = " ".join((field.description or "").split())
-        fields.append(StructFieldSpec(name, kind, default, text or None))
-    return StructConstructorSpec(info.type, tuple(fields))
+        fields.append(StructFieldSpec(name, Annotated[kind, *marks], default, text or None))
+    return StructConstructorSpec(dict, tuple(fields))
 
 
-def _spec(field: FieldInfo) -> PrimitiveConstructorSpec | None:
-    """How tyro reads a setting's value; None for a group or a switch, which take none."""
-    if field.annotation is bool or _is_group(field):
-        return None
-    kind = PrimitiveTypeInfo.make(field.annotation, set())
-    spec = ConstructorRegistry.get_primitive_spec(kind)
-    return spec if isinstance(spec, PrimitiveConstructorSpec) else None
+def _words(kind: Any) -> PrimitiveConstructorSpec:
+    """The words of a setting that pydantic is to read. A list may also have commas, except where a
+    file's name may."""
+    types = set(_types(kind))
+    is_list = bool({tuple, dict} & types)
 
+    def read(words: list[str]) -> Any:
+        parts = [
+            None if part == "None" and type(None) in types else part
+            for word in words
+            for part in (word.split(",") if is_list and Path not in types else [word])
+        ]
+        if dict in types:
+            return dict(zip(parts[::2], parts[1::2], strict=False))
+        return parts if is_list and parts != [None] else parts[0]
 
-def _metavar(field: FieldInfo, spec: PrimitiveConstructorSpec | None) -> str | None:
-    """The form of a setting's value: `PATH` of tyro's `{None}|PATH`, `INT ...` of
-    `[INT [INT ...]]`."""
-    if spec is None:
-        return None
-    form = re.sub(r"\{None\}\||(?<=\{)None,", "", spec.metavar)
-    form = re.sub(r"\[(.+?) \[\1 \.\.\.\]\]", r"\1 ...", form)
-    if "," not in form:
-        form = form.strip("{}")
-    if tyro.conf.UseAppendAction in field.metadata:
-        form = form.removesuffix(" ...")
-    return f"[{form}]" if tyro.conf.Positional in field.metadata else form
-
-
-def _usual_spelling(args: Sequence[str], flags: dict[str, FieldInfo | None]) -> list[str]:
-    """A command line in tyro's spelling.
-
-    Other programs also take `--flag=false` for `--no-flag`, `1e6` for a whole number, and
-    `256,256` for a list of two.
-    """
-    words: list[str] = []
-    field = None
-    for word in args:
-        flag, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-        if flag:
-            field = flags.get(flag.replace("_", "-"))
-        kind = None if field is None else field.annotation
-        if kind is bool and value.lower() in ("true", "false"):
-            if flag or words[-1].startswith("--"):
-                flag = flag or words.pop()
-                words.append(flag if value.lower() == "true" else _negated(flag))
-                continue
-        types = set(_types(kind))
-        # The name of a file may have commas.
-        parts = value.split(",") if tuple in types and Path not in types else [value]
-        if int in types:
-            parts = [str(whole_number(part)) for part in parts]
-        if len(parts) > 1 and flag:
-            words.append(flag)
-        elif flag:
-            parts = [flag + equals + parts[0]]
-        words.extend(parts)
-    return words
+    return PrimitiveConstructorSpec(
+        nargs="*" if is_list else 1,
+        metavar=_form(kind),
+        instance_from_str=read,
+        is_instance=lambda _: True,
+        str_from_instance=lambda value: list(map(str, value if is_list and value else [value])),
+    )
 
 
 def _types(kind: Any) -> Iterator[Any]:
@@ -216,96 +209,44 @@ def _types(kind: Any) -> Iterator[Any]:
         yield from _types(inner)
 
 
-def _negated(flag: str) -> str:
-    """The flag that sets a switch to false."""
-    group, dot, name = flag.removeprefix("--").rpartition(".")
-    return f"--{group}{dot}no-{name}"
+def _form(kind: Any) -> str:
+    """The form of a setting's value, such as `INT ...` of tuple[int, ...]."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return _form(inner[0])
+    if origin is Literal:
+        return f"{{{','.join(inner)}}}"
+    if origin is dict:
+        return f"{' '.join(map(_form, inner))} ..."
+    if origin is tuple:
+        return f"{_form(inner[0])} ..." if inner[-1] is ... else " ".join(map(_form, inner))
+    if origin in (typing.Union, types.UnionType):
+        return "|".join(_form(kind) for kind in inner if kind is not type(None))
+    return kind.__name__.upper()
 
 
-def _mistake(
-    event: tyro_errors.ParseErrorEvent, command_class: type[pydantic.BaseModel], args: Sequence[str]
-) -> str:
-    if isinstance(event, tyro_errors.UnrecognizedArgs):
-        return unknown_argument(event.tokens[0], flags_of(command_class))
-    invalid = _validation_error()
-    if invalid is not None:
-        return _bad_value(invalid, command_class)
-    argument = getattr(event, "argument", None)
-    if argument is None:
-        return "the command line is not understood"
-    flag = (argument.lowered.name_or_flags or [argument.field.extern_name])[0]
-    wanted = argument.lowered.metavar or "no value"
-    return f"{flag} takes {wanted}, but was given {_given(args, flag) or 'nothing'}"
-
-
-def unknown_argument(word: str, flags: Iterable[str]) -> str:
-    """A word of a command line that is none of the flags, as part of an error."""
-    near = difflib.get_close_matches(word.split("=")[0].replace("_", "-"), flags, n=1)
-    return f"unknown argument {word}" + (f"; did you mean {near[0]}?" if near else "")
-
-
-def _bad_value(error: pydantic.ValidationError, command_class: type[pydantic.BaseModel]) -> str:
-    """The first mistake of a validation error, named by its flag."""
-    groups = {group.__name__: (group, prefix) for group, prefix in _groups(command_class)}
-    group, prefix = groups[error.title]
-    return describe(error, group, lambda name: flag_of(prefix + name))
-
-
-def _validation_error() -> pydantic.ValidationError | None:
-    """The validation error that tyro is handling; tyro's event contains only its text."""
-    error = sys.exception()
-    while error is not None and not isinstance(error, pydantic.ValidationError):
-        error = error.__context__
-    return error
-
-
-def _given(args: Sequence[str], flag: str) -> str:
-    """The value of a flag on the command line."""
-    for i, word in enumerate(args):
-        name, equals, value = word.partition("=")
-        if name.replace("_", "-") == flag:
-            values = itertools.takewhile(lambda word: not word.startswith("--"), args[i + 1 :])
-            return value if equals else " ".join(values)
-    return ""
-
-
-def flags_of(command_class: type[pydantic.BaseModel]) -> dict[str, FieldInfo | None]:
-    """The settings of a command, keyed by the flags that tyro gives them; None for the negation of
-    a switch."""
-    flags: dict[str, FieldInfo | None] = {}
-    for group, prefix in _groups(command_class):
-        for name, field in group.model_fields.items():
-            if tyro.conf.Positional in field.metadata or _is_group(field):
-                continue
-            flag = flag_of(prefix + _argument_name(name, field))
-            flags[flag] = field
+def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
+    """The flags of a command."""
+    flags = []
+    for path in leaves(command_class):
+        field = path[-1][1]
+        if tyro.conf.Positional not in field.metadata:
+            flags.append(_flag(path))
             if field.annotation is bool:
-                flags[_negated(flag)] = None
+                group, dot, name = flags[-1].removeprefix("--").rpartition(".")
+                flags.append(f"--{group}{dot}no-{name}")
     return flags
 
 
-def _groups(
-    command_class: type[pydantic.BaseModel], prefix: str = ""
-) -> Iterator[tuple[type[pydantic.BaseModel], str]]:
-    """A command and the groups of settings in it, each with the prefix of its flags."""
-    yield command_class, prefix
-    for name, field in command_class.model_fields.items():
-        if _is_group(field):
-            inner = _argument_name(name, field)
-            yield from _groups(field.annotation, f"{prefix}{inner}." if inner else prefix)
-
-
-def _is_group(field: FieldInfo) -> bool:
-    annotation = field.annotation
-    return isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel)
-
-
-def _argument_name(name: str, field: FieldInfo) -> str:
-    """The name of a field's flag, which `tyro.conf.arg(name=...)` may replace."""
-    given = (getattr(mark, "name", None) for mark in field.metadata)
-    return next((new for new in given if isinstance(new, str)), name)
+def _flag(path: Sequence[tuple[str, FieldInfo]]) -> str:
+    """The flag of a setting: --reset.joint-angles of env.reset.joint_angles."""
+    names = []
+    for name, field in path:
+        given = (getattr(mark, "name", None) for mark in field.metadata)
+        names.append(next((new for new in given if isinstance(new, str)), name))
+    return flag_of(".".join(filter(None, names)))
 
 
 def flag_of(name: str) -> str:
-    """The flag of a setting: --num-envs of num_envs."""
+    """The flag of a name: --num-envs of num_envs."""
     return f"--{name}".replace("_", "-")

@@ -7,32 +7,16 @@ import yaml
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.files import read_regular
-
-_MAX_BYTES = 2**16
-_MAX_ALIASES = 10
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML in which a key appears twice, or whose size multiplies because repeated groups
-    contain repeated groups."""
-
-    _aliases = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
-        is_alias = self.check_event(yaml.AliasEvent)
-        node = super().compose_node(parent, index)
-        self._aliases += is_alias and isinstance(node, yaml.CollectionNode)
-        if self._aliases > _MAX_ALIASES:
-            raise yaml.YAMLError(f"it repeats a group more than {_MAX_ALIASES} times")
-        return node
+    """Refuses YAML in which a key appears twice, of which the last would count."""
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
-        first: dict[Any, yaml.Node] = {}
+        first: dict[str, yaml.Node] = {}
         for key, _ in node.value:
-            name = (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else key
-            if (other := first.setdefault(name, key)) is not key:
+            if (other := first.setdefault(str(key.value), key)) is not key:
                 lines = f"{other.start_mark.line + 1} and {key.start_mark.line + 1}"
                 raise yaml.YAMLError(
                     f"the key {key.value} appears twice, in lines {lines}; join the two"
@@ -50,24 +34,20 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
     Raises:
       UserError: the file is missing or is not a YAML mapping.
     """
+    advice = f"give a YAML file of keys and values such as {example}"
     try:
-        values = _Loader(read_regular(path, _MAX_BYTES).decode("utf-8")).get_single_data()
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     # PyYAML raises exceptions of many types where a value looks like a number or a date but is not
     # one.
     except Exception as error:
         reason = " ".join((getattr(error, "strerror", None) or str(error) or repr(error)).split())
         raise UserError(
-            f"the {kind} {shorten(str(path))} cannot be read ({shorten(reason, 300)}); give a "
-            f"YAML file such as {example}"
+            f"the {kind} {shorten(str(path))} cannot be read ({shorten(reason, 300)}); {advice}"
         ) from error
-    if values is None:
-        values = {}
-    if not isinstance(values, dict):
-        raise UserError(
-            f"the {kind} {shorten(str(path))} holds a {type(values).__name__}, not a mapping "
-            f"of keys to values; write it like {example}"
-        )
-    return values
+    if not isinstance(values, dict | None):
+        kind = f"the {kind} {shorten(str(path))} holds a {type(values).__name__}"
+        raise UserError(f"{kind}, not a mapping; {advice}")
+    return values or {}
 
 
 def dump_config(config: StrictModel) -> str:

@@ -6,11 +6,13 @@ are wide, and refuse the same quantity in another unit: millimetres, degrees or 
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
 from pydantic import Field
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticKnownError
 
 
@@ -124,6 +126,18 @@ class StrictModel(pydantic.BaseModel):
             else value
             for name, value in values.items()
         }
+
+
+def is_group(kind: Any) -> bool:
+    """Whether a type is a group of settings."""
+    return isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)
+
+
+def leaves(group: type[pydantic.BaseModel]) -> Iterator[tuple[tuple[str, FieldInfo], ...]]:
+    """The settings of a group and of the groups in it: the names and fields that lead to each."""
+    for step in group.model_fields.items():
+        inner = step[1].annotation
+        yield from ((step, *rest) for rest in (leaves(inner) if is_group(inner) else [()]))
 
 
 def merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:

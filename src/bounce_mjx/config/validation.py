@@ -2,13 +2,12 @@
 
 import difflib
 import re
-import reprlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import pydantic
 
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.settings import StrictModel, leaves
 from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
@@ -35,24 +34,30 @@ def describe(
     error: pydantic.ValidationError,
     config_class: type[pydantic.BaseModel],
     spell: Callable[[str], str] = str,
+    show: Callable[[Any], str] = repr,
 ) -> str:
-    """The first mistake of a validation error as part of a sentence.
+    """The first mistake of a validation error as part of a sentence, in pydantic's words.
 
     Args:
       spell: turns the dotted name of a setting into the form for the message, such as a flag.
+      show: the same for its value.
     """
     first = error.errors()[0]
+    fields = {".".join(name for name, _ in path): path[-1][1] for path in leaves(config_class)}
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        path = [shorten(str(part)) for part in first["loc"]]
-        return f"unknown key {'.'.join(path)}; {_advice(config_class, path)}"
-    path = [part for part in first["loc"] if isinstance(part, str)]
+        *groups, name = (shorten(str(part)) for part in first["loc"])
+        return f"unknown key {'.'.join([*groups, name])}; {_advice(fields, groups, name)}"
+    key = ".".join(part for part in first["loc"] if isinstance(part, str))
     if first["type"] == "value_error":
-        reason = first["msg"].removeprefix("Value error, ")
-        return ": ".join([*path[-1:], shorten(reason, 500)])
-    given, unit = shorten(_Repr().repr(first["input"])), ""
-    if first["type"].startswith(("greater_than", "less_than")):
-        unit = f" {unit_of(_text(config_class, path))}".rstrip()
-    return f"{spell('.'.join(path))} is {given}, but must {_wanted(error)}{unit}"
+        reason = shorten(first["msg"].removeprefix("Value error, "), 500)
+        return ": ".join(filter(None, [key.rpartition(".")[2], reason]))
+    reason = first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] == "missing":
+        reason = "an item is missing"
+    if first["type"].startswith(("greater_than", "less_than")) and key in fields:
+        reason += f" {unit_of(fields[key].description or '')}".rstrip()
+    given = shorten(show(first["input"]))
+    return f"{spell(key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
 
 def unit_of(text: str) -> str:
@@ -62,63 +67,17 @@ def unit_of(text: str) -> str:
     return units[-1] if units else ""
 
 
-def _text(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
-    """The docstring of a setting; empty if there is none of this dotted name."""
-    for name in path[:-1]:
-        field = config_class.model_fields.get(name)
-        config_class = getattr(field, "annotation", None)
-        if not (isinstance(config_class, type) and issubclass(config_class, pydantic.BaseModel)):
-            return ""
-    field = config_class.model_fields.get(path[-1]) if path else None
-    return (field and field.description) or ""
+def _advice(known: dict[str, Any], groups: list[str], name: str) -> str:
+    """Advice on an unknown key.
 
-
-class _Repr(reprlib.Repr):
-    """Python's notation, shortened: a value from a file may be very long."""
-
-    def __init__(self):
-        super().__init__()
-        self.maxstring = self.maxother = self.maxlong = 80
-        self.maxlevel = 3
-
-    def repr_int(self, x: int, level: int) -> str:
-        # Python refuses to write an integer of many digits.
-        return super().repr_int(x, level) if x.bit_length() < 1000 else "a very large number"
-
-
-def _wanted(error: pydantic.ValidationError) -> str:
-    """The requirement that the first mistake violates, to follow "must"."""
-    first = error.errors()[0]
-    if first["type"] == "missing":
-        missing = [e["loc"] for e in error.errors() if e["loc"][:-1] == first["loc"][:-1]]
-        return f"have {missing[-1][-1] + 1} items"
-    limits = first.get("ctx", {})
-    special = {
-        "model_type": "be a group of keys and values",
-        "path_type": "be a path",
-        "too_long": f"have {limits.get('max_length')} items",
-        "too_short": f"have at least {limits.get('min_length')} item",
-        "tuple_type": "be a list",
-    }
-    ordinary = first["msg"].removeprefix("Input should ").split(", unable")[0]
-    return special.get(first["type"], ordinary)
-
-
-def _advice(config_class: type[pydantic.BaseModel], path: list[str]) -> str:
-    """Advice on an unknown key."""
-    known = list(_dotted_keys(config_class))
-    prefix = ".".join([*path[:-1], ""])
-    siblings = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
-    same_name = [key for key in known if key.split(".")[-1] == path[-1]]
-    near = difflib.get_close_matches(path[-1], siblings, n=1)
+    Args:
+      known: the settings by dotted name.
+      groups: the groups that the key is in.
+    """
+    prefix = "".join(f"{group}." for group in groups)
+    here = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
+    same_name = [key for key in known if key.rpartition(".")[2] == name]
+    near = [prefix + key for key in difflib.get_close_matches(name, here, n=1)]
     if near or same_name:
-        return f"did you mean {same_name[0] if same_name else prefix + near[0]}?"
-    return f"known keys here are {', '.join(sorted(siblings))}"
-
-
-def _dotted_keys(config_class: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
-    for name, field in config_class.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
-            yield from _dotted_keys(field.annotation, f"{prefix}{name}.")
-        else:
-            yield prefix + name
+        return f"did you mean {(same_name or near)[0]}?"
+    return f"known keys here are {', '.join(sorted(here))}"

@@ -1,4 +1,4 @@
-"""The flags of the commands that train."""
+"""The flags of the command that trains."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,9 +6,11 @@ from typing import Annotated, TypeVar
 
 import pydantic
 import tyro
+from pydantic import Field
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import parse, parse_first
 from bounce_mjx.config.files import differing_keys
+from bounce_mjx.config.settings import Count, HostName, NonNegativeInt, Steps, StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import (
@@ -23,13 +25,15 @@ from bounce_mjx.runs.task import is_same_task
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
+PROG = "bounce-mjx train"
 
-class TrainingCommand(TrainConfig):
-    """The command line: the config's keys as flags, and the preset or run to start from."""
 
-    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
-    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
-    config: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+class Options(StrictModel):
+    """How a training starts, and what it does that its config does not say: flags without a key."""
+
+    config: Annotated[
+        tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PATH")
+    ] = ()
     """Preset: the name of a YAML file in configs/, such as cpu, robust or finetune; a task's own
     preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on an
     accelerator, and cpu on a CPU. A YAML file of yours lies on that default, or on the preset that
@@ -49,17 +53,57 @@ class TrainingCommand(TrainConfig):
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
     """Project of Weights & Biases to log to, in addition to TensorBoard; needs the extra wandb."""
+    distributed: bool = False
+    """Train together with the same command on other hosts, started by Slurm, Open MPI or
+    Kubernetes."""
+    coordinator_address: str | None = None
+    """HOST:PORT of process 0, to train on several hosts without one of these launchers."""
+    num_processes: Count | None = None
+    """Number of processes, one per host; with coordinator-address."""
+    process_id: NonNegativeInt | None = None
+    """Number of this process, from 0; with coordinator-address."""
+    watch: bool = False
+    """Serve a page during the training, with the newest policy, the curves and the results."""
+    watch_host: str = "127.0.0.1"
+    """Address of that page's server; 0.0.0.0 also admits other machines."""
+    watch_allow_host: tuple[HostName, ...] = ()
+    """Other names under which a browser may open that page, such as a proxy's."""
+    watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
+    """Port of that page's server, or the next free port."""
+    host_timeout: Annotated[Count, Field(le=10**6)] = 300
+    """Seconds that the processes wait for each other at the start."""
+
+    @property
+    def on_several_hosts(self) -> bool:
+        """Whether other processes train too."""
+        joins = (self.coordinator_address, self.num_processes, self.process_id)
+        return self.distributed or any(value is not None for value in joins)
 
 
-CommandT = TypeVar("CommandT", bound=TrainingCommand)
+class TrainCommand(Options, TrainConfig):
+    """Trains a policy; by default, one that keeps the ball bouncing."""
+
+    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
+    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
 
 
-def read_training(
-    command_class: type[CommandT],
+class _FirstFlags(Options):
+    """The flags that decide the config on which the others lie."""
+
+    task: str | None = None
+    warm_start: Path | None = None
+    log_dir: Path | None = None
+    total_steps: Steps | None = None
+
+
+CommandT = TypeVar("CommandT", bound=TrainCommand)
+
+
+def read_command(
     args: Sequence[str],
-    *,
-    prog: str,
     machine: Path | None = None,
+    kind: type[CommandT] = TrainCommand,
+    prog: str = PROG,
 ) -> CommandT:
     """Reads a command line on top of the preset, or of the resumed run's config. Its `config` are
     the files of that preset, each of which lies on those before it.
@@ -71,54 +115,58 @@ def read_training(
       UserError: a flag or the preset is wrong, or a flag changes a key of the resumed run that must
         stay the same.
     """
-    configs, resume = list(map(Path, early_flags(args, "--config"))), path_flag(args, "--resume")
-    robot, world = path_flag(args, "--robot"), path_flag(args, "--world")
-    task, warm_start = early_flag(args, "--task"), path_flag(args, "--warm-start")
-    for given, flag in ((configs, "--config"), (robot, "--robot"), (world, "--world")):
-        if given and resume:
-            raise UserError(f"{flag} and --resume cannot be combined; a resumed run has its config")
-    if warm_start and robot:
+    first = parse_first(_FirstFlags, args, prog=prog)
+    if first.resume:
+        return _resumed(first, args, kind, prog)
+    if first.warm_start and first.robot:
         raise UserError(
             "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
         )
-    if resume:
-        from bounce_mjx.runs.folders import find_run, named_run
-        from bounce_mjx.runs.reading import RESUMABLE_KEYS
-
-        log_dir = path_flag(args, "--log-dir") or runs_folder(find_task(task or DEFAULT))
-        resume = find_run(named_run(resume, log_dir))
-        base = load_run_config(resume, task)
-        if task is not None and not is_same_task(base.task, task):
-            raise UserError(
-                f"--resume cannot change the task, and {task} differs from {base.task}; restore "
-                "it, name the run's copy, or start a new run"
-            )
-    elif warm_start:
+    if first.warm_start:
         from bounce_mjx.training.warm_start import warm_config
 
-        base = warm_config(warm_start, configs, task, world, machine)
+        base = warm_config(first.warm_start, first.config, first.task, first.world, machine)
     else:
-        base = read_preset(configs, robot, task, world, machine)
-    start = base
-    if resume and early_flag(args, "--total-steps") is not None and _is_solved(resume):
-        start = base.model_copy(update={"stop_when_solved": False})
-    own_class = train_config(base.env.task, command_class)
-    default = own_class(**dict(start), robot=robot, world=world, resume=resume)
-    command = parse(own_class, args, prog=prog, default=default)
-    if warm_start and not resume:
-        # By its own name, if it was the latest.
-        command = command.model_copy(update={"warm_start": base.warm_start})
-    if resume:
-        command = command.model_copy(update={"resume": resume, "task": base.task})
-        changed = differing_keys(base, config_of(command)) - RESUMABLE_KEYS
-        if changed:
+        base = read_preset(first.config, first.robot, first.task, first.world, machine)
+    command = _parse(args, base, kind, prog)
+    files = preset_files(first.config, base.task, machine)
+    # The run of a warm start by its own name, if it was the latest.
+    return command.model_copy(update={"config": tuple(files), "warm_start": base.warm_start})
+
+
+def _resumed(first: _FirstFlags, args: Sequence[str], kind: type[CommandT], prog: str) -> CommandT:
+    """A command line on top of a resumed run's config."""
+    for flag in ("config", "robot", "world"):
+        if getattr(first, flag):
             raise UserError(
-                f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
-                "start a new run"
+                f"--{flag} and --resume cannot be combined; a resumed run has its config"
             )
-        return command
-    files = preset_files(configs, base.task, machine)
-    return command.model_copy(update={"config": tuple(files)})
+    from bounce_mjx.runs.folders import find_run, named_run
+    from bounce_mjx.runs.reading import RESUMABLE_KEYS
+
+    log_dir = first.log_dir or runs_folder(find_task(first.task or DEFAULT))
+    run = find_run(named_run(first.resume, log_dir))
+    base = load_run_config(run, first.task)
+    if first.task is not None and not is_same_task(base.task, first.task):
+        raise UserError(
+            f"--resume cannot change the task, and {first.task} differs from {base.task}; restore "
+            "it, name the run's copy, or start a new run"
+        )
+    longer = first.total_steps is not None and _is_solved(run)
+    start = base.model_copy(update={"stop_when_solved": False}) if longer else base
+    command = _parse(args, start, kind, prog).model_copy(update={"resume": run, "task": base.task})
+    if changed := differing_keys(base, config_of(command)) - RESUMABLE_KEYS:
+        raise UserError(
+            f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or start "
+            "a new run"
+        )
+    return command
+
+
+def _parse(args: Sequence[str], base: TrainConfig, kind: type[CommandT], prog: str) -> CommandT:
+    """A command line on top of a config."""
+    own_class = train_config(base.env.task, kind)
+    return parse(own_class, args, prog=prog, default=own_class(**dict(base)))
 
 
 def _is_solved(run: Path) -> bool:
@@ -130,30 +178,6 @@ def _is_solved(run: Path) -> bool:
     return all(found is not None and found.solved for found in results)
 
 
-def config_of(command: TrainingCommand) -> TrainConfig:
+def config_of(command: TrainCommand) -> TrainConfig:
     """The run's config within a command line."""
     return TrainConfig(**{key: getattr(command, key) for key in TrainConfig.model_fields})
-
-
-def path_flag(args: Sequence[str], flag: str) -> Path | None:
-    """The path in a flag that must be read before the others."""
-    word = early_flag(args, flag)
-    return None if word is None else Path(word)
-
-
-def early_flag(args: Sequence[str], flag: str) -> str | None:
-    """The value of a flag that must be read before the others, in every spelling that the parser
-    accepts: with - or _ in the name, and with = or a space before the value. If the flag is
-    repeated, the last value counts."""
-    return next(reversed(early_flags(args, flag)), None)
-
-
-def early_flags(args: Sequence[str], flag: str) -> list[str]:
-    """All values of a flag that may be repeated, as for `early_flag`."""
-    values = []
-    for i, word in enumerate(args):
-        name, equals, given = word.partition("=")
-        if name.startswith("--") and name.replace("_", "-") == flag:
-            following = args[i + 1] if i + 1 < len(args) else ""
-            values.append(given if equals else following)
-    return values

@@ -17,7 +17,7 @@ from bounce_mjx.runs.config import TrainConfig, shown_file
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
-from bounce_mjx.training.command import TrainingCommand, config_of
+from bounce_mjx.training.command import TrainCommand, config_of
 from bounce_mjx.training.console import say
 from bounce_mjx.training.job import Options, SeedRun, TrainingStopped, train
 from bounce_mjx.training.log import open_log
@@ -25,7 +25,7 @@ from bounce_mjx.training.trainer import Trainer, Watcher
 
 
 def run_command(
-    command: TrainingCommand,
+    command: TrainCommand,
     make_trainer: Callable[[TrainConfig, Env], Trainer],
     prog: str,
     watcher: Watcher | None = None,
