@@ -671,8 +671,8 @@ FOREIGN = (
 
 @pytest.mark.slow
 def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
-    """Every value that a control does not offer is refused before it is stored, so that the page
-    sends it to no other client, and nothing is printed."""
+    """Whatever a client sends, the simulation keeps within what the controls offer, other clients
+    read on, and nothing is printed."""
     client, did = page
     controls = {label: client.control(label) for label in HOSTILE}
     capfd.readouterr()
@@ -686,7 +686,12 @@ def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
     client.send_bytes(b"\xc1")
     client.send_bytes(b"\x91" * 2000)
     client.send_bytes("text")
-    assert (set(did["shown"]), set(did["speed"]), set(did["target"])) == ({1}, {1.0}, {None})
+    client.set(controls["pause"], False)
+    steps = len(did["target"])
+    wait_until(lambda: len(did["target"]) > steps)
+    assert set(did["shown"]) <= {1, 2}
+    assert all(speed == 0.0 or 0.1 <= speed <= 4.0 for speed in did["speed"])
+    assert all(target is None or 0.3 <= target <= 0.8 for target in did["target"])
     assert not did["push"]
 
     with contextlib.closing(Client(client.address)) as other:
@@ -704,12 +709,12 @@ def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def handshake(address: str, host: str | None, origin: str | None, version: str = "") -> bytes:
+def handshake(address: str, host: str | None, origin: str | None) -> bytes:
     """The status of the answer to a page that opens a WebSocket."""
     where = urllib.parse.urlsplit(address)
     lines = ["GET / HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade"]
     lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13"]
-    lines += [f"Sec-WebSocket-Protocol: viser-v{version or viser.__version__}"]
+    lines += [f"Sec-WebSocket-Protocol: viser-v{viser.__version__}"]
     lines += [] if host is None else [f"Host: {host}"]
     lines += [] if origin is None else [f"Origin: {origin}"]
     with socket.create_connection((where.hostname, where.port)) as client:
@@ -777,7 +782,6 @@ def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -
         # A proxy replaces the name.
         for name in allowed:
             assert handshake(address, "127.0.0.1", f"https://{name}") == b"101"
-        assert handshake(address, "localhost", None, version="0.0.1") == b"400"
 
         request = urllib.request.Request(address, headers={"Host": "evil.test"})
         with pytest.raises(urllib.error.HTTPError) as refusal:
@@ -803,7 +807,7 @@ def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:
     assert stopped
 
 
-def test_keys_act_as_in_the_window(page) -> None:
+def test_keys_act(page) -> None:
     client, did = page
     client.control("push the ball right")
     assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
@@ -977,7 +981,7 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
     assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
 
 
-def test_the_legend_explains_the_markers_and_the_keys_are_those_of_the_window(page) -> None:
+def test_the_legend_explains_the_markers(page) -> None:
     client, _ = page
     client.control("push the ball right")
     (legend,) = {text for text in client.texts if "path of the ball" in text}
@@ -1092,20 +1096,6 @@ def test_the_page_shows_the_commands_of_any_task(leaning: Simulation, monkeypatc
     leaning.command = {}
 
 
-def test_keys_of_the_window_move_the_first_command_within_its_limits(leaning: Simulation) -> None:
-    window = native.Window(leaning, 1.0)
-    for key, end in (("T", 0.3), ("G", -0.3)):
-        for _ in range(8):
-            window.press(ord(key))
-        assert leaning.command == {"lean_angle": pytest.approx(end)}
-    leaning.step()
-    (_, _, names, values), (_, _, keys, meanings) = window._texts()
-    assert dict(zip(names.split("\n"), values.split("\n"), strict=True))["twice"] == "-0.6"
-    help_ = dict(zip(keys.split("\n"), meanings.split("\n"), strict=True))
-    assert help_["T"] == "lean angle up"
-    leaning.command = {}
-
-
 def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
     still: Simulation, monkeypatch
 ) -> None:
@@ -1114,10 +1104,6 @@ def test_a_task_without_commands_has_no_slider_and_no_key_for_one(
         assert client.sliders.keys() == {"speed", "robots", "speed, m/s"}
         assert "".join(client.keys) == "spaceRMNIKJL"
         assert client.lines == ["s", "ball", "paddle"]
-    window = native.Window(still, 1.0)
-    window.press(ord("T"))
-    (*_, (_, _, keys, _)) = window._texts()
-    assert still.command == {} and "T" not in keys.split("\n")
 
 
 def test_a_label_without_readings_is_not_shown(still: Simulation, mirrored: Simulation) -> None:
@@ -1501,14 +1487,6 @@ def test_a_video_shows_one_policy(fails, monkeypatch) -> None:
     monkeypatch.setattr(Simulation, "__init__", None)
     sentence = fails(play.main, "pretrained pretrained --video a.mp4".split())
     assert "shows one policy" in sentence and "--viewer browser" in sentence
-
-
-def test_the_windows_own_toggles_of_the_used_keys_are_undone(mirrored: Simulation) -> None:
-    keys = {mujoco.mjVISSTRING[i][2] for i in native._OPTION_FLAGS}
-    keys |= {mujoco.mjRNDSTRING[i][2] for i in native._SCENE_FLAGS}
-    (*_, (_, _, names, _)) = native.Window(mirrored, 1.0)._texts()
-    used = {*names.split("\n")} - {"space"}
-    assert keys == used == set(native._KEYS)
 
 
 @pytest.mark.parametrize("main", [view.main, play.main])

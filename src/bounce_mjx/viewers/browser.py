@@ -95,8 +95,8 @@ class LivePage:
         for frames in in_real_time(simulation, seconds, controls.pace):
             between()
             controls.apply()
-            if controls.num_shown.value != scene.num_envs:
-                scene.show(controls.num_shown.value)
+            if controls.num_shown != scene.num_envs:
+                scene.show(controls.num_shown)
             self._history.extend(frames)
             scene.update(frames or [simulation.frame])
             if frames and time.monotonic() >= next_plot:

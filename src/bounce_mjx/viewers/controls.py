@@ -1,9 +1,8 @@
-"""The page's panel of controls. `guard` refuses values that a control does not offer."""
+"""The page's panel of controls."""
 
 import html
 import queue
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import viser
@@ -11,11 +10,9 @@ import viser
 from bounce_mjx.viewers.options import SPEED_RANGE, PageStart
 from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.world import sliders_for
-from bounce_mjx.world.config import Command, WorldConfig
+from bounce_mjx.world.config import Command
 
 _PUSH_RANGE = (0.05, 1.0)
-DEFAULT_PUSH = 0.2
-"""Speed of a push, m/s."""
 _DIRECTIONS = ("up", "away", "back", "left", "right")
 _SPEED_STEP = 0.1
 # Steps of a command's slider in a change by a key.
@@ -36,25 +33,25 @@ class Controls:
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", *SPEED_RANGE, _SPEED_STEP, start.speed)
         most = simulation.num_envs
-        self.num_shown = gui.add_slider(
+        self._num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
         )
         self.following = gui.add_checkbox("follow the ball", False)
         reset = gui.add_button("reset", icon=viser.Icon.REFRESH)
-        reset.on_click(self.reset)
+        reset.on_click(self._reset)
         self.save = gui.add_button("save the last 10 s", icon=viser.Icon.DOWNLOAD)
         self._commands = {
             name: self._add_command(gui, name, command)
             for name, command in simulation.env.config.commands.items()
         }
         with gui.add_folder("push the ball"):
-            self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, DEFAULT_PUSH)
+            self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, 0.2)
             push = gui.add_button_group("towards", _DIRECTIONS)
-        push.on_click(lambda event: self.push(push.value, event))
+        push.on_click(lambda event: self._push(push.value, event))
         self._sliders = {}
         self._add_world(gui)
         # Ctrl-K lists them. The arrows and W, A, S, D, Q and E move viser's camera.
-        for label, key, act in keys(self, simulation.env.config):
+        for label, key, act in self._keys():
             gui.add_command(label, hotkey=key).on_trigger(act)
 
     def _add_command(
@@ -91,75 +88,78 @@ class Controls:
                 self._sliders[slider] = handle
             gui.add_button("nominal world").on_click(self._make_nominal)
 
-    def pause(self, _: object) -> None:
-        """Pauses the simulation, or resumes it."""
+    @property
+    def num_shown(self) -> int:
+        """Number of robots in the scene."""
+        return min(_bounded(self._num_shown), self._simulation.num_envs)
+
+    def pace(self) -> float:
+        """The present speed, as a factor of real time; 0 is a pause."""
+        return 0.0 if self._paused.value else _bounded(self._speed)
+
+    def _keys(self) -> list[tuple[str, str, Callable[[viser.CommandEvent], None]]]:
+        """What each key does, the key, and the function of its event."""
+        name = next(map(words, self._commands), None)
+        return [
+            ("pause", "space", self._pause),
+            ("reset", "R", self._reset),
+            *([] if name is None else [(f"{name} up", "T", lambda _: self._move(1.0))]),
+            *([] if name is None else [(f"{name} down", "G", lambda _: self._move(-1.0))]),
+            ("faster", "M", lambda _: self._accelerate(_SPEED_STEP)),
+            ("slower", "N", lambda _: self._accelerate(-_SPEED_STEP)),
+            ("push the ball up", "I", lambda event: self._push("up", event)),
+            ("push the ball back", "K", lambda event: self._push("back", event)),
+            ("push the ball left", "J", lambda event: self._push("left", event)),
+            ("push the ball right", "L", lambda event: self._push("right", event)),
+        ]
+
+    def _pause(self, _: object) -> None:
         self._paused.value = not self._paused.value
 
-    def reset(self, _: object) -> None:
-        """Requests a new episode of every robot."""
+    def _reset(self, _: object) -> None:
         self._requests.put(self._simulation.reset)
 
-    def move(self, steps: float) -> None:
+    def _move(self, steps: float) -> None:
         """Moves the first command's slider by a number of the command's steps."""
         name, (drawn, slider) = next(iter(self._commands.items()))
         change = steps * self._simulation.env.config.commands[name].step
         slider.value = float(np.clip(slider.value + change, slider.min, slider.max))
         drawn.value = False
 
-    def hasten(self, change: float) -> None:
-        """Changes the speed."""
+    def _accelerate(self, change: float) -> None:
         self._speed.value = float(np.clip(round(self._speed.value + change, 1), *SPEED_RANGE))
 
-    def push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
+    def _push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
         """Requests a push of the ball in a direction as the event's page sees it."""
-        camera = event.client.camera
-        velocity = self._push_speed.value * direction(towards, camera.look_at - camera.position)
-        self._requests.put(lambda: self._simulation.push(velocity))
+        if towards in _DIRECTIONS:
+            camera = event.client.camera
+            view = camera.look_at - camera.position
+            velocity = _bounded(self._push_speed) * direction(towards, view)
+            self._requests.put(lambda: self._simulation.push(velocity))
 
     def _make_nominal(self, _: object) -> None:
         for slider, handle in self._sliders.items():
             handle.value = slider.nominal
         self._drawn.value = False
 
-    def pace(self) -> float:
-        """The present speed, as a factor of real time; 0 is a pause."""
-        return 0.0 if self._paused.value else self._speed.value
-
     def apply(self) -> None:
         """Applies the settings and the requests to the simulation."""
         self._simulation.command = {
-            name: slider.value
+            name: _bounded(slider)
             for name, (drawn, slider) in self._commands.items()
             if not drawn.value
         }
         if self._sliders:
-            positions = {slider: handle.value for slider, handle in self._sliders.items()}
+            positions = {slider: _bounded(handle) for slider, handle in self._sliders.items()}
             world = {slider.term: slider.world_value(x) for slider, x in positions.items()}
             self._simulation.world = None if self._drawn.value else world
         while not self._requests.empty():
             self._requests.get()()
 
 
-def keys(viewer: Any, config: WorldConfig) -> list[tuple[str, str, Callable[[Any], None]]]:
-    """The keys of the page and of MuJoCo's window: what each one does, the key, and the function of
-    its event.
-
-    Args:
-      viewer: has the methods pause, reset, move, hasten and push.
-    """
-    moved = [words(name) for name in config.commands][:1]
-    return [
-        ("pause", "space", viewer.pause),
-        ("reset", "R", viewer.reset),
-        *((f"{name} up", "T", lambda _: viewer.move(1.0)) for name in moved),
-        *((f"{name} down", "G", lambda _: viewer.move(-1.0)) for name in moved),
-        ("faster", "M", lambda _: viewer.hasten(_SPEED_STEP)),
-        ("slower", "N", lambda _: viewer.hasten(-_SPEED_STEP)),
-        ("push the ball up", "I", lambda event: viewer.push("up", event)),
-        ("push the ball back", "K", lambda event: viewer.push("back", event)),
-        ("push the ball left", "J", lambda event: viewer.push("left", event)),
-        ("push the ball right", "L", lambda event: viewer.push("right", event)),
-    ]
+def _bounded(slider: viser.GuiSliderHandle) -> float:
+    """The slider's value. A page may send any number, which viser does not check."""
+    return max(slider.min, min(slider.value, slider.max))
 
 
 def direction(towards: str, view: np.ndarray) -> np.ndarray:

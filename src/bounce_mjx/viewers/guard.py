@@ -14,26 +14,24 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Collection, Iterator
-from typing import Annotated, Any, Literal
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
-import pydantic
+import numpy as np
 import rich
 import viser
 import websockets.asyncio.server
-from pydantic import Field
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 
 _LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 _ALL_ADDRESSES = ("0.0.0.0", "::", "")
 # The longest message of a page, its camera, has 400 bytes.
 _MAX_BYTES = 4096
-_ROUNDING = 1e-6
+_MAX_NUMBER = 1e6
 # viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
 _STOP_SECONDS = 1.0
 _REFUSAL = (
@@ -42,37 +40,6 @@ _REFUSAL = (
     "--watch-allow-host)\n"
 )
 _STARTING = threading.Lock()
-
-_Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
-_PositiveNumber = Annotated[_Number, Field(gt=0.0)]
-_Vector = tuple[_Number, _Number, _Number]
-
-
-class _Camera(StrictModel):
-    type: Literal["ViewerCameraMessage"]
-    wxyz: tuple[_Number, _Number, _Number, _Number]
-    position: _Vector
-    look_at: _Vector
-    up_direction: _Vector
-    fov: _PositiveNumber
-    near: _PositiveNumber
-    far: _PositiveNumber
-    image_height: _PositiveNumber
-    image_width: _PositiveNumber
-
-
-class _Key(StrictModel):
-    type: Literal["CommandTriggerMessage"]
-    uuid: str
-
-
-class _Update(StrictModel):
-    type: Literal["GuiUpdateMessage"]
-    uuid: str
-    updates: Annotated[dict[Literal["value"], Any], Field(min_length=1)]
-
-
-_MESSAGES = pydantic.TypeAdapter(Annotated[_Camera | _Key | _Update, Field(discriminator="type")])
 
 
 @contextlib.contextmanager
@@ -89,14 +56,12 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
       UserError: this version of viser cannot be guarded.
     """
     guard = _Guard(host, allowed)
-    # viser prints with rich's global console, from several threads; this package uses others.
-    rich.get_console().quiet = True
-    # viser has no parameter for any of this. It starts its websocket server in its constructor.
-    with _STARTING:
+    # viser starts its websocket server in its constructor, and has no parameter for a guard.
+    with _STARTING, _quiet_console():
         serve = websockets.asyncio.server.serve
         websockets.asyncio.server.serve = functools.partial(guard.serve, serve)
         try:
-            guard.server = viser.ViserServer(host=host, port=port, verbose=False)
+            server = viser.ViserServer(host=host, port=port, verbose=False)
         finally:
             websockets.asyncio.server.serve = serve
     try:
@@ -105,16 +70,31 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
                 f"viser {viser.__version__} would admit every website to the page; install viser "
                 "1.1"
             )
-        yield guard.server
+        yield server
     finally:
-        stopping = threading.Thread(target=guard.server.stop, daemon=True)
+        stopping = threading.Thread(target=_stop, args=(server,), daemon=True)
         stopping.start()
         stopping.join(_STOP_SECONDS)
 
 
+@contextlib.contextmanager
+def _quiet_console() -> Iterator[None]:
+    """Silences rich's global console, on which viser prints; this package uses others."""
+    console = rich.get_console()
+    console.quiet = True
+    try:
+        yield
+    finally:
+        console.quiet = False
+
+
+def _stop(server: viser.ViserServer) -> None:
+    with _quiet_console():
+        server.stop()
+
+
 class _Guard:
     def __init__(self, host: str, allowed: Collection[str]):
-        self.server: viser.ViserServer | None = None
         self.is_serving = False
         self._allowed = {name.lower() for name in allowed}
         self._names = self._allowed | {*_LOCAL_NAMES, host.lower()}
@@ -131,10 +111,7 @@ class _Guard:
             **options
             | {
                 "process_request": functools.partial(self._refusal, options["process_request"]),
-                # viser prints a line for a client of another version.
-                "subprotocols": [f"viser-v{viser.__version__}"],
-                "select_subprotocol": None,
-                "create_connection": functools.partial(_Connection, self),
+                "create_connection": _Connection,
                 "max_size": _MAX_BYTES,
                 "logger": logging.Logger(__name__, logging.CRITICAL + 1),
             },
@@ -166,42 +143,31 @@ class _Guard:
         own = origin.lower().partition("://")[2] == host.lower()
         return own or _host_name(origin) in self._allowed
 
-    def accepts(self, data: str | bytes) -> bool:
-        """Whether a client's message is valid."""
-        try:
-            message = _MESSAGES.validate_python(msgspec.msgpack.decode(data))
-        # Any bytes may come.
-        except Exception:
-            return False
-        return not isinstance(message, _Update) or self._fits(message)
-
-    def _fits(self, update: _Update) -> bool:
-        """Whether a control offers the new value."""
-        gui, value = getattr(self.server, "gui", None), update.updates["value"]
-        handle = gui and gui._gui_input_handle_from_uuid.get(update.uuid)
-        if handle is None or handle.disabled:
-            return False
-        if isinstance(handle, viser.GuiSliderHandle):
-            # A page sends whole numbers as such, and rounds the others.
-            is_number = type(value) in (int, type(handle.value))
-            return is_number and handle.min - _ROUNDING <= value <= handle.max + _ROUNDING
-        if isinstance(handle, viser.GuiButtonGroupHandle):
-            return value in handle.options
-        return isinstance(value, bool)
-
 
 class _Connection(ServerConnection):
-    """A connection that drops invalid messages."""
-
-    def __init__(self, guard: _Guard, *args: Any, **options: Any):
-        super().__init__(*args, **options)
-        self._guard = guard
+    """A connection that drops messages that are not a page's."""
 
     async def recv(self, *args: Any, **options: Any) -> str | bytes:
         message = await super().recv(*args, **options)
-        while not self._guard.accepts(message):
+        while not _is_of_page(message):
             message = await super().recv(*args, **options)
         return message
+
+
+def _is_of_page(data: str | bytes) -> bool:
+    """Whether a message is one that a page sends: its camera, a key, or a control's new value."""
+    # Any bytes may come.
+    with contextlib.suppress(Exception):
+        match msgspec.msgpack.decode(data):
+            case {"type": "ViewerCameraMessage", **numbers}:
+                return bool(np.all(np.abs(np.hstack(list(numbers.values()))) <= _MAX_NUMBER))
+            case {"type": "CommandTriggerMessage", "uuid": str(), **others}:
+                return not others
+            case {"type": "GuiUpdateMessage", "uuid": str(), "updates": {"value": value, **others}}:
+                # viser would read a number from a text.
+                is_word = isinstance(value, str) and value.isalpha()
+                return not others and (is_word or abs(value) <= _MAX_NUMBER)
+    return False
 
 
 def _host_name(url: str) -> str:

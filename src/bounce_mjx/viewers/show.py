@@ -14,7 +14,7 @@ from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output
 from bounce_mjx.viewers.controllers import Controller
-from bounce_mjx.viewers.native import Window, check_display, has_display
+from bounce_mjx.viewers.native import check_display, has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import SideBySide, Simulation
 from bounce_mjx.viewers.world import drawn_ranges, with_sliders
@@ -114,7 +114,7 @@ def _window(options: ViewerOptions, console: Console) -> Present:
 
     def present(simulation: Simulation, start: PageStart) -> None:
         with contextlib.suppress(Interrupted), StopRequest() as stop:
-            Window(simulation, start.speed).run(options.seconds, stop.check)
+            show_window(simulation, start.speed, options.seconds, stop.check)
 
     return present
 
