@@ -20,7 +20,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.export import export_jax, export_onnx, policy_metadata
+from bounce_mjx.deploy.export import export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import CommandRange, from_entries, to_entries
 from bounce_mjx.deploy.policy import DeployedPolicy
@@ -401,17 +401,6 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
         np.testing.assert_allclose(results[f"next/{name}"], values, rtol=1e-6, atol=1e-6)
     network = network_of(config, reading.read_policy(checkpoint, config))
     np.testing.assert_allclose(results["action"], network(inputs | seen), rtol=0.0, atol=2e-5)
-
-
-@pytest.mark.parametrize("name", ["all histories", "pretrained"])
-def test_jax_artefact_equals_jax(name: str, runs: dict[str, Path]) -> None:
-    inputs, expected = draw_inputs(name, runs)
-    given = {input_name(quantity): values for quantity, values in inputs.items()}
-    artefact = jax.export.deserialize(export_jax(find_checkpoint(runs[name])))
-    assert set(artefact.platforms) == {"cpu", "cuda"}
-    for count in (1, 1000):
-        some = {part: values[:count] for part, values in given.items()}
-        np.testing.assert_allclose(artefact.call(some), expected[:count], rtol=0.0, atol=1e-5)
 
 
 def test_metadata_has_the_ranges_of_each_axis() -> None:
@@ -1008,13 +997,12 @@ def test_no_servo_targets_for_a_wrong_action(action, policies) -> None:
         policy.servo_targets(action)
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "flatbuffers"])
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
 def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     use = {
         "onnx": lambda: export_onnx(pretrained_checkpoint()),
         "onnxruntime": lambda: load_policy("pretrained"),
-        "flatbuffers": lambda: export_jax(pretrained_checkpoint()),
     }
     with pytest.raises(UserError, match=f"^{package} cannot be imported.*pip install"):
         use[package]()
@@ -1096,22 +1084,20 @@ def test_the_example_has_a_late_camera() -> None:
     assert measured["ball_age"] == pytest.approx(0.02)
 
 
-def test_command_writes_both_files(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_command_writes_the_file(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    export_command.main("pretrained --onnx policy.onnx --jax policy.jax".split())
+    export_command.main("pretrained --onnx policy.onnx".split())
     fresh = export_onnx(pretrained_checkpoint())
     assert (tmp_path / "policy.onnx").read_bytes() == fresh
-    artefact = jax.export.deserialize((tmp_path / "policy.jax").read_bytes())
-    assert artefact.out_avals[0].shape[1:] == (6,)
     assert "written: policy.onnx" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ("pretrained", "give --onnx FILE or --jax FILE"),
+        ("pretrained", "give --onnx FILE"),
         ("pretrained --onnx nowhere/a.onnx", "folder of --onnx nowhere/a.onnx does not exist"),
-        ("pretrained --jax .", "--jax . is a folder"),
+        ("pretrained --onnx .", "--onnx . is a folder"),
         ("nowhere --onnx a.onnx", "no run nowhere, and no policy of this name"),
     ],
 )

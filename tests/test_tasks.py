@@ -150,7 +150,7 @@ def test_a_task_without_events_goes_through_every_command(
     assert "target_height" in command("view", *task, *flags, code=2)
     command("report", *task)
     command("plot", *task, "--formats", "svg")
-    command("export", *task, "--onnx", "rest.onnx", "--jax", "rest.jax")
+    command("export", *task, "--onnx", "rest.onnx")
     script = """
 import numpy as np
 from bounce_mjx import load_policy

@@ -1,7 +1,7 @@
-"""A trained policy as one ONNX graph, or its network as a compiled JAX function.
+"""A trained policy as one ONNX graph.
 
-Both have a separate input for each part of the observation. The runtime checks the names and shapes
-of the inputs; a single vector would hide a wrong order.
+It has a separate input for each part of the observation. The runtime checks the names and shapes of
+the inputs; a single vector would hide a wrong order.
 """
 
 from collections.abc import Callable, Sequence
@@ -87,28 +87,6 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     onnx.helper.set_model_props(model, to_entries(metadata))
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
-
-
-def export_jax(checkpoint: Checkpoint) -> bytes:
-    """Exports a checkpoint's policy as a `jax.export` artefact for the CPU and CUDA.
-
-    `jax.export.deserialize(artefact).call(inputs)` gives the actions [N, n] for any N; `inputs` is
-    a dict of the histories [N, history, size] of all quantities, named as for `export_onnx`.
-
-    Raises:
-      UserError: the checkpoint is damaged, or flatbuffers is not installed.
-    """
-    with needed("flatbuffers", EXTRA):
-        # JAX serialises with it.
-        import flatbuffers  # noqa: F401
-    config = load_run_config(checkpoint.run)
-    network = jax.jit(jax.vmap(_network(config, read_actor(checkpoint, config)[1])))
-    (n,) = jax.export.symbolic_shape("n")
-    shapes = {
-        name: jax.ShapeDtypeStruct((n, *row.shape), row.dtype)
-        for name, row in _histories(config.env).items()
-    }
-    return jax.export.export(network, platforms=("cpu", "cuda"))(shapes).serialize()
 
 
 def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
