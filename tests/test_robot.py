@@ -198,8 +198,16 @@ BROKEN = {
         "put the base",
     ),
     "narrow limits": (
-        mjcf(arm(limits="-0.1 0.1", tip='<body name="hand"/>'), motors(ARM_JOINTS)),
+        mjcf(arm(limits="-0.1 0.1"), motors(ARM_JOINTS)),
         "tool",
+        "no pose in which the joints j1, j2",
+        "wider ranges",
+    ),
+    "a site that is never level": (
+        mjcf(
+            arm(limits="-0.1 0.1", tip='<site name="tilted" euler="0.8 0 0"/>'), motors(ARM_JOINTS)
+        ),
+        "tilted",
         "no reachable pose",
         "j1, j2",
     ),
@@ -370,7 +378,7 @@ def test_servos_step_without_overshoot_and_hold_the_arm(env, dt) -> None:
     model.opt.timestep = config.physics_dt
     end = travelled[-1]
     assert np.all(np.abs(data.qvel[list(addresses.arm_qvel)]) < 0.02)
-    assert np.all(np.max(travelled, axis=0) < np.maximum(end, 0.02) + 0.004)
+    assert np.all(np.max(travelled, axis=0) < np.maximum(end, 0.02) + 0.006)
     assert np.all(np.abs(end - 0.02) < 0.025) and np.median(end) > 0.018
 
 

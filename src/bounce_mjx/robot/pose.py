@@ -1,6 +1,6 @@
 """Search of the start pose: a level paddle at a well-conditioned point in front of the robot.
 
-Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds; the best pose
+Inverse kinematics by least squares within the joint limits, from many seeds; the best pose
 has the largest score of conditioning, distance to the joint limits and strength.
 """
 
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import scipy.optimize
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import joint_name
@@ -22,9 +23,8 @@ _LEAST_ACCELERATION, _AMPLE_ACCELERATION = 3.0, 20.0
 # Smallest singular value of a usable pose; 1 would be an arm that moves as a sphere.
 _LEAST_MANIPULABILITY = 0.02
 _LEVEL_TOLERANCE = 1e-9
-_DAMPING = 1e-3
-_ITERATIONS = 60
-_MAX_STEP = 0.4
+_EVALUATIONS = 30
+_UP = np.array([0.0, 0.0, 1.0])
 # Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
 # short range it is a tenth.
 _LEAST_MARGIN = 0.1
@@ -112,16 +112,15 @@ class _Search:
         low, high = model.jnt_range[self._joints].T
         free = low >= high
         self._range = np.where(free, -np.inf, low), np.where(free, np.inf, high)
-        # A joint without limits, or with more than a turn, is searched within half a turn.
-        self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        wide, centre = np.where(self._hinge, np.pi, 0.5), model.qpos0[self._qpos]
-        self._low = np.maximum(self._range[0], centre - wide)
-        self._high = np.minimum(self._range[1], centre + wide)
-        outside = self._low >= self._high
-        self._low[outside], self._high[outside] = low[outside], high[outside]
         # A servo whose joint is at its limit could move it one way only.
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
         self._inside = self._range[0] + margin, self._range[1] - margin
+        # A joint without limits, or with more than a turn, is searched within half a turn.
+        self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
+        wide, centre = np.where(self._hinge, np.pi, 0.5), model.qpos0[self._qpos]
+        self._low, self._high = (
+            np.clip(centre + side * wide, *self._inside) for side in (-1.0, 1.0)
+        )
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         mujoco.mj_kinematics(model, self._data)
@@ -191,10 +190,10 @@ class _Search:
         return self._data.geom_xpos[self._at.paddle_geom].copy(), rotation[:, 2].copy()
 
     def _jacobian(self, paddle: np.ndarray) -> np.ndarray:
-        """Jacobian [5, n] of the paddle's displacement, m, and of its tilt about x and y, m."""
+        """Jacobian [6, n] of the paddle's displacement and scaled rotation, m."""
         linear, angular = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
-        return np.vstack([linear, _LENGTH * angular[:2]])[:, self._dofs]
+        return np.vstack([linear, _LENGTH * angular])[:, self._dofs]
 
     def _level_poses(self, reach: float):
         """Poses [n] with a level paddle in front of the robot, at many distances and heights."""
@@ -211,31 +210,34 @@ class _Search:
 
     def _solved(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """The pose near the goal with a level paddle; None if the search finds none."""
-        for iteration in range(_ITERATIONS):
+
+        def error(angles: np.ndarray, rows: slice) -> np.ndarray:
             paddle, normal = self._forward(angles)
-            # The rotation vector that turns the normal to vertical.
-            tilt = np.array([normal[1], -normal[0]])
-            if normal[2] < 0.0:
-                size = np.linalg.norm(tilt)
-                tilt = tilt / size if size > 1e-6 else np.array([1.0, 0.0])
-            if normal[2] > 0.0 and np.linalg.norm(tilt) < _LEVEL_TOLERANCE and iteration >= 30:
-                break
+            return np.concatenate([paddle - goal, _LENGTH * (normal - _UP)])[rows]
+
+        def derivative(angles: np.ndarray, rows: slice) -> np.ndarray:
+            paddle, normal = self._forward(angles)
             jacobian = self._jacobian(paddle)
-            if iteration < 30:
-                error = np.concatenate([goal - paddle, _LENGTH * tilt])
-            else:
-                # The paddle stays where the joints can hold it level.
-                jacobian, error = jacobian[3:], _LENGTH * tilt
-            damping = _DAMPING if iteration < 30 else 1e-9
-            gram = jacobian @ jacobian.T + damping * np.eye(len(error))
-            step = jacobian.T @ np.linalg.solve(gram, error)
-            largest = np.max(np.abs(step))
-            step *= min(1.0, _MAX_STEP / max(largest, 1e-12))
-            angles = np.clip(angles + step, *self._inside)
-        else:
-            return None
+            return np.vstack([jacobian[:3], np.cross(jacobian[3:].T, normal).T])[rows]
+
+        # Level and at the goal, then level alone: not every arm can be both.
+        for rows in (slice(0, 6), slice(3, 6)):
+            angles = scipy.optimize.least_squares(
+                error,
+                angles,
+                derivative,
+                self._inside,
+                method="dogbox",
+                ftol=None,
+                xtol=None,
+                gtol=1e-13,
+                max_nfev=_EVALUATIONS,
+                args=(rows,),
+            ).x
         wrapped = self._wrapped(angles)
-        paddle, _ = self._forward(wrapped)
+        paddle, normal = self._forward(wrapped)
+        if normal[2] < 0.0 or np.linalg.norm(normal[:2]) > _LEVEL_TOLERANCE:
+            return None
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
         return wrapped if in_front and paddle[2] > 0.03 else None
 
@@ -252,7 +254,8 @@ class _Search:
         paddle, _ = self._forward(angles)
         if not self._is_clear(paddle):
             return None
-        jacobian = self._jacobian(paddle)
+        # A turn about the vertical does not matter.
+        jacobian = self._jacobian(paddle)[:5]
         lifting = jacobian[2:]
         task = jacobian if len(angles) >= 5 else lifting
         smallest = float(np.linalg.svd(task, compute_uv=False)[-1])
