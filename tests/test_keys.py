@@ -25,8 +25,9 @@ from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.training.command import Options
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.job import Options, _Job
+from bounce_mjx.training.job import _Job
 from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
 from bounce_mjx.training.trainer import in_whole_blocks
 from bounce_mjx.world.randomization import Term
@@ -185,7 +186,7 @@ def of_run(config: TrainConfig) -> tuple:
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         config = in_whole_blocks(config)
-        job = _Job(config, Console(quiet=True), PPOTrainer, Options("train"), stack)
+        job = _Job(config, Console(quiet=True), PPOTrainer, Options(), stack)
 
         def run_block() -> None:
             blocks.append(job.steps)

@@ -54,7 +54,7 @@ from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
-from bounce_mjx.training.command import TrainCommand, config_of
+from bounce_mjx.training.command import Options, TrainCommand, config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
@@ -359,7 +359,7 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
         command = train_command.read_command([*flags, "--log-dir", str(tmp_path / name)])
         config, console = config_of(command), Console(file=io.StringIO())
         with contextlib.suppress(training_job.TrainingStopped):
-            options = training_job.Options("train", report=False, **resumed)
+            options = Options(report=False, **resumed)
             training_job.train(config, console, trainer, options)
         return next((tmp_path / name).iterdir())
 

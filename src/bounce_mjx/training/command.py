@@ -22,7 +22,7 @@ from bounce_mjx.runs.config import (
     train_config,
 )
 from bounce_mjx.runs.task import is_same_task
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 from bounce_mjx.world.config import WorldConfig
 
 PROG = "bounce-mjx train"
@@ -176,6 +176,11 @@ def _is_solved(run: Path) -> bool:
 
     results = [load_results(seed) for seed in runs_of_seeds(run)]
     return all(found is not None and found.solved for found in results)
+
+
+def named_task(config: TrainConfig) -> list[str]:
+    """The flag with which a later command has to name a task's file again."""
+    return ["--task", config.task] if is_file(config.task) else []
 
 
 def config_of(command: TrainCommand) -> TrainConfig:

@@ -33,6 +33,7 @@ from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import load_training_state, read_policy, read_record
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import hosts
+from bounce_mjx.training.command import PROG, Options, named_task
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
@@ -79,22 +80,6 @@ class SeedRun:
         return self.final or self.progress.best
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """What a training run does that its config does not say."""
-
-    command: str
-    """The user's command, to which `--resume` may be added."""
-    resume: Path | None = None
-    """The run to continue, in place."""
-    report: bool = True
-    """Whether to import the modules of the report during the compilation."""
-    wandb: str | None = None
-    """Project of Weights & Biases to log to, in addition to TensorBoard."""
-    watcher: Watcher | None = None
-    """Receives the progress of the first seed."""
-
-
 class TrainingStopped(Exception):
     """The user stopped the training; the text says how to continue."""
 
@@ -104,11 +89,15 @@ def train(
     console: Console,
     make_trainer: Callable[[TrainConfig, Env], Trainer],
     options: Options,
+    watcher: Watcher | None = None,
+    prog: str = PROG,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
 
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
+      watcher: receives the progress of the first seed.
+      prog: the user's command, to which `--resume` may be added.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -122,7 +111,7 @@ def train(
     hosts.agree(config, options.resume)
     config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:
-        job = _Job(config, console, make_trainer, options, stack)
+        job = _Job(config, console, make_trainer, options, stack, watcher, prog)
         try:
             job.compile()
             job.train()
@@ -147,8 +136,11 @@ class _Job:
         make_trainer: Callable[[TrainConfig, Env], Trainer],
         options: Options,
         stack: contextlib.ExitStack,
+        watcher: Watcher | None = None,
+        prog: str = PROG,
     ):
         self.config, self.console, self.options, self.stack = config, console, options, stack
+        self.watcher, self.prog = watcher, prog
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.resumed = options.resume is not None
@@ -192,7 +184,8 @@ class _Job:
 
     @property
     def _go_on(self) -> str:
-        return f"continue with: {self.options.command} --resume {shlex.quote(str(self.run))}"
+        flags = [*named_task(self.config), "--resume", str(self.run)]
+        return f"continue with: {self.prog} {shlex.join(flags)}"
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
@@ -300,7 +293,7 @@ class _Job:
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.reporter = self.stack.enter_context(
-            Reporter(opening.result, self.console, self.config, self.steps, self.options.watcher)
+            Reporter(opening.result, self.console, self.config, self.steps, self.watcher)
         )
         self.started = True
         self.clock.lap("compile")
@@ -394,9 +387,9 @@ class _Job:
             return False
         healthy = [member.progress.fault is None for member in self.members]
         self.reporter.evaluation(self.steps, reports, healthy)
-        if self.options.watcher is not None:
+        if self.watcher is not None:
             policy = self._of_seed(snapshot.policy, 0)
-            self.options.watcher.evaluation(self.steps, reports[0], policy)
+            self.watcher.evaluation(self.steps, reports[0], policy)
         best, seconds = [], sum(self.clock.seconds.values())
         for i, member in enumerate(self.members):
             if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):

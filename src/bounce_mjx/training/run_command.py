@@ -15,11 +15,10 @@ from bounce_mjx.interrupt import leave
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig, shown_file
 from bounce_mjx.runs.folders import find_checkpoint
-from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
-from bounce_mjx.training.command import TrainCommand, config_of
+from bounce_mjx.training.command import TrainCommand, config_of, named_task
 from bounce_mjx.training.console import say
-from bounce_mjx.training.job import Options, SeedRun, TrainingStopped, train
+from bounce_mjx.training.job import SeedRun, TrainingStopped, train
 from bounce_mjx.training.log import open_log
 from bounce_mjx.training.trainer import Trainer, Watcher
 
@@ -49,17 +48,14 @@ def run_command(
         say(console, f"config: {' on '.join(map(shown_file, reversed(command.config)))}")
         if command.warm_start is not None:
             say(console, f"warm start: {command.warm_start}")
-    # A later command has to name the task's file again.
-    task = f" --task {shlex.quote(command.task)}" if is_file(command.task) else ""
     try:
-        options = Options(prog + task, command.resume, command.report, command.wandb, watcher)
-        seeds = train(config_of(command), console, make_trainer, options)
+        seeds = train(config_of(command), console, make_trainer, command, watcher, prog)
     except TrainingStopped as stop:
         say(console, str(stop))
         # Does not wait for a compilation or an evaluation in another thread.
         leave(0)
     best = print_results(seeds, console)
-    run = f"{shlex.quote(str(best.run))}{task}"
+    run = shlex.join([str(best.run), *named_task(command)])
     if command.report and hosts.is_leader():
         leave_report(best, console, f"bounce-mjx report {run}")
     say(console, f"measure it: bounce-mjx eval {run}")
