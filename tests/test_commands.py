@@ -397,19 +397,6 @@ def test_whole_process_exits_without_a_traceback_on_a_damaged_checkpoint(run: Pa
     assert re.fullmatch(r"error: .+\n", done.stderr), done.stderr
 
 
-def test_platform_that_jax_does_not_have(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx.eval", "pretrained"],
-        cwd=tmp_path,
-        env=os.environ | {"JAX_PLATFORMS": "nope"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 2
-    sentence = r"error: JAX does not start on JAX_PLATFORMS=nope \(.+\); unset it, or .+\n"
-    assert re.fullmatch(sentence, done.stderr), done.stderr
-
-
 def test_path_that_the_output_cannot_encode() -> None:
     program = (
         "from bounce_mjx.errors import exit_on_user_error\n"

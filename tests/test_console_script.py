@@ -92,7 +92,6 @@ def test_a_missing_opengl_library_ends_only_what_draws(tmp_path: Path) -> None:
     paths = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     code = (
         "from bounce_mjx.commands.main import main; main(['--version'])\n"
-        "import os, mujoco; print(os.environ['MUJOCO_GL'])\n"
         "main(['view', '--video', 'a.mp4'])"
     )
     done = subprocess.run(
@@ -102,7 +101,6 @@ def test_a_missing_opengl_library_ends_only_what_draws(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
     )
-    assert done.stdout.splitlines()[1:] == ["egl"], done.stderr
     assert done.returncode == 2
     assert re.fullmatch(r"error: .+ MUJOCO_GL=egl does not work here; .+\n", done.stderr)
 

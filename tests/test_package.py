@@ -89,20 +89,6 @@ print(*(name for name in ("brax", "mujoco.mjx", "trimesh") if name in sys.module
     assert done.stdout == "\n", done.stdout + done.stderr
 
 
-def test_a_package_in_a_zip_says_that_it_must_be_unpacked(tmp_path: Path) -> None:
-    """MuJoCo reads only files."""
-    path = shutil.make_archive(str(tmp_path / "all"), "zip", CHECKOUT / "src", "bounce_mjx")
-    code = "from bounce_mjx.resources import resource_path; resource_path('pretrained')"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
-    assert f"UserError: bounce_mjx runs from {path}" in done.stderr
-
-
 def test_no_module_redirects_the_output() -> None:
     """`sys.stdout` belongs to all threads: two that redirect it at once may not restore it."""
     found = []

@@ -1,13 +1,11 @@
 """The exception that a user's mistake raises, and how a command reports it."""
 
 import contextlib
-import importlib.metadata
 import io
 import os
 import shlex
 import sys
 from collections.abc import Iterator
-from typing import NoReturn
 
 from bounce_mjx.interrupt import leave
 
@@ -42,25 +40,6 @@ def needed(package: str, install: str) -> Iterator[None]:
         ) from error
 
 
-def check_version(package: str, distribution: str, below: int) -> None:
-    """Refuses a major version of an optional package that is another program; a missing package is
-    left to its import.
-
-    Raises:
-      MissingPackage: the installed version is too new.
-    """
-    try:
-        version = importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return
-    if int(version.partition(".")[0]) >= below:
-        command = install_command(f"{distribution}<{below}")
-        raise MissingPackage(
-            f"{package} {version} is installed, but this adapter needs a version below {below}; "
-            f"install it with: {command}"
-        )
-
-
 def install_command(*words: str) -> str:
     """The command that installs a package where this process runs.
 
@@ -74,9 +53,9 @@ def install_command(*words: str) -> str:
 
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Reports a `UserError`, or a `JAX_PLATFORMS` that JAX refuses, as one sentence on stderr and
-    exits with status 2; Ctrl-C exits with status 130. Neither prints a traceback, and nor does an
-    output that cannot encode a path, or that cannot be written any more: see `_Output`."""
+    """Reports a `UserError` as one sentence on stderr and exits with status 2; Ctrl-C exits with
+    status 130. Neither prints a traceback, and nor does an output that cannot encode a path, or
+    that cannot be written any more: see `_Output`."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         # Not where a test or a notebook has put its own stream.
@@ -85,12 +64,8 @@ def exit_on_user_error() -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        _exit_with(str(error))
-    except (RuntimeError, AssertionError):
-        refusal = _refused_platforms()
-        if refusal is None:
-            raise
-        _exit_with(refusal)
+        print(f"error: {on_one_line(str(error))}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         leave()
 
@@ -120,26 +95,6 @@ def _lasting(stream: io.TextIOWrapper | None) -> io.TextIOWrapper:
         errors="backslashreplace" if stream.errors == "strict" else stream.errors,
         line_buffering=stream.line_buffering or stream.write_through,
     )
-
-
-def _exit_with(sentence: str) -> NoReturn:
-    print(f"error: {on_one_line(sentence)}", file=sys.stderr)
-    sys.exit(2)
-
-
-def _refused_platforms() -> str | None:
-    """Why JAX does not start on the user's `JAX_PLATFORMS`; None if it does."""
-    platforms = os.environ.get("JAX_PLATFORMS")
-    if not platforms or "jax" not in sys.modules:
-        return None
-    try:
-        sys.modules["jax"].devices()
-    except (RuntimeError, AssertionError) as error:
-        return (
-            f"JAX does not start on JAX_PLATFORMS={platforms} ({reason_of(error)}); unset it, or "
-            "name platforms of this machine, such as cpu"
-        )
-    return None
 
 
 def on_one_line(text: str) -> str:

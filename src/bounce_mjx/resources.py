@@ -3,8 +3,6 @@
 import os
 from pathlib import Path
 
-from bounce_mjx.errors import UserError
-
 PRETRAINED = "pretrained"
 TASK_POLICIES = ("balance", "catch", "juggle", "track")
 """Tasks with a policy of their name, in addition to the default task's, `PRETRAINED`."""
@@ -23,15 +21,7 @@ def resource_path(name: str) -> Path:
     """Path of a data file such as "mjcf/bounce_ball.xml".
 
     The folders are inside the package in a wheel, and at the top of a source checkout.
-
-    Raises:
-      UserError: the package is in a zip.
     """
-    if not _PACKAGE.is_dir():
-        raise UserError(
-            f"bounce_mjx runs from {_PACKAGE.parent}, and MuJoCo and JAX read its data only from "
-            "files; unpack or install it"
-        )
     inside = _PACKAGE / name
     # Unlike os.path.exists, Path.exists raises an error for a name that is too long.
     return inside if os.path.exists(inside) else _PACKAGE.parent.parent / name

@@ -6,6 +6,7 @@
 import difflib
 import gc
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from types import ModuleType
@@ -13,7 +14,6 @@ from types import ModuleType
 import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import end_on_ctrl_c
-from bounce_mjx.lazy import spare_opengl
 
 COMMANDS = {
     "train": "train a policy",
@@ -49,7 +49,6 @@ def main(args: Sequence[str] | None = None) -> None:
     # Python looks for garbage after so many new objects. Those of imports and of JAX's programs are
     # hardly ever garbage.
     gc.set_threshold(10_000)
-    spare_opengl()
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
         if name in ("--help", "-h"):
@@ -63,6 +62,12 @@ def main(args: Sequence[str] | None = None) -> None:
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
+        if opengl := os.environ.get("MUJOCO_GL"):
+            # Where this library is missing, MuJoCo's import would fail, also in a command that
+            # draws nothing; one that draws tries the library itself (`viewers.offscreen`).
+            os.environ["MUJOCO_GL"] = "disabled"
+            _import("mujoco")
+            os.environ["MUJOCO_GL"] = opengl
         _import(f"bounce_mjx.commands.{name.replace('-', '_')}").main(rest)
 
 

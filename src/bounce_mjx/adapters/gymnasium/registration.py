@@ -2,7 +2,7 @@
 
 import sys
 
-from bounce_mjx.lazy import around_import
+from bounce_mjx.lazy import wrap_import
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
@@ -24,7 +24,7 @@ def register_when_imported() -> None:
     if "gymnasium" in sys.modules:
         register()
     else:
-        around_import("gymnasium", after=lambda module: register())
+        wrap_import("gymnasium", lambda load, module: (load(module), register()))
 
 
 def register() -> None:

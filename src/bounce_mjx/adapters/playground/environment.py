@@ -14,7 +14,7 @@ from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env import state as core
 from bounce_mjx.env.env import Env, EnvState
-from bounce_mjx.errors import check_version, needed
+from bounce_mjx.errors import needed
 from bounce_mjx.lazy import silence_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
@@ -24,7 +24,6 @@ from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 with needed("MuJoCo Playground", "playground<1"):
-    check_version("MuJoCo Playground", "playground", 1)
     silence_mjx()
     from ml_collections import config_dict
     from mujoco import mjx
