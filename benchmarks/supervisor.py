@@ -51,17 +51,15 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
 
     def row(state: State, action: jax.Array) -> dict[str, jax.Array]:
         now = state.pipeline_state
-        truth, memory = env.kinematics(now), now.memory
+        truth = env.kinematics(now)
         angles, velocities = truth.joint_angles, truth.joint_velocities
         ball, age = truth.ball_position, jnp.zeros(())
-        if memory is not None and memory.sensing is not None:
-            angles, velocities = sensing.measured_joints(now.world, memory.counter, truth)
-            ball, age = memory.sensing.picture.position, memory.sensing.picture.age
-        after = env.begin_step(state, action)[0].pipeline_state
-        if after.setpoint is not None:
-            command = after.setpoint.position
-        elif after.ctrl is not None:
-            command = after.ctrl[: env.action_size]
+        if now.sensing is not None:
+            angles, velocities = sensing.measured_joints(now.world, now.clock.counter, truth)
+            ball, age = now.sensing.picture.position, now.sensing.picture.age
+        _, actuation = env.control(now, action)
+        if actuation.setpoint is not None:
+            command = actuation.setpoint.position
         else:
             command = env.servo_targets(now.physics, action)[: env.action_size]
         return {

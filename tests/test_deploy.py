@@ -220,7 +220,7 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
     checkpoint = find_checkpoint(runs[name])
     config = load_run_config(checkpoint.run)
     policy = reading.read_policy(checkpoint, config)
-    layout, counts = config.env.layout, config.env.observation.seen()
+    layout, counts = config.env.layout, config.env.observation.lengths()
     rng = np.random.default_rng(3)
     # Some observations are beyond the clipping range of the normaliser.
     spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
@@ -239,7 +239,7 @@ def network_of(config: TrainConfig, policy: Policy):
     networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
 
     def network(histories: dict[str, np.ndarray]) -> np.ndarray:
-        parts = [np.asarray(histories[name]) for name in config.env.observation.seen()]
+        parts = [np.asarray(histories[name]) for name in config.env.observation.lengths()]
         flat = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
         return np.asarray(networks.act(policy, flat))
 
@@ -357,7 +357,7 @@ def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> No
     checkpoint, session = find_checkpoint(runs[name]), session_of(runs[name])
     config = load_run_config(checkpoint.run)
     inputs, _ = draw_inputs(name, runs)
-    own, rng = config.env.observation.seen("task"), np.random.default_rng(0)
+    own, rng = config.env.observation.lengths("task"), np.random.default_rng(0)
     given = {input_name(quantity): values for quantity, values in inputs.items()}
     measured, remembered = {}, {}
     for tensor in session.get_inputs():
@@ -418,7 +418,7 @@ def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) ->
     metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
     config = load_run_config(runs["sensors"])
     assert {p.name: p.history for p in metadata.observation} == {
-        input_name(name): count for name, count in config.env.observation.seen().items()
+        input_name(name): count for name, count in config.env.observation.lengths().items()
     }
     assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
     assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7)) and metadata.steps == 64
@@ -473,7 +473,9 @@ def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
         for _ in range(2):
             policy.step(measured_once() | {"joint_angles": angles, "time": 0.01 * step})
         action = rng.uniform(0.0, 1.0, 6)
-        state, control = env.begin_step(state, jnp.asarray(action, jnp.float32))
+        pipeline = state.pipeline_state
+        control, actuation = env.control(pipeline, jnp.asarray(action, jnp.float32))
+        state = state.replace(pipeline_state=pipeline._replace(actuation=actuation))
         targets = policy.servo_targets(action)
         np.testing.assert_allclose(targets, control.ctrl, atol=1e-6)
     assert np.abs(targets - angles).max() > 0.025
@@ -513,7 +515,7 @@ def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
 def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
     """Newest measurements in an environment's sensor memory."""
     names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
-    measured = {name: np.asarray(sensing.seen[name][0]) for name in names}
+    measured = {name: np.asarray(sensing.histories[name][0]) for name in names}
     return (
         measured
         | command
@@ -531,13 +533,13 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     env, policy = Env(load_run_config(runs[name]).env), policies[name]
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
     policy.reset()
-    own = {name: set() for name in env.config.observation.seen("task")}
+    own = {name: set() for name in env.config.observation.lengths("task")}
     commands, reached = set(), set()
     for i in range(300):
         state_now = state.pipeline_state
-        measured = measured_by(state_now.memory.sensing, state_now.command)
+        measured = measured_by(state_now.sensing, state_now.command)
         if name == "sensors":
-            measured["ball_age"] = state_now.memory.sensing.picture.age
+            measured["ball_age"] = state_now.sensing.picture.age
         action = policy.step(measured | {"time": 7.0 + i * env.dt})
         # The environment's targets add up in single precision.
         tolerance = 1e-5 + (1e-7 * i if name == "leading targets" else 0.0)
@@ -571,11 +573,11 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
     nexts = set()
     for i in range(40):
         now = state.pipeline_state
-        sensing = now.memory.sensing
+        sensing = now.sensing
         balls = np.asarray(sensing.picture.position)
         measured = {
-            "joint_angles": sensing.seen["joint_angles"][0],
-            "joint_velocities": sensing.seen["joint_velocities"][0],
+            "joint_angles": sensing.histories["joint_angles"][0],
+            "joint_velocities": sensing.histories["joint_velocities"][0],
             "ball_position": balls if i % 2 else balls.ravel(),
         }
         action = policy.step(measured | now.command)
@@ -615,7 +617,12 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
     )
     targets, ages = rng.uniform(0.4, 0.6, (200, 1)), 0.03 - 0.0001 * np.arange(200)[:, None]
     measured = truth._asdict() | {"target_height": targets, "ball_age": ages, "ball_picture": ball}
-    task, own, action, intervals = env.task(env), env.observation.seen("task"), np.zeros(6), set()
+    task, own, action, intervals = (
+        env.task(env),
+        env.observation.lengths("task"),
+        np.zeros(6),
+        set(),
+    )
     memory = seen = None
 
     def first(measured: dict) -> tuple:
@@ -623,7 +630,7 @@ def test_histories_of_any_observation_are_those_of_the_simulated_sensors(
         seen = measured | values
         return memory, {
             name: jnp.broadcast_to(seen[name], (count, *seen[name].shape))
-            for name, count in env.observation.seen().items()
+            for name, count in env.observation.lengths().items()
         }
 
     @jax.jit

@@ -44,13 +44,18 @@ def step(env):
 
 @pytest.fixture(scope="module")
 def finish(env):
-    return jax.jit(env.finish_step)
+    return jax.jit(lambda *args: finished(env, *args))
 
 
 @pytest.fixture(scope="module")
 def model():
     """The MJCF as MuJoCo reads it, without the package in between."""
     return mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+
+
+def finished(env, state, action, physics):
+    """The second half of a step, for another state of the physics."""
+    return env.finish_step(state, action, state.pipeline_state.actuation, physics)
 
 
 def mj_data(model, physics) -> mujoco.MjData:
@@ -318,12 +323,13 @@ def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
 def test_action_adds_to_the_last_target_within_its_lead():
     """The arm does not move meanwhile; the targets lead it by at most max_lead and one action."""
     env = BounceBall(EnvConfig(action={"base": "target", "max_lead": 0.05}))
-    state = env.reset(jax.random.key(0))
-    angles = state.pipeline_state.physics.qpos[:6]
+    state = env.reset(jax.random.key(0)).pipeline_state
+    angles = state.physics.qpos[:6]
     for lead in (0.02, 0.04, 0.06, 0.07, 0.07):
-        state, control = env.begin_step(state, jnp.ones(6))
+        control, actuation = env.control(state, jnp.ones(6))
+        state = state._replace(actuation=actuation)
         np.testing.assert_allclose(control.ctrl - angles, lead, atol=1e-6)
-    _, control = env.begin_step(state, -jnp.ones(6))
+    control, _ = env.control(state, -jnp.ones(6))
     np.testing.assert_allclose(control.ctrl - angles, 0.03, atol=1e-6)
 
 
@@ -626,7 +632,7 @@ def test_a_fast_or_spinning_ball_does_not_end_the_episode(reset, finish):
 @pytest.fixture(scope="module")
 def finish_each(env):
     """`finish_step` of one state for a batch of physics states."""
-    return jax.jit(jax.vmap(env.finish_step, in_axes=(None, None, 0)))
+    return jax.jit(jax.vmap(functools.partial(finished, env), in_axes=(None, None, 0)))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -686,7 +692,7 @@ def test_nan_action_ends_the_episode_and_acts_as_zero(broken, walked, step, late
 def test_fault_leaves_the_rest_of_the_batch_alone(env):
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(4), 5))
     actions = jax.random.uniform(jax.random.key(5), (5, 6))
-    finish_many = jax.jit(jax.vmap(env.finish_step))
+    finish_many = jax.jit(jax.vmap(functools.partial(finished, env)))
     healthy = states.pipeline_state.physics
     broken = healthy._replace(qpos=healthy.qpos.at[2, 8].set(jnp.nan))
     expected, actual = (finish_many(states, actions, p) for p in (healthy, broken))

@@ -17,7 +17,7 @@ from rich.console import Console
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.config import command_line
-from bounce_mjx.env.env import Env, Memory
+from bounce_mjx.env.env import Env, Redraw
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
@@ -158,18 +158,11 @@ def test_bounces_settle_again_after_a_change_of_the_target(env):
     never does."""
     row = {"bounced": 1.0, "apex_error": 0.05}
     batch = states([row] * 4)
-    memory = Memory(
-        counter=jnp.zeros(4, jnp.int32),
-        step=jnp.full(4, 901),
-        phases=jnp.zeros((3, 4)),
-        command_age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
-        command_ranges={"target_height": (jnp.full(4, 0.3), jnp.full(4, 0.8))},
-        actuation=None,
-        sensing=None,
+    redraw = Redraw(
+        age=jnp.array([0.01, 2.0, 2.01, 7.0], jnp.float32),
+        ranges={"target_height": (jnp.full(4, 0.3), jnp.full(4, 0.8))},
     )
-    changing = batch.pipeline_state._replace(
-        world={"command_interval": jnp.full(4, 4.0)}, memory=memory
-    )
+    changing = batch.pipeline_state._replace(redraw=redraw)
     batch = batch.replace(pipeline_state=changing)
     s = flat(accumulate(env, empty_statistics(env, batch), batch, jnp.int32(900)))
     np.testing.assert_array_equal(s.settled_bounces, [0, 0, 1, 1])

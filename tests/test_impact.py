@@ -109,7 +109,7 @@ def test_worlds_with_a_sloped_restitution_are_mujocos(record_property):
         world = {name: float(value[w]) for name, value in pipeline.world.items()}
         paddle = find_addresses(model).paddle_geom
         reach = model.geom_size[paddle].min() + model.geom_size[find_addresses(model).ball_geom, 0]
-        dampings = np.asarray(pipeline.memory.impact.damping)[w]
+        dampings = np.asarray(pipeline.impact.damping)[w]
         data, jacobian, speed = mujoco.MjData(model), np.zeros((3, model.nv)), 0.0
         data.qpos[:], data.qvel[:] = (np.asarray(x)[w] for x in pipeline.physics[:2])
         for t in range(STEPS):
@@ -139,16 +139,14 @@ def test_a_changed_world_keeps_the_slope():
     """As the sliders of a viewer change it."""
     env = BounceBall(EnvConfig(randomization=SLOPED))
     state = env.reset(jax.random.PRNGKey(0))
-    before, memory = state.pipeline_state, state.pipeline_state.memory
-    fast = before._replace(memory=memory._replace(impact=memory.impact._replace(speed=4.0)))
+    before = state.pipeline_state
+    fast = before._replace(impact=before.impact._replace(speed=4.0))
 
     def damped(world: dict) -> float:
-        changed = state.replace(pipeline_state=env.in_world(fast, world))
-        begun, _ = env.begin_step(changed, jnp.zeros(6))
-        return float(begun.pipeline_state.parameters.contact_damping)
+        return float(env.with_world(fast, world).parameters.contact_damping)
 
     own = damped(before.world)
-    assert own == pytest.approx(float(damping(fast.memory.impact)), rel=1e-6)
+    assert own == pytest.approx(float(damping(fast.impact)), rel=1e-6)
     flat = before.world | {"restitution_slope": jnp.float32(0.0)}
     level = physics_parameters(flat, env.mj_model).contact_damping
     assert damped(flat) == pytest.approx(float(level), rel=1e-5)
@@ -163,10 +161,7 @@ def test_a_changed_world_keeps_the_parameters_of_randomize():
     state = env.reset(jax.random.PRNGKey(0))
     before = state.pipeline_state
     world = before.world | {"ball_mass": jnp.float32(2.0), "restitution": jnp.float32(0.8)}
-    begun, _ = env.begin_step(
-        state.replace(pipeline_state=env.in_world(before, world)), jnp.zeros(6)
-    )
-    after = begun.pipeline_state.parameters
+    after = env.with_world(before, world).parameters
     assert (after.ball_radius, after.contact_damping) == (own.ball_radius, own.contact_damping)
     assert float(after.ball_mass) == pytest.approx(0.0054)
 
@@ -176,7 +171,7 @@ def test_a_changed_world_keeps_the_parameters_of_randomize():
 def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed, restitution, slope):
     """On C, in the mean over the phases of the first contact's physics step."""
     world = {"restitution": jnp.float32(restitution), "restitution_slope": jnp.float32(slope)}
-    impact: Impact = first_impact(world, 98696.0)
+    impact: Impact = first_impact(world, mj_model)
     given = PhysicsParameters(contact_damping=damping(impact._replace(speed=jnp.float32(speed))))
     model = edited_model(mj_model, given)
     rebounds = []

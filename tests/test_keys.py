@@ -162,8 +162,8 @@ def _reset(env: Env) -> jax.stages.Traced:
 
 def _step(env: Env, state: State) -> tuple:
     def step(state: State, action: jax.Array) -> tuple[Control, State]:
-        after, control = env.begin_step(state, action)
-        return control, env.finish_step(after, action, after.pipeline_state.physics)
+        control, actuation = env.control(state.pipeline_state, action)
+        return control, env.finish_step(state, action, actuation, state.pipeline_state.physics)
 
     action = jax.ShapeDtypeStruct((env.action_size,), "float32")
     return text(jax.jit(step).trace(state, action))

@@ -57,14 +57,10 @@ def rolled_out(smooth: bool, world: dict) -> Rollout:
         state = env.reset(jax.random.PRNGKey(0))
 
         def step(state, action):
-            before, control = env.begin_step(state, action)
-            after = env.finish_step(
-                before,
-                action,
-                env.engine.step(
-                    state.pipeline_state.parameters, state.pipeline_state.physics, control, SUBSTEPS
-                ),
-            )
+            now = state.pipeline_state
+            control, actuation = env.control(now, action)
+            physics = env.engine.step(now.parameters, now.physics, control, SUBSTEPS)
+            after = env.finish_step(state, action, actuation, physics)
             physics = after.pipeline_state.physics
             return after, (servo_targets(control, SUBSTEPS), physics.qpos, physics.qvel)
 
@@ -165,13 +161,11 @@ def test_the_engines_follow_the_commands_like_c(world: tuple) -> None:
 def test_without_limits_a_target_is_the_actions() -> None:
     """And limits of the torque alone do not move it."""
     env = BounceBall(EnvConfig(robot={"limits": {"torque": (90.0,) * 6}}))
-    state = env.reset(jax.random.PRNGKey(0))
-    assert state.pipeline_state.setpoint is None
-    _, control = env.begin_step(state, jnp.ones(6))
+    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    assert state.actuation.setpoint is None
+    control, _ = env.control(state, jnp.ones(6))
     assert control.moving is None
-    np.testing.assert_array_equal(
-        control.ctrl, env.servo_targets(state.pipeline_state.physics, jnp.ones(6))
-    )
+    np.testing.assert_array_equal(control.ctrl, env.servo_targets(state.physics, jnp.ones(6)))
 
 
 def test_an_action_adds_to_a_moving_command() -> None:

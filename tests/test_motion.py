@@ -55,18 +55,19 @@ def test_commands_are_those_of_the_environment(smooth: bool) -> None:
     policy, rng = limited(limits), np.random.default_rng(0)
     with jax.enable_x64(True):
         env = BounceBall(config)
-        state = env.reset(jax.random.PRNGKey(0))
-        begin = jax.jit(env.begin_step)
+        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        begin = jax.jit(env.control)
         for i in range(60):
-            physics = state.pipeline_state.physics
+            physics = state.physics
             # The arm follows its command, more or less.
-            start = state.pipeline_state.setpoint.position + rng.normal(0.0, 0.05 * (i > 0), 6)
+            start = state.actuation.setpoint.position + rng.normal(0.0, 0.05 * (i > 0), 6)
             physics = physics._replace(qpos=physics.qpos.at[:6].set(start))
-            state = state.replace(pipeline_state=state.pipeline_state._replace(physics=physics))
+            state = state._replace(physics=physics)
             action = np.clip(rng.normal(0.0, 1.0, 6), -1.0, 1.0)
             policy.step(measured(np.asarray(start)))
             targets = policy.servo_targets(action)
-            state, control = begin(state, jnp.asarray(action))
+            control, actuation = begin(state, jnp.asarray(action))
+            state = state._replace(actuation=actuation)
             expected = np.asarray(servo_targets(control, 10))
             np.testing.assert_allclose(policy.commands(1000), expected, rtol=0.0, atol=1e-12)
             np.testing.assert_allclose(policy.commands(500), expected[1::2], rtol=0.0, atol=1e-12)

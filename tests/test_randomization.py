@@ -31,7 +31,7 @@ from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_target
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_config
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import delayed, start_actuation
+from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import (
     TERMS,
     RandomizationConfig,
@@ -232,7 +232,7 @@ def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> 
     seen = {part.name for part in config.layout.parts}
     measured = {"joint_angles", "joint_velocities", "ball_position", "ball_age", "target_height"}
     # Those of the task come from the measurements, too.
-    computed = {"paddle_position", "action", "servo_lead", *config.observation.seen("task")}
+    computed = {"paddle_position", "action", "servo_lead", *config.observation.lengths("task")}
     if config.observation.velocity != "measured":
         computed.add("ball_velocity")
     assert seen <= measured | computed
@@ -398,7 +398,7 @@ def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float) -> None:
         world = {"action_latency": latency, "servo_lag": jnp.asarray(lag * dt / n)}
 
         def step(memory, target):
-            control, memory = delayed(world, memory, Control(target[None]), dt, n)
+            control, memory = add_delay(world, memory, Control(target[None]), dt, n)
             return memory, servo_targets(control, n)[:, 0]
 
         memory = start_actuation(config, dt, jnp.asarray(asked[:1]))
@@ -413,7 +413,7 @@ def test_a_latency_is_rounded_to_a_physics_step() -> None:
     config = RandomizationConfig(action_latency=(0.0, 0.03))
     memory = start_actuation(config, 0.01, jnp.zeros(1))
     for latency, switch in ((0.0124, 2.0), (0.0126, 3.0), (0.0199, 10.0), (0.02, 0.0)):
-        control, _ = delayed(
+        control, _ = add_delay(
             {"action_latency": jnp.asarray(latency)}, memory, Control(jnp.ones(1)), 0.01, 10
         )
         assert control.switch == switch
@@ -464,13 +464,13 @@ def free_run() -> Run:
             starts = jax.vmap(env.reset, out_axes=-1)(keys)
 
             def step(state, action):
-                before, control = env.begin_step(state, action)
-                pipeline = before.pipeline_state
+                pipeline = state.pipeline_state
+                control, actuation = env.control(pipeline, action)
                 physics = env.engine.step(pipeline.parameters, pipeline.physics, control, 10)
-                after = env.finish_step(before, action, physics)
+                after = env.finish_step(state, action, actuation, physics)
                 pipeline = after.pipeline_state
                 target = pipeline.command["target_height"]
-                seen = (physics, control, target, pipeline.memory.command_age)
+                seen = (physics, control, target, pipeline.redraw.age)
                 return after, seen
 
             def steps(state, action):
@@ -657,20 +657,20 @@ def watching(camera: bool, velocity: str):
             physics = PhysicsState(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
             pipeline = start.pipeline_state._replace(physics=physics)
             # The first memory must also have the ball of the trajectory.
-            memory = env._first_memory(pipeline, env.kinematics(pipeline), key)
-            pipeline = pipeline._replace(memory=memory)
+            memory = env._sensors.first(env.kinematics(pipeline), *env._of_sensors(pipeline))
+            pipeline = pipeline._replace(sensing=memory)
             start = start.replace(pipeline_state=pipeline, obs=env.observe(pipeline))
 
             def step(state, inputs):
                 action, physics = inputs
-                state, control = env.begin_step(state, action)
-                state = env.finish_step(state, action, physics)
+                control, actuation = env.control(state.pipeline_state, action)
+                state = env.finish_step(state, action, actuation, physics)
                 metrics = {n: x for n, x in state.metrics.items() if n.startswith(PRIVILEGED)}
                 return state, (state.obs, control.ctrl, metrics)
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
             _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
-            return start.pipeline_state.world, memory.phases[0], start.obs, *seen
+            return start.pipeline_state.world, pipeline.clock.phases[0], start.obs, *seen
 
         return jax.vmap(of_one)(keys, ranges)
 

@@ -60,7 +60,7 @@ class MirrorLaw:
             the law needs.
         """
         config, model = env.config, env.mj_model
-        missing = [name for name in _needs(config) if name not in config.observation.seen()]
+        missing = [name for name in _needs(config) if name not in config.observation.lengths()]
         if "target_height" in missing or config.num_balls > 1:
             raise UserError(
                 f"the mirror law bounces one ball at a target_height, and the task "

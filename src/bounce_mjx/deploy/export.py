@@ -162,7 +162,7 @@ def _limits(env: WorldConfig) -> CommandLimits | None:
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
-    histories = env.observation.seen()
+    histories = env.observation.lengths()
     return tuple(
         Input(_INPUT_NAMES.get(part.name, part.name), histories[part.name], part.size, part.unit)
         for part in env.observation.parts(env.num_joints, env.num_balls)
@@ -230,7 +230,7 @@ def _control_step(
 ) -> tuple[Callable[[dict], dict], dict[str, jax.ShapeDtypeStruct]]:
     """A control step as a function of named arrays, and their shapes: the action, and what the task
     remembers of the measurements, as the environment computes it."""
-    task, own = env.task(env), env.observation.seen("task")
+    task, own = env.task(env), env.observation.lengths("task")
     if not own:
         return lambda given: {"action": network(given)}, _histories(env)
     rows = (env.num_balls,) if env.num_balls > 1 else ()

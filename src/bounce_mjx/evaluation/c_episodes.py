@@ -65,24 +65,17 @@ def make_recording_mujoco_evaluator(
 
     @jax.jit
     def decide(policy, states):
-        actions = actor.act(policy, states.obs.T).T
-        states, control = jax.vmap(env.begin_step, in_axes=-1, out_axes=-1)(states, actions)
+        now, actions = states.pipeline_state, actor.act(policy, states.obs.T).T
+        control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
         targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-        memory = states.pipeline_state.memory
-        varies = memory is not None and memory.impact is not None
-        damping = states.pipeline_state.parameters.contact_damping if varies else None
-        return (
-            actions,
-            states,
-            targets,
-            control.ball_push,
-            damping,
-            (control.air_drag, control.air_lift),
-        )
+        damping = None if now.impact is None else now.parameters.contact_damping
+        air = control.air_drag, control.air_lift
+        return actions, actuation, targets, control.ball_push, damping, air
 
     @functools.partial(jax.jit, donate_argnames="recording")
-    def finish(states, actions, physics, statistics, step, recording):
-        states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(states, actions, physics)
+    def finish(states, actions, actuation, physics, statistics, step, recording):
+        halves = states, actions, actuation, physics
+        states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves)
         recording = record(env, recording, states, statistics.running, step)
         return states, accumulate(env, statistics, states, step), recording
 
@@ -98,7 +91,7 @@ def make_recording_mujoco_evaluator(
         recording = empty_recording(env, states, min(recorded, episodes))
         with rollout.Rollout(nthread=num_threads) as pool:
             for step in range(env.config.episode_steps):
-                actions, states, *inputs = decide(policy, states)
+                actions, actuation, *inputs = decide(policy, states)
                 targets, push, damping, air = jax.tree.map(
                     lambda x: np.asarray(x, np.float64), inputs
                 )
@@ -109,7 +102,7 @@ def make_recording_mujoco_evaluator(
                 simulated = _next_states(pool, models, data, simulated, targets, *air)
                 physics = physics_states(env.mj_model, simulated)
                 states, statistics, recording = finish(
-                    states, actions, physics, statistics, step, recording
+                    states, actions, actuation, physics, statistics, step, recording
                 )
                 if step % 100 < 99:
                     continue

@@ -51,7 +51,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
 
     def one(state: State, running: jax.Array) -> Recording:
         now = moment(env, state, step)
-        setpoint = state.pipeline_state.setpoint
+        setpoint = state.pipeline_state.actuation.setpoint
         return Recording(
             joint_angles=now.truth.joint_angles,
             ball=now.truth.ball_position,

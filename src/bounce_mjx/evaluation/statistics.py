@@ -27,14 +27,13 @@ def moment(env: Env, state: State, step: jax.Array) -> Moment:
     """One environment after the control step with this index [], from 0."""
     now = state.pipeline_state
     seconds = (step + 1) * env.dt
-    changes = "command_interval" in now.world
     return Moment(
         truth=env.kinematics(now),
         command=now.command,
         state=now.task,
         metrics=state.metrics,
         seconds=seconds,
-        command_seconds=now.memory.command_age if changes else seconds,
+        command_seconds=seconds if now.redraw is None else now.redraw.age,
     )
 
 

@@ -277,11 +277,11 @@ def _changed(env: Env, states: State, changes: _Changes) -> State:
         command=_given_or_drawn(changes.command, before.command),
     )
 
-    def in_world(state: EnvState) -> EnvState:
-        return env.in_world(state, _given_or_drawn(changes.world, state.world))
+    def with_world(state: EnvState) -> EnvState:
+        return env.with_world(state, _given_or_drawn(changes.world, state.world))
 
     if changes.world:
-        changed = jax.vmap(in_world, in_axes=-1, out_axes=-1)(changed)
+        changed = jax.vmap(with_world, in_axes=-1, out_axes=-1)(changed)
     observation = jax.vmap(env.observe, in_axes=-1, out_axes=-1)(changed)
     return states.replace(pipeline_state=changed, obs=observation)
 

@@ -1,15 +1,22 @@
-"""Inputs of the physics from the policy's action: servo targets with latency and lag; pushes."""
+"""From the policy's action to the inputs of the physics: servo targets with limits, latency and
+lag, pushes, and the air."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 from bounce_mjx.physics import Control
 from bounce_mjx.physics.control import Moving, servo_target
-from bounce_mjx.robot.setpoints import Setpoint
+from bounce_mjx.robot.model import command_limits, find_addresses
+from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
 from bounce_mjx.world import noise
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.randomization import RandomizationConfig, World
 
 # Time between pushes if only their speed is given, s.
@@ -17,24 +24,168 @@ DEFAULT_PUSH_INTERVAL = 2.0
 
 
 class Actuation(NamedTuple):
-    """Memory of the actuation; a field is None if no term needs it."""
+    """Memory of the actuation; a field is None if no setting needs it."""
 
-    targets: jax.Array | Setpoint | None
+    setpoint: Setpoint | None = None
+    """The joints' commands at the end of the last step, each entry [n], to which an action adds;
+    the position alone if the commands jump."""
+    queue: jax.Array | Setpoint | None = None
     """Servo targets of the last control steps [K, nu], the newest first; of targets that move,
     position and velocity at the start of each step and the acceleration in it."""
-    filtered: jax.Array | None
+    filtered: jax.Array | None = None
     """Outputs of the servos' lags [nu]."""
+
+
+class Actuators:
+    """The actuators of a world."""
+
+    def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel):
+        self._config, self._model = config, mj_model
+        self._addresses = find_addresses(mj_model)
+        self._motion = command_limits(config.robot.limits, mj_model, self._addresses)
+        self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0].tolist()
+
+    def first(self, qpos: jax.Array) -> Actuation:
+        """Memory at a reset, with the servos at rest at qpos [nq]."""
+        config = self._config
+        joints = self._joint_targets(qpos, jnp.zeros(config.num_joints, qpos.dtype))
+        moving, position = self._motion is not None, jnp.stack(joints)
+        memory = start_actuation(
+            config.randomization, config.control_dt, self._ctrl(joints), moving
+        )
+        if config.action.base == "measured":
+            return memory
+        still = jnp.zeros_like(position) if moving else None
+        return memory._replace(setpoint=Setpoint(position, still, still))
+
+    def next(
+        self,
+        before: Actuation,
+        qpos: jax.Array,
+        action: jax.Array,
+        world: World,
+        clock: Clock | None,
+    ) -> tuple[Control, Actuation]:
+        """The inputs of the physics over a control step, and the memory after it.
+
+        Args:
+          qpos: true positions before the step [nq].
+          action: clipped [n].
+          clock: before the step; None for a world that is not randomised.
+        """
+        config, error = self._config, None
+        if "joint_angle_noise" in world:
+            # The same noise as in the observation from which the policy chose the action.
+            numbers, _ = noise.joints(clock.counter, config.num_joints, action.dtype)
+            error = world["joint_angle_noise"] * numbers
+        wanted = self._joint_targets(qpos, action, error, before.setpoint)
+        control, setpoint = self._command(wanted, before.setpoint)
+        control, memory = add_delay(world, before, control, config.control_dt, config.num_substeps)
+        control = control._replace(air_drag=world.get("air_drag"), air_lift=world.get("air_lift"))
+        if "push_speed" in world:
+            control = control._replace(ball_push=self._push(world, clock))
+        return control, memory._replace(setpoint=setpoint)
+
+    def servo_targets(
+        self, qpos: jax.Array, action: jax.Array, last: Setpoint | None = None
+    ) -> jax.Array:
+        """`Env.servo_targets`, at the joint angles in qpos [nq]."""
+        return self._ctrl(self._joint_targets(qpos, action, None, last))
+
+    def _joint_targets(
+        self,
+        qpos: jax.Array,
+        action: jax.Array,
+        error: jax.Array | None = None,
+        last: Setpoint | None = None,
+    ) -> list[jax.Array]:
+        """The target [] of each joint, rad: one scalar per joint, which XLA fuses with the physics;
+        it would not fuse an indexed update.
+
+        Args:
+          error: error of the measured angles [n], rad, without the offset of the encoders' zeros,
+            which the servo shares.
+          last: the last commands, to which the action adds, within `max_lead` of the measured
+            angles; None if it adds to these.
+        """
+        config, targets = self._config, []
+        for i, joint in enumerate(self._addresses.arm_joints):
+            angle = qpos[self._addresses.arm_qpos[i]]
+            if error is not None:
+                angle = angle + error[i]
+            if last is not None:
+                lead = config.action.max_lead
+                angle = jnp.clip(last.position[i], angle - lead, angle + lead)
+            target = angle + config.action_scale * action[i]
+            low, high = (float(limit) for limit in self._model.jnt_range[joint])
+            targets.append(jnp.clip(target, low, high) if low < high else target)
+        return targets
+
+    def _command(
+        self, wanted: list[jax.Array], last: Setpoint | None
+    ) -> tuple[Control, Setpoint | None]:
+        """The control that takes each joint to a target [], as far as its limits allow, and the
+        command at the end of the step."""
+        if self._motion is None:
+            after = None if last is None else Setpoint(jnp.stack(wanted), None, None)
+            return Control(self._ctrl(wanted)), after
+        dt, substep = self._config.control_dt, self._config.physics_dt
+        starts = [Setpoint(*(x[i] for x in last)) for i in range(len(wanted))]
+        ends = [
+            next_setpoint(limits, start, target, dt, jnp)
+            for limits, start, target in zip(self._motion, starts, wanted, strict=True)
+        ]
+        moving = Moving(
+            velocity=self._ctrl([start.velocity * substep for start in starts]),
+            acceleration=self._ctrl([end.acceleration * substep**2 for end in ends]),
+            before=self._ctrl([start.acceleration * substep**2 for start in starts]),
+            smoothing=self._smoothing(wanted[0].dtype),
+        )
+        control = Control(self._ctrl([start.position for start in starts]), moving)
+        return control, Setpoint(*map(jnp.stack, zip(*ends, strict=True)))
+
+    def _smoothing(self, dtype: jnp.dtype) -> jax.Array | None:
+        """Physics steps [nu] of the mean that limits the jerk of each servo target."""
+        if self._motion[0].smoothing is None:
+            return None
+        # An actuator of no joint has a target of zero, whatever the time.
+        times = np.ones(self._model.nu)
+        for actuator, limits in zip(self._addresses.actuators, self._motion, strict=True):
+            times[actuator] = limits.smoothing / self._config.physics_dt
+        return jnp.asarray(times, dtype)
+
+    def _ctrl(self, values: Sequence[jax.Array]) -> jax.Array:
+        """Inputs of the actuators [nu] from a value [] of each joint's angle."""
+        ctrl = [jnp.zeros_like(values[0])] * self._model.nu
+        for actuator, gear, value in zip(
+            self._addresses.actuators, self._gears, values, strict=True
+        ):
+            ctrl[actuator] = value if gear == 1.0 else gear * value
+        return jnp.stack(ctrl)
+
+    def _push(self, world: World, clock: Clock) -> jax.Array:
+        """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most
+        steps. Several balls are pushed at one time, each in its direction [B, 3]."""
+        config, phase = self._config, clock.phases[1]
+        interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
+        now = passes(interval, phase, clock.step, config.control_dt)
+        each = () if config.num_balls == 1 else (config.num_balls,)
+        counter = noise.next_counter(clock.counter)
+        angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, each, phase.dtype)
+        speed = jnp.where(now, world["push_speed"], 0.0)
+        x, y = speed * jnp.cos(angle), speed * jnp.sin(angle)
+        return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
 def start_actuation(
     config: RandomizationConfig, control_dt: float, targets: jax.Array, moving: bool = False
-) -> Actuation | None:
-    """Memory at a reset, with the servos at rest at the targets [nu].
+) -> Actuation:
+    """Memory of latency and lag at a reset, with the servos at rest at the targets [nu].
 
     Args:
       moving: whether the targets move within an arm's limits.
     """
-    queue = filtered = None
+    queue = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
         queue = jnp.broadcast_to(targets, (length, *targets.shape))
@@ -42,30 +193,22 @@ def start_actuation(
             # Smoothing needs the acceleration one step further back.
             still = jnp.zeros((length + 1, *targets.shape), targets.dtype)
             queue = Setpoint(queue, still[1:], still)
-    if config.servo_lag is not None:
-        filtered = targets
-    return None if queue is None and filtered is None else Actuation(queue, filtered)
+    return Actuation(queue=queue, filtered=None if config.servo_lag is None else targets)
 
 
-def delayed(
-    world: World,
-    actuation: Actuation | None,
-    control: Control,
-    control_dt: float,
-    num_substeps: int,
-) -> tuple[Control, Actuation | None]:
+def add_delay(
+    world: World, memory: Actuation, control: Control, control_dt: float, num_substeps: int
+) -> tuple[Control, Actuation]:
     """Control of a control step from that of its action, which has targets alone.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
     them.
     """
-    if actuation is None:
-        return control, None
-    queue, targets, moving = actuation.targets, control.ctrl, control.moving
+    queue, filtered, moving = memory.queue, memory.filtered, control.moving
     if queue is not None:
-        newest = targets
+        newest = control.ctrl
         if moving is not None:
-            newest = Setpoint(targets, moving.velocity, moving.acceleration)
+            newest = Setpoint(newest, moving.velocity, moving.acceleration)
         queue = jax.tree.map(lambda new, q: jnp.concatenate([new[None], q[:-1]]), newest, queue)
         latency = world["action_latency"] / control_dt
         # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
@@ -76,12 +219,11 @@ def delayed(
         else:
             control = _late(queue, whole, moving, num_substeps)
         control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
-    filtered = actuation.filtered
     if filtered is not None:
         steps = world["servo_lag"] / (control_dt / num_substeps)
         control = control._replace(filtered=filtered, lag=steps)
-        filtered = servo_target(control, jnp.asarray(num_substeps - 1, targets.dtype))
-    return control, Actuation(queue, filtered)
+        filtered = servo_target(control, jnp.asarray(num_substeps - 1, filtered.dtype))
+    return control, memory._replace(queue=queue, filtered=filtered)
 
 
 def _late(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) -> Control:
@@ -100,39 +242,12 @@ def _late(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) 
 
 
 def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
-    """Entry of a queue [K, ...] at a whole-number index []; beyond the end, the last entry.
-
-    The chain of selections replaces indexing, which the GPU kernel lacks.
-    """
+    """Entry of a queue [K, ...] at a whole-number index []; beyond the end, the last entry."""
+    # XLA fuses a chain of selections with what follows; it does not fuse indexing.
     entry = queue[0]
     for i in range(1, len(queue)):
         entry = jnp.where(index >= i, queue[i], entry)
     return entry
-
-
-def push(
-    world: World,
-    counter: jax.Array,
-    phase: jax.Array,
-    step: jax.Array,
-    control_dt: float,
-    num_balls: int = 1,
-) -> jax.Array:
-    """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most
-    steps. Several balls are pushed at one time, each in its direction [B, 3].
-
-    Args:
-      counter: counter of the random numbers.
-      phase: share of an interval that had passed at the reset [].
-      step: control steps since the reset [].
-    """
-    interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
-    now = passes(interval, phase, step, control_dt)
-    each = () if num_balls == 1 else (num_balls,)
-    angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, each, phase.dtype)
-    speed = jnp.where(now, world["push_speed"], 0.0)
-    x, y = speed * jnp.cos(angle), speed * jnp.sin(angle)
-    return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
 def passes(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:

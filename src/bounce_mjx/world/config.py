@@ -284,7 +284,7 @@ class WorldConfig(StrictModel):
     def unseen_noise(self) -> tuple[str, ...]:
         """Terms of the randomisation that change measurements which the policy does not see."""
         seen, terms = self.observation, self.randomization.terms
-        if seen.seen("task"):
+        if seen.lengths("task"):
             return ()
         velocity = seen.ball_velocity and seen.velocity == "measured"
         unseen = {

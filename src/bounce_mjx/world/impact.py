@@ -8,7 +8,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
+from bounce_mjx.physics import Engine, PhysicsParameters
+from bounce_mjx.physics.parameters import direct_solref
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import IMPACT_SPEED, World, contact_damping
 
 # Impact speeds between which the damping is linear, m/s.
@@ -26,26 +32,40 @@ class Impact(NamedTuple):
     """Damping [3] of the contact in a slow, a medium and a fast impact, 1/s."""
 
 
-def first_impact(world: World, stiffness: float) -> Impact:
-    """The impact of a reset, with a drawn restitution and its slope.
-
-    Args:
-      stiffness: of the contact, 1/s^2.
-    """
+def first_impact(world: World, mj_model: mujoco.MjModel) -> Impact | None:
+    """The impact of a reset; None if the drawn restitution does not depend on the speed."""
+    if "restitution_slope" not in world:
+        return None
+    stiffness, _ = direct_solref(mj_model)
     speeds = jnp.array([_SLOW, _MIDDLE, _FAST], world["restitution"].dtype)
     restitution = world["restitution"] - world["restitution_slope"] * (speeds - IMPACT_SPEED)
     return Impact(jnp.zeros_like(restitution[0]), contact_damping(restitution, stiffness))
 
 
-def next_impact(impact: Impact, gap: jax.Array, speed: jax.Array) -> Impact:
-    """The impact after a control step.
-
-    Args:
-      gap: height of each ball's lowest point over the paddle, m [] or [B]; the lowest ball counts.
-      speed: speed with which each approaches the paddle, m/s.
-    """
+def next_impact(
+    impact: Impact,
+    mj_model: mujoco.MjModel,
+    engine: Engine,
+    parameters: PhysicsParameters,
+    qpos: jax.Array,
+    truth: Kinematics,
+) -> Impact:
+    """The impact after a control step, or after a reset, which ended at qpos [nq]."""
+    addresses = find_addresses(mj_model)
+    moving = [jnp.zeros_like(qpos[0])] * mj_model.nq
+    for i, address in enumerate(addresses.arm_qpos):
+        moving[address] = truth.joint_velocities[i]
+    paddle_position = lambda qpos: engine.paddle_position(parameters, qpos)  # noqa: E731
+    _, paddle_velocity = jax.jvp(paddle_position, (qpos,), (jnp.stack(moving),))
+    radius = parameters.ball_radius
+    if radius is None:
+        radius = mj_model.geom_size[addresses.ball_geom, 0]
+    height = radius + np.min(mj_model.geom_size[addresses.paddle_geom])
+    gap = truth.ball_position[..., 2] - truth.paddle_position[2] - height
+    # The lowest ball counts.
     lowest = jnp.min(gap)
-    speed = jnp.max(jnp.where(gap <= lowest, speed, 0.0))
+    approach = paddle_velocity[2] - truth.ball_velocity[..., 2]
+    speed = jnp.max(jnp.where(gap <= lowest, approach, 0.0))
     return impact._replace(speed=jnp.where(lowest > _NEAR, speed, impact.speed))
 
 

@@ -1,11 +1,12 @@
-"""Random numbers within a control step, from a counter in the state.
+"""Time and random numbers of an episode in a randomised world.
 
-An environment's `step` takes no key, and JAX's generators are not available in a GPU kernel. A few
-integer operations give numbers that are random enough for sensor noise.
+An environment's `step` takes no key. A few integer operations on a counter in its state give
+numbers that are random enough for the noise of sensors.
 """
 
 import enum
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,29 @@ class Stream(enum.IntEnum):
     FRAME_DROP = 2
     PUSH = 3
     COMMAND = 4
+
+
+class Clock(NamedTuple):
+    """What the random events of an episode depend on."""
+
+    counter: jax.Array
+    """Counter of the random numbers [], int32."""
+    step: jax.Array
+    """Control steps since the reset [], int32."""
+    phases: jax.Array
+    """Share of the current interval that had passed at the reset [3]: camera, pushes, commands."""
+
+
+def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
+    """The clock at a reset; consumes the key."""
+    counter = jax.lax.bitcast_convert_type(jax.random.bits(key, dtype=jnp.uint32), jnp.int32)
+    phases = uniform(counter, Stream.COMMAND, (3,), dtype)
+    return Clock(counter, jnp.zeros((), jnp.int32), phases)
+
+
+def next_clock(clock: Clock) -> Clock:
+    """The clock of the next control step."""
+    return clock._replace(counter=next_counter(clock.counter), step=clock.step + 1)
 
 
 def next_counter(counter: jax.Array) -> jax.Array:
@@ -48,6 +72,12 @@ def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.d
     sine, cosine = sine_cosine(2.0 * math.pi * numbers[1])
     both = jnp.concatenate([radius * cosine, radius * sine])
     return both[:size].reshape(shape)
+
+
+def joints(counter: jax.Array, num_joints: int, dtype: jnp.dtype) -> tuple[jax.Array, jax.Array]:
+    """Normally distributed numbers for the measured angle and velocity of each joint, both [n]."""
+    numbers = normal(counter, Stream.JOINTS, (2 * num_joints,), dtype)
+    return numbers[:num_joints], numbers[num_joints:]
 
 
 def _mixed(x: jax.Array) -> jax.Array:

@@ -99,7 +99,7 @@ class ObservationConfig(StrictModel):
         }
         return dict(sorted(found.items(), key=lambda item: _GROUPS.index(item[1].group)))
 
-    def seen(self, group: str | None = None) -> dict[str, int]:
+    def lengths(self, group: str | None = None) -> dict[str, int]:
         """The number of values of each quantity that the policy sees, all or those of a group."""
         return {
             name: count
@@ -113,12 +113,12 @@ class ObservationConfig(StrictModel):
         known = self.quantities()
         return tuple(
             Part(name, known[name].entries(num_joints, num_balls), known[name].unit)
-            for name in self.seen()
+            for name in self.lengths()
         )
 
     def layout(self, num_joints: int, num_balls: int = 1) -> ObservationLayout:
         """The order of the entries of `parts`, with past values."""
-        counts = self.seen()
+        counts = self.lengths()
         return ObservationLayout(
             tuple(
                 part._replace(size=part.size * counts[part.name])
@@ -130,8 +130,8 @@ class ObservationConfig(StrictModel):
     def is_momentary(self) -> bool:
         """Whether the true state of one instant and the commands determine the whole
         observation."""
-        past = any(count > 1 for count in self.seen().values())
-        remembered = self.seen("past") or self.seen("task")
+        past = any(count > 1 for count in self.lengths().values())
+        remembered = self.lengths("past") or self.lengths("task")
         return not past and not remembered and self.velocity == "measured"
 
 

@@ -6,21 +6,30 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
+from bounce_mjx.physics import Engine
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import taken
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics, ObservationConfig
 from bounce_mjx.world.randomization import RandomizationConfig, World
 
-SENSOR_TERMS = frozenset(
+_TERMS = frozenset(
     "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
     "ball_velocity_noise ball_velocity_bias joint_angle_noise encoder_bias joint_velocity_noise "
     "joint_velocity_bias paddle_offset paddle_tilt".split()
 )
 """Terms that make measurements differ from the truth."""
 
+_PADDLE_TERMS = frozenset("encoder_bias joint_angle_noise paddle_offset paddle_tilt".split())
+"""Terms that make the forward kinematics of the measured joint angles differ from the truth."""
 
-# Age, s, and number of pictures, that no control step has.
+# Age, s, and number of pictures, of one that no control step can have.
 _LONG_AGO = 1e6
 
 
@@ -44,63 +53,130 @@ class Sensing(NamedTuple):
     """True position and velocity of the ball in the last control steps [K, 6], the newest first;
     [K, B, 6] with several balls."""
     picture: Picture
-    seen: dict[str, jax.Array]
+    histories: dict[str, jax.Array]
     """Last values of each observed quantity [H, size], the newest first."""
     task: Any
     """What the task remembers of the measurements."""
 
 
-def is_needed(randomization: RandomizationConfig, observation: ObservationConfig) -> bool:
-    """Whether the observation differs from the true state of a single instant."""
-    return bool(SENSOR_TERMS & set(randomization.terms)) or not observation.is_momentary
+class Sensors:
+    """The sensors of a world."""
+
+    def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine, task: Any):
+        """Chooses what has to be simulated.
+
+        Args:
+          task: `task.Task`, which has quantities of its own.
+        """
+        self._config, self._engine, self._task = config, engine, task
+        self._qpos, self._arm = mj_model.qpos0, find_addresses(mj_model).arm_qpos
+        observation, terms = config.observation, set(config.randomization.terms)
+        self.are_needed = bool(_TERMS & terms) or not observation.is_momentary
+        """Whether the observation differs from the true state of a single instant."""
+        sees_paddle = observation.paddle_position or observation.lengths("task")
+        self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
+
+    def first(
+        self,
+        truth: Kinematics,
+        world: World,
+        clock: Clock,
+        known: dict[str, jax.Array],
+        setpoint: Setpoint | None,
+    ) -> Sensing:
+        """Memory at a reset: the histories repeat the first measurements, and the ball has rested
+        until then. The arguments are those of `next`."""
+        config, zero = self._config, jnp.zeros((), truth.ball_position.dtype)
+        length = math.ceil(_oldest_picture(config.randomization) / config.control_dt - 1e-6) + 1
+        ball = _position_and_velocity(truth)
+        balls = jnp.broadcast_to(ball, (length, *ball.shape))
+        # So long ago that the difference from it is not a velocity.
+        before = Picture(
+            truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO
+        )
+        picture = take_picture(config, world, balls, before, clock)
+        measured = self._measure(truth, world, clock, known, setpoint, picture)
+        task, own = self._task.first_quantities(measured)
+        values = measured | own
+        histories = {
+            name: jnp.broadcast_to(values[name], (count, *values[name].shape))
+            for name, count in config.observation.lengths().items()
+        }
+        return Sensing(balls, picture, histories, task)
+
+    def next(
+        self,
+        before: Sensing,
+        truth: Kinematics,
+        world: World,
+        clock: Clock,
+        known: dict[str, jax.Array],
+        setpoint: Setpoint | None,
+    ) -> Sensing:
+        """Memory after a control step.
+
+        Args:
+          truth: after the step.
+          clock: after the step.
+          known: values [size] of the quantities that need no sensor: the commands and the action.
+          setpoint: the joints' commands at the end of the step, if an action adds to them.
+        """
+        config, ball = self._config, _position_and_velocity(truth)
+        balls = jnp.concatenate([ball[None], before.balls[:-1]])
+        picture = take_picture(config, world, balls, before.picture, clock)
+        measured = self._measure(truth, world, clock, known, setpoint, picture)
+        histories = remember(config.observation, before.histories, measured)
+        own = {name: histories[name] for name in config.observation.lengths("task")}
+        task, own = self._task.next_quantities(before.task, own, measured)
+        return Sensing(balls, picture, histories | own, task)
+
+    def _measure(
+        self,
+        truth: Kinematics,
+        world: World,
+        clock: Clock,
+        known: dict[str, jax.Array],
+        setpoint: Setpoint | None,
+        picture: Picture,
+    ) -> dict[str, jax.Array]:
+        """The measured value [size] of each quantity of the world and of each command."""
+        angles, velocities = measured_joints(world, clock.counter, truth)
+        measured = truth._asdict() | known
+        measured |= {
+            "joint_angles": angles,
+            "joint_velocities": velocities,
+            "ball_position": picture.position,
+            "ball_velocity": picture.velocity,
+            "ball_age": picture.age[None],
+            "ball_picture": picture.position,
+        }
+        if setpoint is not None:
+            # The servo shares the offset of the encoder's zero.
+            measured["servo_lead"] = setpoint.position - (angles - world.get("encoder_bias", 0.0))
+        if self._misjudges_paddle:
+            qpos = [jnp.asarray(coordinate, angles.dtype) for coordinate in self._qpos]
+            for i, address in enumerate(self._arm):
+                qpos[address] = angles[i]
+            measured["paddle_position"] = self._engine.paddle_position(
+                MODEL_PARAMETERS, jnp.stack(qpos)
+            )
+        return measured
 
 
-def resting_ball(
-    randomization: RandomizationConfig, control_dt: float, truth: Kinematics
-) -> jax.Array:
-    """`Sensing.balls` at a reset, before which the ball rested."""
-    length = math.ceil(oldest_picture(randomization) / control_dt - 1e-6) + 1
-    ball = position_and_velocity(truth)
-    return jnp.broadcast_to(ball, (length, *ball.shape))
-
-
-def position_and_velocity(truth: Kinematics) -> jax.Array:
+def _position_and_velocity(truth: Kinematics) -> jax.Array:
     """Position and velocity of the ball [6], or of each ball [B, 6]."""
     return jnp.concatenate([truth.ball_position, truth.ball_velocity], axis=-1)
 
 
-def picture_long_ago(truth: Kinematics) -> Picture:
-    """The picture before the first one, so long ago that their difference is not a velocity."""
-    zero = jnp.zeros((), truth.ball_position.dtype)
-    return Picture(truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO)
-
-
-def oldest_picture(randomization: RandomizationConfig) -> float:
+def _oldest_picture(randomization: RandomizationConfig) -> float:
     """Greatest age of the last picture if none is lost, s."""
     latency = (randomization.ball_latency or (0.0, 0.0))[1]
     rate = randomization.camera_rate
     return latency if rate is None else latency + 1.0 / rate[0]
 
 
-def joint_angle_noise(
-    world: World, counter: jax.Array, num_joints: int, dtype: jnp.dtype
-) -> jax.Array | None:
-    """Noise [n] of the measured joint angles of a control step, rad; None if there is no noise."""
-    if "joint_angle_noise" not in world:
-        return None
-    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)
-    return world["joint_angle_noise"] * noises[:num_joints]
-
-
 def take_picture(
-    observation: ObservationConfig,
-    world: World,
-    balls: jax.Array,
-    last: Picture,
-    counter: jax.Array,
-    phase: jax.Array,
-    step: jax.Array,
-    control_dt: float,
+    config: WorldConfig, world: World, balls: jax.Array, last: Picture, clock: Clock
 ) -> Picture:
     """Last picture that has arrived at a control step.
 
@@ -112,14 +188,12 @@ def take_picture(
     Args:
       balls: `Sensing.balls`, including the ball of this control step.
       last: the last picture at the control step before.
-      phase: share of a picture interval that had passed at the reset [].
-      step: control steps since the reset [].
     """
-    dtype = balls.dtype
-    steps = step.astype(dtype)
+    dtype, control_dt = balls.dtype, config.control_dt
+    steps = clock.step.astype(dtype)
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
-        interval = 1.0 / (world["camera_rate"] * control_dt)
+        interval, phase = 1.0 / (world["camera_rate"] * control_dt), clock.phases[0]
         # The 1e-4 lets a picture that is due at exactly this instant arrive despite rounding.
         number = jnp.floor((steps - latency) / interval - phase + 1e-4)
         age = steps - (number + phase) * interval
@@ -128,18 +202,17 @@ def take_picture(
     age = jnp.maximum(age, 0.0)
     whole = jnp.floor(age)
     newer, older = taken(balls, whole), taken(balls, whole + 1.0)
-    share = age - whole
-    position, velocity = _between(newer, older, share, control_dt)
+    position, velocity = _between(newer, older, age - whole, control_dt)
 
-    noises = noise.normal(counter, noise.Stream.BALL, balls.shape[1:], dtype)
+    noises = noise.normal(clock.counter, noise.Stream.BALL, balls.shape[1:], dtype)
     position = _disturbed(world, "ball_position", position, noises[..., :3])
     due = number > last.number
     arrived = due
     if "frame_drop" in world:
-        lost = noise.uniform(counter, noise.Stream.FRAME_DROP, (), dtype) < world["frame_drop"]
-        arrived = due & (~lost | (step == 0))
+        chance = noise.uniform(clock.counter, noise.Stream.FRAME_DROP, (), dtype)
+        arrived = due & ((chance >= world["frame_drop"]) | (clock.step == 0))
     held_age = last.age + control_dt
-    if observation.velocity == "differences":
+    if config.observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
         velocity = (position - last.position) / elapsed
     velocity = _disturbed(world, "ball_velocity", velocity, noises[..., 3:])
@@ -181,29 +254,28 @@ def measured_joints(
     world: World, counter: jax.Array, truth: Kinematics
 ) -> tuple[jax.Array, jax.Array]:
     """Measured joint angles [n] (rad) and joint velocities [n] (rad/s)."""
-    dtype, num_joints = truth.joint_angles.dtype, len(truth.joint_angles)
-    angles, error = truth.joint_angles, joint_angle_noise(world, counter, num_joints, dtype)
-    if error is not None:
-        angles = angles + error
+    angles = truth.joint_angles
+    of_angles, of_velocities = noise.joints(counter, len(angles), angles.dtype)
+    if "joint_angle_noise" in world:
+        angles = angles + world["joint_angle_noise"] * of_angles
     if "encoder_bias" in world:
         angles = angles + world["encoder_bias"]
-    noises = noise.normal(counter, noise.Stream.JOINTS, (2 * num_joints,), dtype)[num_joints:]
-    return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, noises)
+    return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, of_velocities)
 
 
 def remember(
     observation: ObservationConfig,
-    seen: dict[str, jax.Array],
+    histories: dict[str, jax.Array],
     measured: dict[str, jax.Array],
 ) -> dict[str, jax.Array]:
     """Histories after the measurements of a control step; those of the task's own quantities stay.
 
     Args:
-      seen: last values of each observed quantity [H, size].
+      histories: last values of each observed quantity [H, size].
       measured: value [size] of each quantity except the task's own.
     """
-    own = observation.seen("task")
+    own = observation.lengths("task")
     return {
         name: past if name in own else jnp.concatenate([measured[name][None], past[:-1]])
-        for name, past in seen.items()
+        for name, past in histories.items()
     }

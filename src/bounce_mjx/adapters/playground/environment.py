@@ -123,7 +123,7 @@ class PlaygroundBounceBall(MjxEnv):
         before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
         acted = after.pipeline_state.last_action
-        ctrl = self.task.servo_targets(physics, acted, last=data.task.ctrl)
+        ctrl = self.task.servo_targets(physics, acted, data.task.actuation.setpoint)
         data = data.replace(
             **after.pipeline_state.physics._asdict(),
             time=data.time + self.task.dt,
