@@ -43,7 +43,7 @@ def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
     import torch
 
     from bounce_mjx.adapters.torch import TorchVectorEnv
-    from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv
+    from bounce_mjx.adapters.torch.rsl_rl_env import RslRlVecEnv
 
     env = BounceBall()
     episode_steps = env.config.episode_steps

@@ -5,11 +5,10 @@
     python benchmarks/jax_vs_torch.py --methods --merge FILES            # existing records only
 
 The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax.
-They use the config's hyperparameters as far as each library has them (`trainers.py`,
-`adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py`). Each run is a separate process
-with an empty compilation cache. All trainers start episodes with the task's resets. Every
-`eval_every` steps, the same evaluation measures the policy without noise, on the same resets and on
-the fused physics.
+They use the config's hyperparameters as far as each library has them (`trainers.py`). Each run is a
+separate process with an empty compilation cache. All trainers start episodes with the task's
+resets. Every `eval_every` steps, the same evaluation measures the policy without noise, on the same
+resets and on the fused physics.
 
 - Training clock: time in the trainer, without evaluations and without compiling. The first two
   blocks of a trainer may compile, so each of them counts as at most the median of the later blocks.

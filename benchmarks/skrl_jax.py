@@ -1,6 +1,6 @@
 """skrl's PPO in JAX on this environment, for `jax_vs_torch.py`.
 
-The hyperparameters are the same as in `adapters/torch/skrl_ppo.py`, except that skrl's JAX side
+The hyperparameters are the same as in `torch_ppo.py`, except that skrl's JAX side
 clips the gradients of each network separately and adapts a learning rate for each network.
 """
 
@@ -143,7 +143,7 @@ class SkrlJaxLearner:
         depth = len(self.config.hidden_layers)
         hidden = {f"hidden_{i}": params[f"Dense_{i}"] for i in range(depth)}
         return Policy(
-            self.agent._observation_preprocessor.statistics.normalizer,
+            self.agent.checkpoint_modules["observation_preprocessor"].statistics.normalizer,
             {
                 "params": {
                     "MLP_0": hidden,

@@ -3,9 +3,8 @@
 Each trains on the config's environment until `on_block` returns True. `on_block` receives the
 number of environment steps so far, the block's time in seconds, and the policy.
 
-For rsl_rl, skrl, skrl_jax and brax, the differences of the hyperparameters from ours are in the
-tables of `adapters/torch/rsl_rl_ppo.py`, `adapters/torch/skrl_ppo.py`, `skrl_jax.py` and
-`brax_trainer.py`. A process imports only the library that it measures.
+The differences of the libraries' hyperparameters from ours are in the tables of `torch_ppo.py`,
+`skrl_jax.py` and `brax_trainer.py`. A process imports only the library that it measures.
 """
 
 import concurrent.futures
@@ -68,11 +67,19 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
         )
 
 
-def train_torch(library: Literal["rsl_rl", "skrl"], config: TrainConfig, on_block: OnBlock) -> None:
-    """A PyTorch library on the PyTorch adapter."""
-    from bounce_mjx.adapters.torch.trainer import TorchTrainer
+def train_rsl_rl(config: TrainConfig, on_block: OnBlock) -> None:
+    """rsl_rl on the PyTorch adapter."""
+    from torch_ppo import RslRlLearner
 
-    (learner,) = TorchTrainer(library, config, BounceBall(config.env)).learners
+    learner = RslRlLearner(config.ppo, BounceBall(config.env), config.seed)
+    _train_learner(learner, config, on_block)
+
+
+def train_skrl(config: TrainConfig, on_block: OnBlock) -> None:
+    """skrl on the PyTorch adapter."""
+    from torch_ppo import SkrlLearner
+
+    learner = SkrlLearner(config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)
 
 
@@ -115,7 +122,7 @@ TRAINERS: dict[Method, Callable[[TrainConfig, OnBlock], None]] = {
     "ours": train_ours,
     "brax": functools.partial(train_brax, "auto"),
     "brax_mjx": functools.partial(train_brax, "mjx"),
-    "rsl_rl": functools.partial(train_torch, "rsl_rl"),
-    "skrl": functools.partial(train_torch, "skrl"),
+    "rsl_rl": train_rsl_rl,
+    "skrl": train_skrl,
     "skrl_jax": train_skrl_jax,
 }

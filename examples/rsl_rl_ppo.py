@@ -1,44 +1,63 @@
-"""rsl_rl's own runner on the environment, with the project's tuned settings; then its exports.
+"""rsl_rl: its own runner trains; then its exports, and a run that `bounce-mjx eval` reads.
 
 `python examples/rsl_rl_ppo.py` needs the extra `torch`.
 """
 
+import argparse
 from pathlib import Path
-from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from bounce_mjx import BounceBall
 from bounce_mjx.adapters.torch import TorchVectorEnv
-from bounce_mjx.adapters.torch.rsl_rl_ppo import RslRlVecEnv, algorithm_config
-from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.adapters.torch.policy import to_policy, write_run
+from bounce_mjx.adapters.torch.rsl_rl_env import RslRlVecEnv
 
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--num-envs", type=int, default=4096)
+parser.add_argument("--steps", type=int, default=40_000_000, help="of all environments together")
+parser.add_argument("--out", type=Path, default=Path("runs/rsl_rl"))
+parser.add_argument("--seed", type=int, default=0)
+arguments = parser.parse_args()
+ROLLOUT = 32
 
-def main(folder: Path = Path("rsl_rl_ppo"), iterations: int = 300, **settings: Any) -> torch.Tensor:
-    """Trains, exports the policy and acts with the export; the mean reward of its steps [T].
+torch.manual_seed(arguments.seed)
+task = BounceBall()
+env = RslRlVecEnv(TorchVectorEnv(task, arguments.num_envs, seed=arguments.seed, reward_scale=0.1))
+# A policy of this project has SiLU between its layers.
+network = {
+    "class_name": "MLPModel",
+    "hidden_dims": [128, 128],
+    "activation": "swish",
+    "obs_normalization": True,
+}
+noise = {"class_name": "GaussianDistribution", "init_std": 0.4, "std_type": "log"}
+config = {
+    "num_steps_per_env": ROLLOUT,
+    "save_interval": 50,
+    "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]},
+    "actor": network | {"distribution_cfg": noise},
+    "critic": network,
+    "algorithm": {
+        "class_name": "PPO",
+        "num_learning_epochs": 4,
+        "num_mini_batches": 16,
+        "learning_rate": 3e-4,
+        "desired_kl": 0.01,
+        "gamma": 0.98,
+        "entropy_coef": 0.0,
+    },
+}
+log_dir = arguments.out / "rsl_rl"
+runner = OnPolicyRunner(env, config, log_dir=str(log_dir), device=str(env.device))
+iterations = max(1, arguments.steps // (ROLLOUT * arguments.num_envs))
+runner.learn(iterations, init_at_random_ep_len=True)
+runner.export_policy_to_jit(str(log_dir))
+runner.export_policy_to_onnx(str(log_dir))
 
-    Args:
-      settings: fields of `PPOConfig`.
-    """
-    config = PPOConfig(**settings)
-    env = RslRlVecEnv(
-        TorchVectorEnv(BounceBall(), config.num_envs, reward_scale=config.reward_scale)
-    )
-    train_config = algorithm_config(config) | {"save_interval": 50}
-    runner = OnPolicyRunner(env, train_config, log_dir=str(folder), device=str(env.device))
-    runner.learn(iterations, init_at_random_ep_len=True)
-    runner.export_policy_to_jit(str(folder))
-    runner.export_policy_to_onnx(str(folder))
-
-    policy = torch.jit.load(folder / "policy.pt", map_location=env.device)
-    observations, _ = env.reset()
-    rewards = []
-    for _ in range(100):
-        observations, reward, *_ = env.step(policy(observations["policy"]))
-        rewards.append(reward.mean())
-    return torch.stack(rewards)
-
-
-if __name__ == "__main__":
-    print(main().mean())
+actor = runner.alg.get_policy()
+seen = actor.obs_normalizer
+policy = to_policy(actor.mlp, seen.mean, seen.std + seen.eps, actor.distribution.log_std_param)
+steps = iterations * ROLLOUT * arguments.num_envs
+print("bounce-mjx eval", write_run(arguments.out, task, policy, steps, arguments.seed))

@@ -7,11 +7,9 @@ import json
 import math
 import os
 import re
-import shlex
 import shutil
 import threading
 import time
-import types
 import unittest.mock
 from datetime import UTC, datetime
 from pathlib import Path
@@ -40,7 +38,6 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
-    Checkpoint,
     best_checkpoint,
     check_links,
     choose_checkpoint,
@@ -55,7 +52,6 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.reading import read_policy
-from bounce_mjx.training import job
 from tiny_runs import contents
 
 PRETRAINED = resource_path("pretrained")
@@ -208,20 +204,6 @@ def test_links_of_weights_and_biases_do_not_count(runs: Path) -> None:
     # The newest run may lie behind a link of the user's.
     (runs / "link").symlink_to("2026-01-02")
     check_links(runs / "link")
-
-
-@pytest.mark.parametrize("library", ["x; touch pwned", "$(touch pwned)", "a b", "'", "x" * 9999])
-def test_the_library_of_a_run_is_one_word_of_the_command(
-    library: str, tmp_path: Path, monkeypatch
-) -> None:
-    record = types.SimpleNamespace(progress={"library": library})
-    monkeypatch.setattr(job, "read_record", lambda _: record)
-    with pytest.raises(UserError) as error_info:
-        job.check_library(Checkpoint(tmp_path, tmp_path, 64), "jax")
-    command = shlex.split(str(error_info.value).split("continue with: ")[1])
-    assert command[:3] == ["bounce-mjx", "train-torch", "--library"]
-    assert command[3][:90] == library[:90] and command[4:] == ["--resume", str(tmp_path)]
-    assert len(str(error_info.value)) < 1000
 
 
 def test_a_name_that_a_terminal_would_obey_is_not_printed(runs: Path, capsys) -> None:

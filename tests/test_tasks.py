@@ -43,7 +43,7 @@ RESULT = r"rests +episodes"
 ALLOWED = {
     "__init__.py", "baselines/mirror.py",
     "commands/main.py", "commands/play.py", "commands/train.py",
-    "commands/train_torch.py", "commands/run_options.py", "physics/convergence.py",
+    "commands/run_options.py", "physics/convergence.py",
     "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
     "world/observation.py", "world/randomization.py",
     "identify/fit.py", "identify/stages.py",

@@ -12,7 +12,6 @@ import yaml
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.learning.statistics import normalize
@@ -166,11 +165,3 @@ def test_mistakes_give_one_sentence(
     error = capfd.readouterr().err
     assert re.fullmatch(r"error: .+\n", error) and words in error, error
     assert not list(tmp_path.iterdir())
-
-
-def test_torch_does_not_warm_start(torch_libraries) -> None:
-    from bounce_mjx.adapters.torch.trainer import TorchTrainer
-
-    command = train_command.read_command(["--warm-start", "robust_small"])
-    with pytest.raises(UserError, match="warm_start is robust_small, .*bounce-mjx train"):
-        TorchTrainer("rsl_rl", config_of(command), None)

@@ -28,7 +28,6 @@ COMMANDS = {
     "excite": "plan a motion from which an arm can be identified",
     "identify": "estimate the world of a robot from its logs",
     "doctor": "print versions, devices and what is missing",
-    "train-torch": "train with a PyTorch library",
 }
 _HELP = """usage: bounce-mjx COMMAND [ARGUMENTS]
 
@@ -68,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
             os.environ["MUJOCO_GL"] = "disabled"
             _import("mujoco")
             os.environ["MUJOCO_GL"] = opengl
-        _import(f"bounce_mjx.commands.{name.replace('-', '_')}").main(rest)
+        _import(f"bounce_mjx.commands.{name}").main(rest)
 
 
 def _import(name: str) -> ModuleType:

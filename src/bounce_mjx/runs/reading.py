@@ -128,9 +128,8 @@ def read_networks(
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
-    made_here = read_record(checkpoint).progress.get("library", "jax") == "jax"
     items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
-    if not (items and made_here):
+    if not items:
         raise UserError(
             f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
             "robust_small, or a run that bounce-mjx train made"

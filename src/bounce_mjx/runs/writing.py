@@ -128,6 +128,25 @@ class CheckpointWriter:
                 folders.save_config(self._run, self._run_config)
 
 
+def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
+    """Writes a new run whose best checkpoint holds only a policy; its folder.
+
+    Args:
+      steps: environment steps trained.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    run = folders.create_run(config)
+    writer = CheckpointWriter(run, config)
+    writer.save(("best",), steps, policy)
+    problem = writer.problem()
+    writer.close()
+    if problem is not None:
+        raise UserError(f"{problem}; choose another folder")
+    return run
+
+
 def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
     """Writes a checkpoint and replaces all others in its parent folder.
 

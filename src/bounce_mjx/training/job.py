@@ -39,7 +39,6 @@ from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog, open_log
 from bounce_mjx.training.trainer import (
-    JAX,
     Snapshot,
     Trainer,
     Watcher,
@@ -176,8 +175,7 @@ class _Job:
             say(console, f"warning: {warning}")
         for term in config.env.unseen_noise:
             say(console, f"warning: the policy does not see what {term} changes")
-        library = "" if self.trainer.library == JAX else f"library: {self.trainer.library}  "
-        say(console, f"device: {self.device}  {library}run: {self.run}")
+        say(console, f"device: {self.device}  run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
         say(console, f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
         self.clock.lap("setup")
@@ -249,7 +247,6 @@ class _Job:
             for path in self.run.rglob(f"{UNFINISHED}*"):
                 path.unlink(missing_ok=True)
         latest = folders.latest_checkpoint(self.run)
-        check_library(latest, self.trainer.library)
         self.state, plain = load_training_state(latest, self.trainer.state_template())
         self.steps = latest.steps
         seed_records = [plain] if self.config.num_seeds == 1 else plain["seeds"]
@@ -354,7 +351,6 @@ class _Job:
         self._wait_until_saved()
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
-        self.trainer.save_models([member.run for member in self.members])
         if not evaluated:
             where = "" if stopping else ", before the final evaluation"
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self._go_on}")
@@ -517,10 +513,9 @@ class _Job:
         # Each save waits for the one before.
         self._report_saving(wait=True)
         several = self.config.num_seeds > 1
-        library = {"library": self.trainer.library}
-        plain = [member.progress.model_dump() | library for member in self.members]
+        plain = [member.progress.model_dump() for member in self.members]
         if several and self.writers:
-            self.writers[0].save(("latest",), self.steps, policy, state, {"seeds": plain} | library)
+            self.writers[0].save(("latest",), self.steps, policy, state, {"seeds": plain})
         for i, writer in enumerate(self.writers[-len(self.members) :]):
             names = ("best",) if i in best else ()
             if not several:
@@ -550,34 +545,7 @@ class _Job:
             seconds=self.clock.seconds,
             device=self.device,
             version=bounce_mjx.__version__,
-            library=self.trainer.library,
         )
-
-
-def check_library(checkpoint: folders.Checkpoint, library: str) -> None:
-    """Compares the library that began a run with the library that resumes it.
-
-    Raises:
-      UserError: they differ, or the checkpoint is damaged.
-    """
-    began = library_of(checkpoint)
-    if began != library:
-        # The name is from a file, and the command is to be copied into a shell.
-        began = shorten(began)
-        command = "train" if began == JAX else f"train-torch --library {shlex.quote(began)}"
-        raise UserError(
-            f"{checkpoint.run} was trained with {began}, not with {library}; continue with: "
-            f"bounce-mjx {command} --resume {shlex.quote(str(checkpoint.run))}"
-        )
-
-
-def library_of(checkpoint: folders.Checkpoint) -> str:
-    """The library that trained a checkpoint.
-
-    Raises:
-      UserError: the checkpoint is damaged.
-    """
-    return str(read_record(checkpoint).progress.get("library", JAX))
 
 
 def _wait_until_saved(

@@ -2,8 +2,7 @@
 
 import concurrent.futures
 import functools
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -23,13 +22,12 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import JAX, Metrics, Snapshot, iterations_per_block
+from bounce_mjx.training.trainer import Metrics, Snapshot, iterations_per_block
 
 
 class PPOTrainer:
     """This project's PPO; see `Trainer`."""
 
-    library = JAX
     checked = CHECKED
 
     def __init__(self, config: TrainConfig, env: Env):
@@ -115,9 +113,6 @@ class PPOTrainer:
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
         return Snapshot(policy_of(state, self._observation_size), state)
-
-    def save_models(self, runs: Sequence[Path]) -> None:
-        """The checkpoint has everything."""
 
 
 def _iterations_at_once(config: TrainConfig, env: Env) -> int:

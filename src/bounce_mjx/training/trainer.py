@@ -1,8 +1,7 @@
 """The interfaces between the job, an algorithm that trains policies, and an onlooker."""
 
 import concurrent.futures
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -15,9 +14,6 @@ from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 
 Metrics = dict[str, np.ndarray]
-
-JAX = "jax"
-"""Name of this project's own trainer among the libraries."""
 
 
 class Snapshot(NamedTuple):
@@ -47,9 +43,6 @@ class Trainer(Protocol):
     With several seeds, the first axis of every array in a state or a policy is the seed.
     """
 
-    library: str
-    """Name of the implementation; a run can be continued only by the implementation that began
-    it."""
     mesh: Mesh
     """The devices on which it trains."""
     checked: tuple[str, ...]
@@ -82,10 +75,6 @@ class Trainer(Protocol):
 
     def snapshot(self) -> Snapshot:
         """The policy and the whole state."""
-
-    def save_models(self, runs: Sequence[Path]) -> None:
-        """Writes what its library needs in addition to the checkpoint into the folders of the
-        seeds, at the end of the training or when it is stopped."""
 
 
 class Watcher(Protocol):
