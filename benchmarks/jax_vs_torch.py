@@ -1,10 +1,10 @@
-"""Six PPO trainers on one task: environment steps/s, time and steps to the five results, return.
+"""Five PPO trainers on one task: environment steps/s, time and steps to the five results, return.
 
     python benchmarks/jax_vs_torch.py                                    # all trainers and seeds
     python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # some of them
     python benchmarks/jax_vs_torch.py --methods --merge FILES            # existing records only
 
-The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl, skrl and skrl_jax.
+The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl and skrl.
 They use the config's hyperparameters as far as each library has them (`trainers.py`). Each run is a
 separate process with an empty compilation cache. All trainers start episodes with the task's
 resets. Every `eval_every` steps, the same evaluation measures the policy without noise, on the same
@@ -50,18 +50,17 @@ from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
-METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax")
+METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl")
 _NAMES = {
     "ours": "bounce_mjx (JAX)",
     "brax": "brax ppo, fused physics",
     "brax_mjx": "brax ppo, mjx physics",
     "rsl_rl": "rsl_rl (PyTorch)",
     "skrl": "skrl (PyTorch)",
-    "skrl_jax": "skrl (JAX)",
 }
 _STARTED = "BOUNCE_MJX_BENCHMARK_STARTED"
 _RECORDS = "jax_vs_torch.jsonl"
-# brax and skrl (JAX) compile some programs again in their second block.
+# brax compiles some programs again in its second block.
 _COMPILING_BLOCKS = 2
 
 Record = dict[str, Any]

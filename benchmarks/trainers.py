@@ -3,8 +3,9 @@
 Each trains on the config's environment until `on_block` returns True. `on_block` receives the
 number of environment steps so far, the block's time in seconds, and the policy.
 
-The differences of the libraries' hyperparameters from ours are in the tables of `torch_ppo.py`,
-`skrl_jax.py` and `brax_trainer.py`. A process imports only the library that it measures.
+The differences of the libraries' hyperparameters from ours are in the tables of
+`rsl_rl_learner.py`, `skrl_learner.py` and `brax_trainer.py`. A process imports only the library
+that it measures.
 """
 
 import concurrent.futures
@@ -22,7 +23,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
-Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "skrl_jax"]
+Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl"]
 
 
 class OnBlock(Protocol):
@@ -69,7 +70,7 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_rsl_rl(config: TrainConfig, on_block: OnBlock) -> None:
     """rsl_rl on the PyTorch adapter."""
-    from torch_ppo import RslRlLearner
+    from rsl_rl_learner import RslRlLearner
 
     learner = RslRlLearner(config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)
@@ -77,17 +78,9 @@ def train_rsl_rl(config: TrainConfig, on_block: OnBlock) -> None:
 
 def train_skrl(config: TrainConfig, on_block: OnBlock) -> None:
     """skrl on the PyTorch adapter."""
-    from torch_ppo import SkrlLearner
+    from skrl_learner import SkrlLearner
 
     learner = SkrlLearner(config.ppo, BounceBall(config.env), config.seed)
-    _train_learner(learner, config, on_block)
-
-
-def train_skrl_jax(config: TrainConfig, on_block: OnBlock) -> None:
-    """skrl's JAX side."""
-    from skrl_jax import SkrlJaxLearner
-
-    learner = SkrlJaxLearner(config.ppo, BounceBall(config.env), config.seed)
     _train_learner(learner, config, on_block)
 
 
@@ -124,5 +117,4 @@ TRAINERS: dict[Method, Callable[[TrainConfig, OnBlock], None]] = {
     "brax_mjx": functools.partial(train_brax, "mjx"),
     "rsl_rl": train_rsl_rl,
     "skrl": train_skrl,
-    "skrl_jax": train_skrl_jax,
 }

@@ -70,7 +70,7 @@ def test_the_newest_run_counts_even_if_it_is_incomplete(benchmark):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("torch_libraries")
-@pytest.mark.parametrize("methods", [("ours", "rsl_rl", "skrl"), ("brax", "skrl_jax")])
+@pytest.mark.parametrize("methods", [("ours", "rsl_rl", "skrl"), ("brax",)])
 def test_trainers_are_compared(methods, tmp_path):
     """Each trainer runs in its own process; together they give one table, one plot, and one line
     per evaluation."""
@@ -99,7 +99,7 @@ def test_networks_in_torch_begin_as_in_jax(benchmark):
     varied; the weights are orthogonal with the same gains, so they have the same singular values.
     """
     import torch
-    from torch_ppo import InputNormalizer, make_mlp
+    from torch_networks import InputNormalizer, make_mlp
 
     rng = np.random.default_rng(0)
     normalizer, statistics = InputNormalizer(3), init_statistics(3)
