@@ -26,12 +26,8 @@ torch.manual_seed(arguments.seed)
 task = BounceBall()
 env = RslRlVecEnv(TorchVectorEnv(task, arguments.num_envs, seed=arguments.seed, reward_scale=0.1))
 # A policy of this project has SiLU between its layers.
-network = {
-    "class_name": "MLPModel",
-    "hidden_dims": [128, 128],
-    "activation": "swish",
-    "obs_normalization": True,
-}
+network = {"class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "swish"}
+network["obs_normalization"] = True
 noise = {"class_name": "GaussianDistribution", "init_std": 0.4, "std_type": "log"}
 config = {
     "num_steps_per_env": ROLLOUT,
@@ -47,6 +43,7 @@ config = {
         "desired_kl": 0.01,
         "gamma": 0.98,
         "entropy_coef": 0.0,
+        "use_clipped_value_loss": False,
     },
 }
 log_dir = arguments.out / "rsl_rl"

@@ -72,6 +72,7 @@ settings = PPO_CFG(
     learning_rate_scheduler_kwargs={"kl_threshold": 0.01},
     observation_preprocessor=RunningStandardScaler,
     observation_preprocessor_kwargs=scaler | {"size": env.observation_space},
+    value_clip=0.0,
     state_preprocessor=RunningStandardScaler,
     state_preprocessor_kwargs=scaler | {"size": env.state_space},
     time_limit_bootstrap=True,
