@@ -9,7 +9,6 @@ import difflib
 import hashlib
 import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import sys
 import traceback
@@ -17,7 +16,6 @@ import types
 from pathlib import Path
 
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.files import read_regular
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -27,9 +25,7 @@ DEFAULT = "bounce"
 GROUP = "bounce_mjx.tasks"
 """Entry points of installed packages that have tasks."""
 
-_MAX_BYTES = 2**20
-
-# The tasks of the files that the user has named, by their content.
+# The tasks of the files that the user has named, by their code.
 _named: dict[tuple[str, str], type[Task]] = {}
 
 _OWN = {
@@ -92,6 +88,29 @@ def source_file(name: str) -> Path:
     return Path(name.rpartition(":")[0]).expanduser().absolute()
 
 
+def known_task(name: str) -> type[Task] | None:
+    """The task of FILE.py:CLASS if code with the same content has been named in this process;
+    nothing of the file is run."""
+    return _named.get(code_of(name))
+
+
+def admit(name: str, task: type[Task]) -> None:
+    """Lets a task stand for FILE.py:CLASS, whose code may be another one."""
+    _named[code_of(name)] = task
+
+
+def code_of(name: str) -> tuple[str, str]:
+    """What identifies the code of a task: the hash of its file and the class; for a registered
+    task, its name.
+
+    Raises:
+      UserError: the file cannot be read.
+    """
+    if not is_file(name):
+        return name, ""
+    return _digest(read_source(name)), name.rpartition(":")[2]
+
+
 def read_source(name: str) -> bytes:
     """Content of the file in FILE.py:CLASS.
 
@@ -100,32 +119,16 @@ def read_source(name: str) -> bytes:
     """
     path = source_file(name)
     try:
-        return read_regular(path, _MAX_BYTES)
-    except (OSError, ValueError) as error:
+        return path.read_bytes()
+    except OSError as error:
         raise UserError(
             f"the task's file {shorten(str(path))} cannot be read ({reason_of(error)}); give "
             "FILE.py:CLASS"
         ) from error
 
 
-def known_task(name: str) -> type[Task] | None:
-    """The task of FILE.py:CLASS if code with the same content has been named in this process;
-    nothing of the file is run."""
-    return _named.get(content_of(name))
-
-
-def admit(name: str, task: type[Task]) -> None:
-    """Lets a task stand for FILE.py:CLASS, whose code may be another one."""
-    _named[content_of(name)] = task
-
-
-def content_of(name: str) -> tuple[str, str]:
-    """What identifies the code of FILE.py:CLASS: the file's SHA-256, and the class.
-
-    Raises:
-      UserError: the file cannot be read.
-    """
-    return hashlib.sha256(read_source(name)).hexdigest(), name.rpartition(":")[2]
+def _digest(source: bytes) -> str:
+    return hashlib.sha256(source).hexdigest()[:16]
 
 
 def registered_tasks() -> tuple[str, ...]:
@@ -140,26 +143,25 @@ def _registered() -> dict[str, str]:
 
 
 def _from_file(name: str) -> type[Task]:
-    path, (digest, _) = source_file(name), content_of(name)
-    module_name = f"bounce_mjx_task_{digest[:16]}"
-    if module_name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(module_name, path)
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[module_name] = module
+    path, source = source_file(name), read_source(name)
+    # The name is the same in every process that reads a pickled environment.
+    module = types.ModuleType(f"bounce_mjx_task_{_digest(source)}")
+    module.__file__ = str(path)
+    if module.__name__ not in sys.modules:
+        sys.modules[module.__name__] = module
         try:
-            exec(compile(read_source(name), str(path), "exec"), vars(module))
+            exec(compile(source, str(path), "exec"), vars(module))
         except Exception as error:
-            del sys.modules[module_name]
-            frames = [
-                f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)
-            ]
-            line = getattr(error, "lineno", None) or (frames[-1].lineno if frames else 1)
+            del sys.modules[module.__name__]
+            frames = traceback.extract_tb(error.__traceback__)
+            lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+            line = getattr(error, "lineno", None) or (lines or [1])[-1]
             raise UserError(
                 f"the task's file {path} cannot be imported ({type(error).__name__} in "
                 f"line {line}: {shorten(str(error), 300)}); correct it"
             ) from error
-    task = _class_in(sys.modules[module_name], name)
-    if task.__module__ == module_name:
+    task = _class_in(sys.modules[module.__name__], name)
+    if task.__module__ == module.__name__:
         copyreg.pickle(task.Config, _pickled)
     return task
 
@@ -185,16 +187,15 @@ def _unpickled(name: str, module_name: str) -> WorldConfig:
 
 def _class_in(module: types.ModuleType, name: str) -> type[Task]:
     """The task of FILE.py:CLASS in the file's module."""
-    attribute = name.rpartition(":")[2]
-    found = getattr(module, attribute, None)
-    if isinstance(found, type) and issubclass(found, Task):
-        return found
-    classes = [
-        key
+    classes = {
+        key: value
         for key, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Task) and value is not Task
-    ]
-    raise UserError(
-        f"the task's file {source_file(name)} has no task {shorten(attribute)!r} (its subclasses "
-        f"of Task: {', '.join(classes) or 'none'}); give FILE.py:CLASS"
-    )
+    }
+    attribute = name.rpartition(":")[2]
+    if attribute not in classes:
+        raise UserError(
+            f"the task's file {source_file(name)} has no task {shorten(attribute)!r} (its "
+            f"subclasses of Task: {', '.join(classes) or 'none'}); give FILE.py:CLASS"
+        )
+    return classes[attribute]
