@@ -80,15 +80,6 @@ def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
     np.testing.assert_array_equal(plain.body_mass, pictured.body_mass)
 
 
-def test_the_memory_that_a_file_asks_for_is_ignored(tmp_path):
-    """Too little of it ends a step, and too much the process."""
-    for memory in ("1K", "900T"):
-        size = f'<size memory="{memory}" nuser_body="900000000"/><worldbody>'
-        (tmp_path / "robot.xml").write_text(XML.replace("<worldbody>", size))
-        model = load_model(tmp_path / "robot.xml", 0.001)
-        mujoco.mj_step(model, mujoco.MjData(model))
-
-
 def test_an_edited_model_is_an_error():
     """The error comes when a program that would ignore the edit is traced; colours may be
     edited."""

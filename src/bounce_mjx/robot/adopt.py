@@ -1,6 +1,5 @@
 """Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,12 +8,12 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import (
+    BALL_BODY_NAME,
+    PADDLE_BODY_NAME,
     Arm,
     ServoSettings,
     build_arm,
     compile_spec,
-    find_site,
-    is_below,
     locate,
 )
 from bounce_mjx.robot.config import RobotConfig
@@ -30,6 +29,7 @@ _LARGEST_SPREAD = 4.0
 # Largest difference of an arm in the scene from its file compiled alone: MuJoCo rounds frames that
 # are almost the same.
 _EQUAL = 1e-6
+_BODY_FIELDS = ("pos", "quat", "ipos", "iquat", "mass", "inertia")
 # Torque of a kept servo at the action 1, in multiples of the torque that holds the arm.
 _LEAST_HOLD = 1.5
 
@@ -66,9 +66,10 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     try:
         arm = build_arm(path, config)
         arm.spec.compiler.discardvisual = True
-        # So the paddle keeps its own body, which the search turns.
+        # So every body stays: the search turns the paddle's.
         arm.spec.compiler.fusestatic = False
         model = compile_spec(arm.spec, path)
+        check_as_alone(arm, model)
         asked = Mount(config.paddle.position, config.paddle.quaternion)
         pose = find_pose(model, arm.force_limits, (asked,) if is_mount_given else mounts())
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
@@ -77,9 +78,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
             columns = zip(ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
-        result = build_arm(path, adopted)
-        _check_as_alone(result, compile_spec(result.spec, path), adopted, pose.angles)
-        return Adoption(adopted, scale, pose, result, servos, are_kept)
+        return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
     except UserError as error:
         raise named(path, error) from error
 
@@ -119,92 +118,29 @@ def _servos(
     return servos, _rounded(scale), False
 
 
-def _check_as_alone(
-    arm: Arm, model: mujoco.MjModel, config: RobotConfig, angles: Sequence[float]
-) -> None:
-    """Compares an arm in the task's scene to its file compiled alone, at the start pose.
+def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
+    """Compares the bodies of an arm in the task's scene to those of its file compiled alone.
+
+    Args:
+      model: the compiled scene, with all bodies.
 
     Raises:
-      UserError: the paddle is not at its site, or a link's pose, mass or inertia differs.
+      UserError: a body's pose, mass or inertia differs, or a joint's axis.
     """
-    at, own, blade = find_addresses(model), arm.own, config.paddle
-    here, alone = _at(model, at.arm_joints, angles), _at(own.model, own.joints, angles)
-    body, position, quaternion = find_site(own.model, config)
-    turned = alone.xmat[body].reshape(3, 3)
-    site = turned @ _rotation(quaternion)
-    centre = alone.xpos[body] + turned @ position + site @ blade.position
-    paddle, rotation = at.paddle_geom, site @ _rotation(blade.quaternion)
-    found = {
-        "the pose of the site": (
-            [*here.geom_xpos[paddle], *here.geom_xmat[paddle]],
-            [*centre, *rotation.ravel()],
-        )
-    }
-    squared = np.square(blade.half_size)
-    principal = blade.mass / 3.0 * (np.sum(squared) - squared)
-    added = _inertia(blade.mass, principal, centre, rotation)
-    for name, i, j in zip(arm.joint_names, at.arm_joints, own.joints, strict=True):
-        link, alike = model.jnt_bodyid[i], own.model.jnt_bodyid[j]
-        bodies = _welded(model, at.arm_joints, link)
-        inertia = _summed(model, here, bodies) - added * (model.geom_bodyid[paddle] in bodies)
-        others = _welded(own.model, own.joints, alike, own.gripper)
-        found[f"the pose of the link of {name}"] = (
-            [*here.xpos[link], *here.xmat[link], *here.xaxis[i]],
-            [*alone.xpos[alike], *alone.xmat[alike], *alone.xaxis[j]],
-        )
-        found[f"the mass or inertia of the link of {name}"] = (
-            inertia,
-            _summed(own.model, alone, others),
-        )
-    for words, pair in found.items():
-        if not np.allclose(*pair, rtol=0.0, atol=_EQUAL * np.max(np.abs(pair))):
+    added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
+    bodies = [b for b in range(1, model.nbody) if model.body(b).name not in added]
+    joints = find_addresses(model).arm_joints
+    for field, here, alone in (
+        *((f"body_{name}", bodies, arm.own.bodies) for name in _BODY_FIELDS),
+        *((f"jnt_{name}", joints, arm.own.joints) for name in ("pos", "axis")),
+    ):
+        expected = getattr(arm.own.model, field)[list(alone)]
+        error = np.max(np.abs(getattr(model, field)[list(here)] - expected))
+        if error > _EQUAL * np.max(np.abs(expected)):
             raise UserError(
-                f"an arm that changes in the task's scene: {words} at the start pose differs by "
-                f"{np.max(np.abs(np.subtract(*pair))):.2g}; write the MJCF in a plainer way, with "
-                "angles as quaternions"
+                f"an arm that changes in the task's scene, where its {field} differs by "
+                f"{error:.2g}; write the MJCF in a plainer way, with angles as quaternions"
             )
-
-
-def _at(model: mujoco.MjModel, joints: Sequence[int], angles: Sequence[float]) -> mujoco.MjData:
-    """The kinematics of a model with these joints at these angles, rad."""
-    data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[list(joints)]] = angles
-    mujoco.mj_kinematics(model, data)
-    return data
-
-
-def _welded(
-    model: mujoco.MjModel, joints: Sequence[int], link: int, gripper: Sequence[int] = ()
-) -> list[int]:
-    """A link's bodies, with no other acting joint between, without the gripper's."""
-    acting, bodies = {0, *model.jnt_bodyid[list(joints)].tolist()}, []
-    for body in range(1, model.nbody):
-        owner = body
-        while owner not in acting:
-            owner = int(model.body_parentid[owner])
-        if owner == link and not is_below(model, body, gripper):
-            bodies.append(body)
-    return bodies
-
-
-def _summed(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int]) -> np.ndarray:
-    """`_inertia` of several bodies together."""
-    mass, inertia, centres, frames = model.body_mass, model.body_inertia, data.xipos, data.ximat
-    return sum(_inertia(mass[b], inertia[b], centres[b], frames[b].reshape(3, 3)) for b in bodies)
-
-
-def _inertia(mass: float, principal: np.ndarray, at: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Mass, first moment and inertia matrix about the world's origin [13] of a body with these
-    principal moments [3] about the point `at` [3], along the columns of `axes` [3, 3]."""
-    about = axes @ np.diag(principal) @ axes.T + mass * (at @ at * np.eye(3) - np.outer(at, at))
-    return np.array([mass, *(mass * at), *about.ravel()])
-
-
-def _rotation(quaternion: Sequence[float]) -> np.ndarray:
-    """Rotation matrix [3, 3] of a quaternion [w, x, y, z]."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.array(quaternion) / np.linalg.norm(quaternion))
-    return matrix.reshape(3, 3)
 
 
 def _rounded(value: float) -> float:

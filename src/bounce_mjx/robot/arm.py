@@ -5,7 +5,6 @@ Every change to the user's model is collected as one sentence.
 
 import contextlib
 import importlib.util
-import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -24,15 +23,12 @@ PADDLE_GEOM_NAME = "blocker"
 # Lifting and tilting the paddle about two axes takes three joints.
 MIN_JOINTS = 3
 
-_PADDLE_BODY_NAME = "paddle"
+PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 HIDDEN_GROUP = 3
-_RESERVED = (BALL_BODY_NAME, PADDLE_GEOM_NAME, _PADDLE_BODY_NAME, "ball", "paddle_home")
-_RESERVED += ("ball_link2", "ball_link3", "ball2", "ball3")
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 # A change of a joint's range that is told, rad or m.
 _NARROWER = 1e-3
-_SILENCE = threading.Lock()
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -53,10 +49,10 @@ class Own(NamedTuple):
     """The user's file compiled alone."""
 
     model: mujoco.MjModel
-    joints: tuple[int, ...]
+    joints: list[int]
     """The acting joints in it."""
-    gripper: tuple[int, ...]
-    """The bodies in it whose subtrees are the gripper, which the scene lacks."""
+    bodies: list[int]
+    """The bodies in it that the scene has too."""
 
 
 class Arm(NamedTuple):
@@ -149,14 +145,9 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     """
     try:
         with _silent():
-            spec = mujoco.MjSpec.from_file(str(path))
+            return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise _not_compiled(path, error) from error
-    # The task needs no user data, and the memory that MuJoCo chooses.
-    spec.memory, spec.nuserdata, spec.nkey = -1, 0, 0
-    for name in [name for name in dir(spec) if name.startswith("nuser_")]:
-        setattr(spec, name, -1)
-    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -189,17 +180,15 @@ def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarr
 
 def _other_sites(model: mujoco.MjModel) -> str:
     """The remedy for a wrong site: the sites and bodies that enough joints lead to."""
-    joints = np.zeros(model.nbody, int)
-    for body in range(1, model.nbody):
-        own = model.jnt_type[_joints_of(model, body)]
-        joints[body] = joints[model.body_parentid[body]] + np.isin(own, (_HINGE, _SLIDE)).sum()
-    sites = [
-        model.site(i).name for i in range(model.nsite) if joints[model.site_bodyid[i]] >= MIN_JOINTS
-    ]
-    bodies = [model.body(i).name for i in np.flatnonzero(joints >= MIN_JOINTS)]
-    if not any(sites + bodies):
+
+    def is_led(body: int) -> bool:
+        return model.body_jntnum[_chain(model, body)].sum() >= MIN_JOINTS
+
+    names = [model.site(i).name for i in range(model.nsite) if is_led(model.site_bodyid[i])]
+    names += [model.body(i).name for i in range(1, model.nbody) if is_led(i)]
+    if not any(names):
         return f"give an arm with a named site or body beyond at least {MIN_JOINTS} joints"
-    return f"give --site one of the sites ({_listed(sites, 40)}) or bodies ({_listed(bodies, 40)})"
+    return f"give --site one of the sites and bodies {_listed(names, 80)}"
 
 
 class _Builder:
@@ -212,12 +201,8 @@ class _Builder:
 
     def build(self) -> Arm:
         model = self._model
-        if model.nflex or model.nskin or model.nplugin:
-            raise UserError(
-                "flexes, skins or plugins, which no arm of rigid links has; remove them"
-            )
         end, position, quaternion = find_site(model, self._config)
-        chain = self._chain(end)
+        chain = _chain(model, end)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, actuators[j]) for j in joints)
@@ -231,15 +216,9 @@ class _Builder:
         self._disable_contacts_and_limits(joints)
         scene = self._attach(holder, position, quaternion)
         self._replace_servos(scene, names)
-        own = Own(model, tuple(joints), tuple(gripper))
+        kept = [b for b in range(1, model.nbody) if not is_below(model, b, gripper + objects)]
+        own = Own(model, joints, kept)
         return Arm(scene, names, servos, limits, tuple(self._changes), own)
-
-    def _chain(self, end: int) -> list[int]:
-        """Bodies from the base to the paddle's."""
-        chain = [end]
-        while parent := self._model.body_parentid[chain[-1]]:
-            chain.append(int(parent))
-        return chain[::-1]
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
         model, given = self._model, self._config.joints
@@ -290,13 +269,9 @@ class _Builder:
     def _name(
         self, joints: list[int], end: int, actuators: dict[int, list[int]]
     ) -> tuple[tuple[str, ...], str]:
-        """Gives the arm's parts names that the scene does not use; those of the acting joints, and
-        of the body that holds the paddle."""
+        """The names of the acting joints, and of the body that holds the paddle; those without one
+        get one."""
         arm = self._arm
-        for elements in (arm.bodies[1:], arm.geoms, arm.joints, arm.sites):
-            for element in elements:
-                if element.name in _RESERVED:
-                    element.name += "_of_arm"
         for joint in joints:
             arm.joints[joint].name = arm.joints[joint].name or f"joint{joint}"
             for actuator in actuators[joint]:
@@ -493,13 +468,14 @@ class _Builder:
         scene = read_spec(resource_path("mjcf/scene.xml"))
         differing = _differing_options(self._model.opt, scene.option)
         if differing:
-            self._changes.append(f"replaced the physics options with the task's ({differing})")
+            names = ", ".join(differing)
+            self._changes.append(f"replaced the physics options with the task's ({names})")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
         arm.option = scene.option
         with _silent():
             scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
-        paddle = scene.body(holder).add_body(name=_PADDLE_BODY_NAME, pos=position, quat=quaternion)
+        paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config, scene.default)
         ball = scene.geom("ball")
         ball.size[0], ball.mass = config.ball.radius, config.ball.mass
@@ -674,6 +650,14 @@ def _couplings(model: mujoco.MjModel) -> Iterator[tuple[str, Iterable[int], Iter
         yield f"the tendon {model.tendon(i).name or f'number {i}'}", driven, bodies
 
 
+def _chain(model: mujoco.MjModel, end: int) -> list[int]:
+    """Bodies from the base to `end`."""
+    chain = [end]
+    while parent := model.body_parentid[chain[-1]]:
+        chain.append(int(parent))
+    return chain[::-1]
+
+
 def _joints_of(model: mujoco.MjModel, body: int) -> range:
     first = int(model.body_jntadr[body])
     return range(first, first + int(model.body_jntnum[body]))
@@ -696,23 +680,10 @@ def raise_solver_limits(option: mujoco.MjOption) -> None:
     option.ls_iterations = max(option.ls_iterations, default.ls_iterations)
 
 
-def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> str:
-    """The options of a file that differ from the task's, for the list of changes."""
-    different = []
-    if given.integrator != task.integrator:
-        different.append(mujoco.mjtIntegrator(given.integrator).name.removeprefix("mjINT_").lower())
-    if not np.allclose(given.gravity, task.gravity, atol=1e-2):
-        different.append(f"gravity {np.round(given.gravity, 3).tolist()}")
-    off = [
-        name.removeprefix("mjDSBL_").lower()
-        for name, flag in mujoco.mjtDisableBit.__members__.items()
-        if name.startswith("mjDSBL") and flag.value & given.disableflags & ~task.disableflags
-    ]
-    if off:
-        different.append(f"{' and '.join(off)} disabled")
-    if given.density or given.viscosity or np.any(given.wind):
-        different.append("a medium")
-    return ", ".join(different)
+def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> list[str]:
+    """Names of the options of a file that differ from the task's."""
+    names = [name for name in dir(task) if not name.startswith("_")]
+    return [n for n in names if not np.array_equal(getattr(given, n), getattr(task, n))]
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
@@ -734,11 +705,9 @@ def _not_compiled(path: Path, error: ValueError) -> UserError:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Without MuJoCo's warnings: of the empty prefix of an attached arm, and of meshes.
-
-    Both switches belong to the process, so one thread at a time uses them.
-    """
-    with _SILENCE, warnings.catch_warnings():
+    """Without MuJoCo's warnings, which it also writes to a file: of the empty prefix of an attached
+    arm, and of meshes."""
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         earlier = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(lambda text: None)

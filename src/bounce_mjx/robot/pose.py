@@ -23,7 +23,7 @@ _LEAST_ACCELERATION, _AMPLE_ACCELERATION = 3.0, 20.0
 # Smallest singular value of a usable pose; 1 would be an arm that moves as a sphere.
 _LEAST_MANIPULABILITY = 0.02
 _LEVEL_TOLERANCE = 1e-9
-_EVALUATIONS = 30
+_TRIES, _EVALUATIONS = 8, 30
 _UP = np.array([0.0, 0.0, 1.0])
 # Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
 # short range it is a tenth.
@@ -203,7 +203,7 @@ class _Search:
         for distance in distances:
             for height in heights:
                 goal = np.array([self._base[0] + distance, self._base[1], height])
-                for _ in range(4):
+                for _ in range(_TRIES):
                     angles = self._solved(self._random(), goal)
                     if angles is not None:
                         yield angles
