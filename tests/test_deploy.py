@@ -1,9 +1,7 @@
 """Exported policies: the ONNX graph against JAX, a deployed policy against the environment."""
 
 import inspect
-import json
 import math
-import random
 import runpy
 import subprocess
 import sys
@@ -808,7 +806,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     for prop in unknown.metadata_props:
         prop.value = prop.value.replace("ball_velocity", "ball_colour")
     broken = {
-        "its input ball_colour is unknown": unknown.SerializeToString(),
+        "ball_colour": unknown.SerializeToString(),
         "text": b"hello",
         "half": shipped[: len(shipped) // 2],
         "lacks format": foreign.SerializeToString(),
@@ -820,32 +818,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
             UserError, match="a.onnx is not a policy .*bounce-mjx export"
         ) as refusal:
             load_policy(tmp_path / "a.onnx")
-        assert " " not in reason or reason in str(refusal.value)
-
-
-WRONG_ENTRIES = {
-    "control_dt": [1e-300, 0.0, -0.01, 1e300, float("nan"), "0.01", None, True, [0.01]],
-    "action_scale": [float("inf"), 1e300, -0.1, {}],
-    "format": [2.0, "2", [2], None],
-    "steps": [-1, 1.5, True],
-    "joint_names": ["Joint1", ["Joint1"] * 5, [1] * 6, {}, []],
-    "joint_ranges": [
-        [[1.0, -1.0]] * 6,
-        [[0.0, float("nan")]] * 6,
-        [[0.0, 1.0, 2.0]] * 6,
-        [0.0] * 6,
-    ],
-    "servo_stiffness": [[1.0] * 5, 3.0],
-    "torque_limits": [[None] * 7],
-    "velocity": ["guessed", ["filter"], None],
-    "paddle": [[0.0, 0.0], [1e300, 0.0, 0.0]],
-    "ball": [[3.0, 20.0], {"distance": -1.0, "speed": 9.0}, {"distance": 3.0}],
-    "paddle_normal": [[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
-    "chain": [[], {}, [{"joint": 0}], None],
-    "observation": [[], {}, [["joint_angles", 1, 6, "rad"]]],
-    "randomization": [{"ball_mass": 1.0}, []],
-    "commands": [{}, [], {"target_height": [0.4, 0.6]}, {"time": {"range": [0, 1], "unit": ""}}],
-}
+        assert reason in ("text", "half") or reason in str(refusal.value)
 
 
 @pytest.fixture(scope="module")
@@ -866,73 +839,10 @@ def edited(model: onnx.ModelProto, name: str, text: str) -> bytes:
     return copy.SerializeToString()
 
 
-@pytest.mark.parametrize("name", WRONG_ENTRIES)
-def test_a_wrong_entry_is_refused_by_name(name: str, curious: onnx.ModelProto) -> None:
-    for value in WRONG_ENTRIES[name]:
-        with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file") as refusal:
-            DeployedPolicy(edited(curious, name, json.dumps(value)), "a.onnx")
-        reason = str(refusal.value)
-        words = (name, "joints", "input", "length than 1", "measurement")
-        assert len(reason) < 400 and any(word in reason for word in words), (value, reason)
-
-
 @pytest.mark.parametrize("name", ["position", "velocity"])
 def test_a_policy_with_a_filter_is_refused(name: str, curious: onnx.ModelProto) -> None:
     with pytest.raises(UserError, match="a.onnx is not a policy .*Kalman filter, .* 0.1.0"):
         DeployedPolicy(edited(curious, name, '"filter"'), "a.onnx")
-
-
-def nodes(value: object) -> list[tuple[object, object]]:
-    """Every (group or list, key) in JSON."""
-    keys = (
-        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
-    )
-    return [place for key in keys for place in [(value, key), *nodes(value[key])]]
-
-
-def random_edit(rng: random.Random, text: str) -> str:
-    """JSON with one value replaced, removed, repeated or scaled, or with one character changed."""
-    if rng.random() < 0.1:
-        at = rng.randrange(len(text))
-        return text[:at] + rng.choice('0123456789-.eE"[]{},:nN') + text[at + 1 :]
-    whole = [json.loads(text)]
-    group, key = rng.choice(nodes(whole))
-    value, hostile = group[key], (0, -1, 1e-300, 1e300, 1e30, 10**400, math.nan, math.inf, True)
-    kind = rng.randrange(4)
-    if kind == 0:
-        group[key] = rng.choice([*hostile, None, "", "a", [], {}, [[]], 1, 7, 0.5, 1e-3, 1e4])
-    elif kind == 1 and type(value) in (int, float):
-        group[key] = value * rng.choice((-1, 0.5, 2, 10, 1e3, 1e-3, 1e-6, 1e6))
-    elif kind == 2 and isinstance(group, list):
-        group.insert(key, value)
-    elif group is not whole:
-        del group[key]
-    return json.dumps(whole[0])
-
-
-@pytest.mark.slow
-def test_an_edited_file_is_refused_or_acts_within_the_ranges(curious: onnx.ModelProto) -> None:
-    rng, acting = random.Random(0), 0
-    entries = {prop.key: prop.value for prop in curious.metadata_props}
-    for _ in range(500):
-        name = rng.choice(list(entries))
-        text = random_edit(rng, entries[name])
-        try:
-            policy = DeployedPolicy(edited(curious, name, text), "a.onnx")
-        except UserError as error:
-            assert "a.onnx is not a policy" in str(error) and "\n" not in str(error), (name, text)
-            continue
-        ranges = [limits or (-math.inf, math.inf) for limits in policy.metadata.joint_ranges]
-        low, high = np.transpose(ranges)
-        for time in (0.0, 0.01, 0.02, 0.05, 0.06):
-            measured = {k: v for k, v in falling(time).items() if k in (*policy.needs, "time")}
-            action = policy.step(measured)
-            targets = policy.servo_targets(action)
-            assert np.all(np.abs(action) <= 1.0), (name, text)
-            assert np.all(np.isfinite(targets) & (low <= targets) & (targets <= high)), (name, text)
-        acting += 1
-    # Some edits only change a number.
-    assert 20 < acting < 400
 
 
 def test_a_network_that_gives_no_number_is_refused(curious: onnx.ModelProto) -> None:
@@ -943,53 +853,6 @@ def test_a_network_that_gives_no_number_is_refused(curious: onnx.ModelProto) -> 
         if array.shape == (6,) and array.dtype == np.float32:
             tensor.CopyFrom(onnx.numpy_helper.from_array(array * np.nan, tensor.name))
     with pytest.raises(UserError, match="a.onnx is not a policy .*not finite"):
-        DeployedPolicy(copy.SerializeToString(), "a.onnx")
-
-
-HOSTILE_MEMORY = {
-    "endless": lambda model: tensor_shape(model, "memory/lowest").add(dim_value=10**9),
-    "huge": lambda model: [
-        tensor_shape(model, name).add(dim_value=10**15)
-        for name in ("memory/lowest", "next/memory/lowest")
-    ],
-    "of any size": lambda model: [
-        tensor_shape(model, name).add(dim_param="M")
-        for name in ("memory/lowest", "next/memory/lowest")
-    ],
-    "of text": lambda model: retype(model, onnx.TensorProto.STRING),
-    "of wide numbers": lambda model: retype(model, onnx.TensorProto.DOUBLE),
-    "without an end": lambda model: model.graph.output.remove(
-        next(o for o in model.graph.output if o.name == "next/memory/lowest")
-    ),
-}
-
-
-def tensor_shape(model: onnx.ModelProto, name: str):
-    """Dimensions of an input or an output."""
-    tensors = (*model.graph.input, *model.graph.output)
-    return next(t for t in tensors if t.name == name).type.tensor_type.shape.dim
-
-
-def retype(model: onnx.ModelProto, kind: int) -> None:
-    """Another type of a memory."""
-    for tensor in (*model.graph.input, *model.graph.output):
-        if tensor.name.endswith("memory/lowest"):
-            tensor.type.tensor_type.elem_type = kind
-
-
-@pytest.mark.parametrize("edit", HOSTILE_MEMORY.values(), ids=HOSTILE_MEMORY)
-def test_a_memory_of_another_size_is_refused(edit, curious: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(curious.SerializeToString())
-    edit(copy)
-    with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):
-        DeployedPolicy(copy.SerializeToString(), "a.onnx")
-
-
-def test_an_unknown_output_is_refused(curious: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(curious.SerializeToString())
-    copy.graph.output.append(onnx.helper.make_empty_tensor_value_info("more"))
-    copy.graph.node.append(onnx.helper.make_node("Identity", ["action"], ["more"]))
-    with pytest.raises(UserError, match="^a.onnx is not a policy .*; give a file"):
         DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 

@@ -5,14 +5,13 @@ have none, and what depends on constants alone is computed here.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
-from bounce_mjx.deploy.places import INDICES, evaluated, source_places
 from bounce_mjx.errors import UserError, needed
 
 EXTRA = "bounce_mjx[export]"
@@ -23,11 +22,18 @@ Value = str | np.ndarray
 
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
 _INLINED |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
-# Operations that only move numbers.
+# Operations that only move numbers, and which of their operands are indices.
 _MOVES = frozenset(
     "broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather pad reshape rev "
     "scatter slice split squeeze stack stop_gradient tile transpose".split()
 )
+_INDICES = {
+    "dynamic_slice": range(1, 9),
+    "dynamic_update_slice": range(2, 9),
+    "gather": range(1, 2),
+    "scatter": range(1, 2),
+    "scatter-add": range(1, 2),
+}
 _TYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 # Operations, the types of operands for which they have a counterpart, and this counterpart: a node,
 # or a function (graph, equation, operands).
@@ -109,6 +115,35 @@ def _axes(equation: JaxprEqn) -> list[int]:
     return [axis + 1 for axis in equation.params["axes"]]
 
 
+def _sources(equation: JaxprEqn, indices: Mapping[int, np.ndarray]) -> tuple[list[np.ndarray], int]:
+    """The operation on the places of its operands' entries.
+
+    Args:
+      indices: the operands that are indices, by their number.
+
+    Returns:
+      For each result, the place of each entry among the entries of all other operands, one after
+      another; a place outside of them is that of an index out of bounds. And the number of those
+      entries.
+    """
+    operands, count = [], 0
+    for i, atom in enumerate(equation.invars):
+        if i in indices:
+            operands.append(indices[i])
+            continue
+        size = math.prod(atom.aval.shape)
+        operands.append(np.arange(count, count + size, dtype=np.int32).reshape(atom.aval.shape))
+        count += size
+    return _evaluated(equation, operands), count
+
+
+def _evaluated(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """The results of an operation on constants, also within a trace."""
+    with jax.ensure_compile_time_eval():
+        results = equation.primitive.bind(*map(jax.numpy.asarray, operands), **equation.params)
+    return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
+
+
 class _Graph:
     def __init__(self, owner: str):
         with needed("onnx", EXTRA):
@@ -137,7 +172,7 @@ class _Graph:
             inner = equation.params[_INLINED[name]]
             return self.run(inner.jaxpr, inner.consts, operands)
         if not any(isinstance(value, str) for value in operands):
-            return evaluated(equation, operands)
+            return _evaluated(equation, operands)
         if name in _MOVES:
             return self._moved(equation, operands)
         types, counterpart = _OPERATIONS.get(name, ("", ""))
@@ -166,7 +201,7 @@ class _Graph:
         """Results that hold the operands' numbers at other places."""
         indices, numbers = {}, []
         for i, (value, atom) in enumerate(zip(operands, equation.invars, strict=True)):
-            if i not in INDICES.get(equation.primitive.name, ()):
+            if i not in _INDICES.get(equation.primitive.name, ()):
                 size = math.prod(atom.aval.shape)
                 numbers += [self._flat(value, size, operands)] if size else []
             elif isinstance(value, str):
@@ -174,7 +209,7 @@ class _Graph:
             else:
                 indices[i] = value
         joined = self.node("Concat", *numbers, axis=1) if len(numbers) > 1 else numbers[0]
-        sources, count = source_places(equation, indices)
+        sources, count = _sources(equation, indices)
         results: list[Value] = []
         for source, atom in zip(sources, equation.outvars, strict=True):
             if not source.size:

@@ -4,10 +4,7 @@ Every entry is JSON under the name of its field in `Metadata`.
 """
 
 import json
-import math
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
-
-from bounce_mjx.deploy.strict import read
+from typing import Any, Literal, NamedTuple
 
 FORMAT = 3
 """Version of the entries; readers refuse other versions."""
@@ -32,11 +29,9 @@ PER_BALL = {
 }
 """Measurements of each ball, and their numbers of entries for one."""
 
-Length = Annotated[float, (-1e3, 1e3)]
-Vector = tuple[Length, Length, Length]
-Limit = Annotated[float, (1e-6, 1e9)]
+Vector = tuple[float, float, float]
 
-# Entries that files may lack: their targets jump, they are of one ball, and its bounds are usual.
+# Entries that older files lack, and the values that these files imply.
 _LATER = {"limits": "null", "num_balls": "1", "ball": '{"distance": 3.0, "speed": 20.0}'}
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
@@ -49,9 +44,9 @@ class Input(NamedTuple):
 
     name: str
     """Name of the quantity; `past_actions` are the network's outputs in the last steps."""
-    history: Annotated[int, (1, 100)]
+    history: int
     """Number of values, the newest first."""
-    size: Annotated[int, (1, 1000)]
+    size: int
     """Number of entries of one value."""
     unit: str
     """Unit of the entries; empty for a pure number."""
@@ -60,22 +55,22 @@ class Input(NamedTuple):
 class Hinge(NamedTuple):
     """A hinge between the world and the paddle, in the frame of the previous hinge."""
 
-    joint: Annotated[int, (0, 1000)]
+    joint: int
     """Index of its joint."""
     position: Vector
     """A point on the axis, m."""
     quaternion: tuple[float, float, float, float]
     """Orientation at the angle `reference`, in the order w, x, y, z."""
-    axis: tuple[float, float, float]
+    axis: Vector
     """Unit vector along the axis."""
-    reference: Annotated[float, (-1e3, 1e3)]
+    reference: float
     """Joint angle of the unturned hinge, rad."""
 
 
 class CommandRange(NamedTuple):
     """A command, which is a measurement for the policy."""
 
-    range: tuple[Length, Length]
+    range: tuple[float, float]
     """Its range in the training."""
     unit: str
     """Unit; empty for a pure number."""
@@ -84,20 +79,20 @@ class CommandRange(NamedTuple):
 class CommandLimits(NamedTuple):
     """The arm's limits of each joint's command."""
 
-    velocity: tuple[Limit, ...]
+    velocity: tuple[float, ...]
     """rad/s."""
-    acceleration: tuple[Limit, ...]
+    acceleration: tuple[float, ...]
     """rad/s^2."""
-    jerk: tuple[Limit, ...] | None
+    jerk: tuple[float, ...] | None
     """rad/s^3; None for no limit."""
 
 
 class BallBounds(NamedTuple):
     """Bounds of a ball that the policy can have seen in its training."""
 
-    distance: Annotated[float, (0.1, 1e3)]
+    distance: float
     """Largest distance from the origin of the robot's frame, m."""
-    speed: Annotated[float, (0.1, 1e3)]
+    speed: float
     """Largest measured speed, m/s."""
 
 
@@ -105,11 +100,11 @@ class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
     format: int
-    steps: Annotated[int, (0, 10**12)]
+    steps: int
     """Number of environment steps in the training."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
-    num_balls: Annotated[int, (1, 3)]
+    num_balls: int
     """Number of balls, each of which is measured."""
     ball: BallBounds
     """Bounds of each ball."""
@@ -121,13 +116,13 @@ class Metadata(NamedTuple):
     """Source of ball_velocity: `measured`, or `differences` of the measured positions."""
     estimator: dict[str, float] | None
     """Constants of that filter; None without one."""
-    control_dt: Annotated[float, (1e-3, 1.0)]
+    control_dt: float
     """Time between two actions, s."""
     action: str
     """Meaning of the output [N, J], in words."""
-    action_scale: Annotated[float, (0.0, 1e3)]
+    action_scale: float
     """Change of the servo target at the action 1, rad."""
-    max_lead: Annotated[float, (0.0, 1e3)] | None
+    max_lead: float | None
     """Largest distance from the measured angle to the last servo target, to which an action adds,
     rad; None if it adds to the measured angle."""
     limits: CommandLimits | None
@@ -153,7 +148,7 @@ class Metadata(NamedTuple):
     """The hinges from the world to the paddle."""
     paddle: Vector
     """Centre of the paddle in the frame of the last hinge, m."""
-    paddle_normal: tuple[float, float, float]
+    paddle_normal: Vector
     """Unit normal of the paddle's upper face in the frame of the last hinge."""
 
 
@@ -167,15 +162,15 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name; without the entries that older files lack, if they
-    are as in these, so that such a file is as new."""
+    """JSON texts of the metadata by field name, without the entries that older files lack and imply
+    alike."""
     plain = _plain(metadata)
     texts = {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
     return {name: text for name, text in texts.items() if _LATER.get(name) != text}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
-    """Metadata from the entries of `to_entries`; ValueError for anything else."""
+    """Metadata from the entries of `to_entries`; ValueError for another format."""
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
@@ -185,12 +180,16 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     missing = [name for name in Metadata._fields if name not in entries]
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
-    kinds = get_type_hints(Metadata, include_extras=True)
-    metadata = Metadata(
-        **{name: read(kind, json.loads(entries[name]), name) for name, kind in kinds.items()}
-    )
-    _check(metadata)
-    return metadata
+    values = {name: _with_tuples(json.loads(entries[name])) for name in Metadata._fields}
+    limits, commands = values["limits"], values["commands"]
+    groups = {
+        "ball": BallBounds(**values["ball"]),
+        "observation": tuple(Input(**part) for part in values["observation"]),
+        "limits": None if limits is None else CommandLimits(**limits),
+        "commands": {name: CommandRange(**command) for name, command in commands.items()},
+        "chain": tuple(Hinge(**hinge) for hinge in values["chain"]),
+    }
+    return Metadata(**values | groups)
 
 
 def _plain(value: Any) -> Any:
@@ -202,38 +201,8 @@ def _plain(value: Any) -> Any:
     return [_plain(inner) for inner in value] if isinstance(value, tuple) else value
 
 
-def _check(metadata: Metadata) -> None:
-    """Raises ValueError if two entries contradict each other."""
-    count = len(metadata.joint_names)
-    for name in (
-        "joint_ranges",
-        "servo_stiffness",
-        "servo_damping",
-        "torque_limits",
-        "default_joint_angles",
-    ):
-        if len(getattr(metadata, name)) != count:
-            raise ValueError(f"its {name} do not have one entry for each of the {count} joints")
-    for name, values in (metadata.limits or CommandLimits((), (), None))._asdict().items():
-        if values and len(values) != count:
-            raise ValueError(
-                f"its {name} limits do not have one entry for each of the {count} joints"
-            )
-    if metadata.limits is not None and metadata.max_lead is None:
-        raise ValueError("its limits have no max_lead")
-    if taken := metadata.commands.keys() & UNITS.keys():
-        raise ValueError(f"its command {min(taken)} has the name of a measurement")
-    if any(limits is not None and limits[0] >= limits[1] for limits in metadata.joint_ranges):
-        raise ValueError("one of its joint_ranges ends below its start")
-    if not metadata.chain or any(link.joint >= count for link in metadata.chain):
-        raise ValueError(f"its chain does not have {count} joints")
-    units = [metadata.paddle_normal]
-    units += [unit for link in metadata.chain for unit in (link.axis, link.quaternion)]
-    if not all(math.isclose(math.hypot(*unit), 1.0, abs_tol=1e-3) for unit in units):
-        raise ValueError(
-            "its chain or its paddle_normal contains a direction whose length is not 1"
-        )
-    if metadata.max_lead is None and any(
-        part.name == "servo_lead" for part in metadata.observation
-    ):
-        raise ValueError("its policy sees servo_lead, but it has no max_lead")
+def _with_tuples(value: Any) -> Any:
+    """A value from JSON with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {name: _with_tuples(inner) for name, inner in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
