@@ -13,7 +13,7 @@ from mujoco import mjx
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
-from bounce_mjx.physics.fused.friction import turning_of
+from bounce_mjx.physics.fused.turning import turning_of
 from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses

@@ -1,5 +1,4 @@
-"""MuJoCo's contacts of a ball with the paddle or another ball: geometry, impedance and the forces
-without friction.
+"""MuJoCo's contacts of a ball with the paddle or another ball: geometry and impedance.
 
 Sources: MuJoCo's documentation, "Computation" (constraint model: impedance, reference
 acceleration, diagonal regulariser), and its collision functions.
@@ -16,9 +15,10 @@ from bounce_mjx.physics.fused.scalars import (
     Mat3,
     Scalar,
     Vec3,
+    cross,
     dot,
     matvec,
-    stored,
+    scale,
     transpose,
     vsub,
 )
@@ -144,80 +144,19 @@ def softness(model: ContactModel, d: jax.Array) -> jax.Array:
     return (1.0 - d) / d * (model.inverse_weights[0] + model.inverse_weights[1])
 
 
-def normal_forces(
-    models: Sequence[ContactModel],
-    contacts: Sequence[Contact],
-    normal_velocities: Sequence[Scalar],
-    matrix: Sequence[Scalar],
-    free_accelerations: Sequence[Scalar],
-) -> tuple[jax.Array, ...]:
-    """Forces (N) along the normals: the exact solution of MuJoCo's constraint problem with one
-    inequality for each contact.
-
-    Args:
-      normal_velocities: relative velocities along the normals, m/s.
-      matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
-      free_accelerations: accelerations along the normals without the contacts, m/s^2.
-    """
-    regularisers, references = [], []
-    for model, contact, velocity in zip(models, contacts, normal_velocities, strict=True):
-        d = impedance(model, contact.distance)
-        references.append(-model.damping * velocity - model.stiffness * d * contact.distance)
-        regularisers.append(softness(model, d))
-    pushes = [a - b for a, b in zip(references, free_accelerations, strict=True)]
-    rows = upper_rows(matrix, len(models))
-    for row, regulariser in zip(rows, regularisers, strict=True):
-        row[0] = row[0] + regulariser
-    if len(models) == 1:
-        forces = nonnegative(rows, pushes)
-    else:
-        touches = [contact.distance < 0.0 for contact in contacts]
-        problem = stored(_with_touching_alone(rows, pushes, touches))
-        forces = stored(nonnegative(*problem))
-    return tuple(
-        jnp.where(contact.distance < 0.0, force, 0.0)
-        for contact, force in zip(contacts, forces, strict=True)
+def tangents(normal: Vec3) -> tuple[Vec3, Vec3]:
+    """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign. The first
+    tangent is y, or z if the normal is close to y, made orthogonal to the normal."""
+    x, y, z = normal
+    from_y = jnp.abs(y) < 0.5
+    along = jnp.where(from_y, y, z)
+    inverse = jax.lax.rsqrt(1.0 - along * along)
+    first = scale(
+        (
+            -x * along,
+            jnp.where(from_y, 1.0, 0.0) - y * along,
+            jnp.where(from_y, 0.0, 1.0) - z * along,
+        ),
+        inverse,
     )
-
-
-def upper_rows(triangle: Sequence[Scalar], size: int) -> list[list[Scalar]]:
-    """Rows of a symmetric matrix from its diagonal on, given one after another."""
-    entries = iter(triangle)
-    return [[next(entries) for _ in range(i, size)] for i in range(size)]
-
-
-def _with_touching_alone(
-    rows: list[list[Scalar]], pushes: list[Scalar], touches: Sequence[jax.Array]
-) -> tuple[list[list[Scalar]], list[Scalar]]:
-    """The problem in which a contact that does not touch has no force and no effect."""
-    masked = [
-        [
-            row[0],
-            *(jnp.where(t & u, x, 0.0) for u, x in zip(touches[i + 1 :], row[1:], strict=True)),
-        ]
-        for i, (t, row) in enumerate(zip(touches, rows, strict=True))
-    ]
-    return masked, [jnp.where(t, x, 0.0) for t, x in zip(touches, pushes, strict=True)]
-
-
-def nonnegative(rows: list[list[Scalar]], push: list[Scalar]) -> list[Scalar]:
-    """Minimum of 1/2 x.Q x - push.x over x >= 0 for a positive definite Q, given by `upper_rows`.
-
-    Without the first entry, the others have their minimum. If the first entry's gradient does not
-    pull it from zero there, this is the solution. Otherwise, the first entry is positive, and its
-    elimination leaves a problem of the others.
-    """
-    (pivot, *row), *rest = rows
-    first, *others = push
-    if not rest:
-        return [jnp.maximum(first / pivot, 0.0)]
-    without = nonnegative(rest, others)
-    ratios = [x / pivot for x in row]
-    left = [
-        [x - ratio * y for x, y in zip(entries, row[i:], strict=True)]
-        for i, (entries, ratio) in enumerate(zip(rest, ratios, strict=True))
-    ]
-    with_first = nonnegative(left, [x - r * first for x, r in zip(others, ratios, strict=True)])
-    pushed = first - dot(row, without) > 0.0
-    solved = [jnp.where(pushed, x, y) for x, y in zip(with_first, without, strict=True)]
-    return [jnp.where(pushed, first / pivot - dot(ratios, with_first), 0.0), *solved]
+    return first, cross(normal, first)

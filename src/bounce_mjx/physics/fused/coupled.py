@@ -1,6 +1,6 @@
 """Forces of several contacts with sliding friction at one instant, as MuJoCo computes them.
 
-In the units of the cones (`friction.py`), the forces x minimise
+In the units of the cones (`pyramid.py`), the forces x minimise
 
     1/2 x.(Q + R) x + x.c    over the product of the pyramidal cones
 
@@ -21,7 +21,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused import chain
-from bounce_mjx.physics.fused.contact import ContactModel, upper_rows
+from bounce_mjx.physics.fused.contact import ContactModel
+from bounce_mjx.physics.fused.pyramid import edge_regulariser
 from bounce_mjx.physics.fused.scalars import (
     Scalar,
     Vec3,
@@ -31,6 +32,7 @@ from bounce_mjx.physics.fused.scalars import (
     mul,
     stored,
     sub,
+    upper_rows,
 )
 
 # Steps, and steps of the line search in each. Of 180,000 problems of three contacts with the
@@ -50,22 +52,12 @@ class Cone(NamedTuple):
     """Regulariser of each edge of the pyramid, 1/kg."""
 
 
-def edge_regulariser(model: ContactModel, regulariser: Scalar) -> Scalar:
-    """Regulariser of the coefficient of a pyramid's edge, 1/kg.
-
-    Args:
-      regulariser: of the normal force without friction, 1/kg.
-    """
-    squared = mul(model.friction[0], model.friction[0])
-    return 2.0 * (mul(squared, 1.0 / model.impratio) * regulariser) * add(1.0, squared)
-
-
 def coupled_forces(
     models: Sequence[ContactModel],
     touching: Sequence[jax.Array],
     matrix: Sequence[Scalar],
     offsets: Sequence[Scalar],
-    regularisers: Sequence[Scalar],
+    softnesses: Sequence[Scalar],
 ) -> tuple[Scalar, ...]:
     """Forces [3 k] of k contacts (N): normal, first and second tangent of each.
 
@@ -73,7 +65,7 @@ def coupled_forces(
       touching: whether each contact exists.
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
-      regularisers: regularisers of the normal forces without friction, 1/kg.
+      softnesses: regularisers of the normal forces without friction, 1/kg.
     """
     units = [unit for model in models for unit in (1.0, *model.friction)]
     size = len(units)
@@ -84,8 +76,8 @@ def coupled_forces(
     ]
     c = list(map(mul, offsets, units))
     cones = [
-        Cone(touches, edge_regulariser(model, regulariser))
-        for model, touches, regulariser in zip(models, touching, regularisers, strict=True)
+        Cone(touches, edge_regulariser(model, softness))
+        for model, touches, softness in zip(models, touching, softnesses, strict=True)
     ]
     q, c = stored((q, c))
 

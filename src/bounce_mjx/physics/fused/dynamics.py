@@ -14,37 +14,23 @@ import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, Moving, drag, servo_target
-from bounce_mjx.physics.fused import chain, friction, joint_friction
-from bounce_mjx.physics.fused.contact import (
-    Contact,
-    ContactModel,
-    normal_forces,
-    relative,
-    shared,
-    side,
-    sphere_box,
-    sphere_sphere,
-)
+from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
+from bounce_mjx.physics.fused.response import contact_response, paddle_origin
 from bounce_mjx.physics.fused.scalars import (
-    ZERO3,
     Quaternion,
     Scalar,
     Vec3,
     add,
     cross,
-    dot,
     is_constant,
-    matmul,
-    matvec,
     mul,
-    neg,
-    quaternion_product,
     scale,
     stored,
     sub,
     vadd,
 )
+from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turn, turned, turning_of
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import BallAddresses
@@ -55,7 +41,7 @@ class Ball(NamedTuple):
 
     position: Vec3
     velocity: Vec3
-    turning: friction.Turning | None
+    turning: Turning | None
     """Spin and orientation; None if the spin is constant and has no effect."""
 
 
@@ -104,7 +90,7 @@ def step(
     turned = [
         (turn(*_orientation_and_spin(at, state), num_substeps * model.dt), None)
         if ball.turning is None
-        else (ball.turning.orientation, friction.spin_in_ball(ball.turning))
+        else (ball.turning.orientation, spin_in_ball(ball.turning))
         for at, ball in zip(addresses.balls, motion.balls, strict=True)
     ]
 
@@ -124,7 +110,7 @@ def _ball(at: BallAddresses, state: PhysicsState, turns: bool) -> Ball:
     return Ball(
         position=tuple(state.qpos[i] for i in at.qpos[:3]),
         velocity=tuple(state.qvel[i] for i in at.qvel[:3]),
-        turning=friction.turning_of(*_orientation_and_spin(at, state)) if turns else None,
+        turning=turning_of(*_orientation_and_spin(at, state)) if turns else None,
     )
 
 
@@ -234,7 +220,7 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
 
     def position(*scalars: Scalar) -> Vec3:
         world = in_world(model, given.unflatten(scalars[n:]))
-        return _paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
+        return paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
 
     return jax.jit(position, inline=True)
 
@@ -255,14 +241,22 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         spring = mul(link.stiffness, sub(q, link.spring_position))
         applied.append(joint_force(servo, force, carried) - link.damping * v - add(b, spring))
         servo_damping.append(derivative)
-    constraint_torque, *accelerations = constraint_response(model, motion, pose, inertia, applied)
+    factor = keep(chain.cholesky(inertia))
+    free = [_free_acceleration(model, i, ball) for i, ball in enumerate(motion.balls)]
+    balls = [
+        (ball.position, ball.velocity, ball.turning and ball.turning.spin) for ball in motion.balls
+    ]
+    response = contact_response(
+        model, pose, factor, motion.v, chain.solve_lower(factor, applied), balls, free, keep
+    )
     return integrate(
         model,
         motion,
         inertia,
         servo_damping,
-        [add(a, c) for a, c in zip(applied, constraint_torque, strict=True)],
-        *accelerations,
+        list(map(add, applied, response.joint_torque)),
+        list(map(vadd, free, response.ball_accelerations)),
+        response.spin_accelerations,
     )
 
 
@@ -293,110 +287,6 @@ def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
     return add(jnp.clip(force, *servo.joint_range), carried)
 
 
-def constraint_response(
-    model: FusedModel,
-    motion: Motion,
-    pose: chain.Pose,
-    inertia: chain.SquareMatrix,
-    applied: list[Scalar],
-) -> tuple[list[Scalar], list[Vec3], list[Vec3]]:
-    """Joint forces from the contacts and dry friction, and of each ball the total acceleration
-    (m/s^2) and the angular acceleration (rad/s^2, world)."""
-    contacts = _contacts(model, motion, pose)
-    free = [_free_acceleration(model, i, ball) for i, ball in enumerate(motion.balls)]
-    if model.contacts[0].friction is None:
-        torque, balls = _normal_response(model, motion, pose, inertia, applied, contacts, free)
-        return torque, balls, [ZERO3] * len(balls)
-    factor = stored(chain.cholesky(inertia))
-    response = friction.contact_response(
-        model,
-        pose,
-        factor,
-        contacts,
-        joint_velocity=motion.v,
-        half_applied=chain.solve_lower(factor, applied),
-        balls=[(ball.position, ball.velocity, ball.turning.spin) for ball in motion.balls],
-        free_accelerations=free,
-    )
-    accelerations = [vadd(a, b) for a, b in zip(free, response.ball_accelerations, strict=True)]
-    return response.joint_torque, accelerations, response.spin_accelerations
-
-
-def _normal_response(
-    model: FusedModel,
-    motion: Motion,
-    pose: chain.Pose,
-    inertia: chain.SquareMatrix,
-    applied: list[Scalar],
-    contacts: Sequence[Contact],
-    free_accelerations: Sequence[Vec3],
-) -> tuple[list[Scalar], list[Vec3]]:
-    """`constraint_response` without sliding friction: joint forces and the balls' accelerations."""
-    pairs = model.contacts
-    jacobians = [
-        _normal_jacobian(model, motion, pose, pair, contact.normal)
-        for pair, contact in zip(pairs, contacts, strict=True)
-    ]
-    factor = _keep(model, motion)(chain.cholesky(inertia))
-    halves = [chain.solve_lower(factor, jacobian) for jacobian in jacobians]
-    half_applied = chain.solve_lower(factor, applied)
-
-    speeds, accelerations, matrix = [], [], []
-    for k, (pair, contact) in enumerate(zip(pairs, contacts, strict=True)):
-        speed = dot(contact.normal, relative(pair, [ball.velocity for ball in motion.balls]))
-        acceleration = dot(contact.normal, relative(pair, free_accelerations))
-        inverse = functools.reduce(add, [1.0 / model.balls[i].mass for i in pair.balls])
-        for j, v, half, half_a in zip(jacobians[k], motion.v, halves[k], half_applied, strict=True):
-            speed = add(speed, mul(j, v))
-            acceleration = add(acceleration, mul(half, half_a))
-            inverse = add(inverse, mul(half, half))
-        speeds.append(speed)
-        accelerations.append(acceleration)
-        matrix.append(inverse)
-        for m in range(k + 1, len(pairs)):
-            by_balls = [sign / model.balls[i].mass for i, sign in shared(pair, pairs[m])]
-            along = dot(contact.normal, contacts[m].normal) if by_balls else 0.0
-            by_arm = dot(halves[k], halves[m])
-            matrix.append(add(by_arm, mul(along, functools.reduce(add, by_balls, 0.0))))
-
-    def contact_forces(matrix: Sequence[Scalar], free: Sequence[Scalar]) -> tuple[jax.Array, ...]:
-        return normal_forces(pairs, contacts, speeds, matrix, free)
-
-    forces, dry_friction = joint_friction.contact_and_friction(
-        model.links,
-        factor,
-        motion.v,
-        half_applied,
-        halves,
-        tuple(matrix),
-        tuple(accelerations),
-        contact_forces,
-    )
-    balls = list(free_accelerations)
-    for pair, contact, force in zip(pairs, contacts, forces, strict=True):
-        for i in pair.balls:
-            push = mul(force, side(pair, i)) / model.balls[i].mass
-            balls[i] = vadd(balls[i], scale(contact.normal, push))
-    columns = zip(*jacobians, strict=True)
-    return [add(dot(c, forces), f) for c, f in zip(columns, dry_friction, strict=True)], balls
-
-
-def _contacts(model: FusedModel, motion: Motion, pose: chain.Pose) -> list[Contact]:
-    """Geometry of each of `FusedModel.contacts`."""
-    origin = _paddle_origin(model, pose)
-    rotation = matmul(pose.world_rotation[-1], model.paddle_rotation)
-    contacts = []
-    for pair in model.contacts:
-        centres = [motion.balls[i].position for i in pair.balls]
-        radii = [model.balls[i].radius for i in pair.balls]
-        contacts.append(
-            sphere_box(*radii, *centres, model.paddle_half_size, origin, rotation)
-            if len(pair.balls) == 1
-            else sphere_sphere(*radii, *centres)
-        )
-    return contacts
-
-
 def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec3:
     """Acceleration of a ball without contacts, m/s^2."""
     free = scale(model.gravity, model.balls[index].weight)
@@ -405,17 +295,6 @@ def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec3:
     if not is_constant(model.air_lift):
         free = vadd(free, scale(cross(ball.turning.spin, ball.velocity), model.air_lift))
     return free
-
-
-def _normal_jacobian(
-    model: FusedModel, motion: Motion, pose: chain.Pose, pair: ContactModel, normal: Vec3
-) -> list[Scalar]:
-    """Relative velocity along the normal of a contact, per unit velocity of each joint."""
-    if len(pair.balls) == 2:
-        return [0.0] * len(model.links)
-    # A force along the normal has the same torque at the contact point and at the ball's centre.
-    centre = motion.balls[pair.balls[0]].position
-    return [neg(entry) for entry in chain.point_jacobian(model.links, pose, centre, normal)]
 
 
 def integrate(
@@ -451,23 +330,8 @@ def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -
     position = vadd(ball.position, scale(velocity, dt))
     turning = ball.turning
     if turning is not None:
-        turning = friction.turned(turning, spin_acceleration, dt)
+        turning = turned(turning, spin_acceleration, dt)
     return Ball(position, velocity, turning)
-
-
-def turn(quaternion: Quaternion, spin: Vec3, duration: float) -> Quaternion:
-    """Quaternion [w, x, y, z] after turning at a constant spin (rad/s, body frame): the axis-angle
-    product of MuJoCo's mju_quatIntegrate."""
-    w, x, y, z = quaternion
-    inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
-    unit = tuple(c * inverse_norm for c in quaternion)
-    squared_speed = dot(spin, spin)
-    still = squared_speed == 0.0
-    speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
-    half_angle = 0.5 * duration * speed
-    sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
-    cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
-    return quaternion_product(unit, (cosine, *scale(spin, sine)))
 
 
 def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
@@ -476,7 +340,3 @@ def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
         map(joint_friction.has_friction, model.links)
     )
     return stored if frictional else lambda values: values
-
-
-def _paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:
-    return vadd(pose.world_origin[-1], matvec(pose.world_rotation[-1], model.paddle_origin))

@@ -211,6 +211,12 @@ def polynomial(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
     return value
 
 
+def upper_rows(triangle: Sequence[Scalar], size: int) -> list[list[Scalar]]:
+    """Rows of a symmetric matrix from its diagonal on, given one after another."""
+    entries = iter(triangle)
+    return [[next(entries) for _ in range(i, size)] for i in range(size)]
+
+
 def stored(values: Tree) -> Tree:
     """The same scalars, each computed only once.
 

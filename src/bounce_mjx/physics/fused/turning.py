@@ -1,0 +1,70 @@
+"""Spin and orientation of a ball."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from bounce_mjx.physics.fused.scalars import (
+    Quaternion,
+    Vec3,
+    dot,
+    matvec,
+    quaternion_matrix,
+    quaternion_product,
+    scale,
+    sine_cosine,
+    transpose,
+    vadd,
+)
+
+
+class Turning(NamedTuple):
+    """Spin and orientation of the ball."""
+
+    spin: Vec3
+    """Angular velocity in the world, rad/s. Without a torque it is constant for a sphere, both in
+    the world and in the ball's frame."""
+    orientation: Quaternion
+    """Unit quaternion w, x, y, z."""
+
+
+def turning_of(quaternion: Quaternion, spin: Vec3) -> Turning:
+    """Spin in the world and normalised orientation from MuJoCo's coordinates."""
+    orientation = _normalised(quaternion)
+    return Turning(matvec(quaternion_matrix(orientation), spin), orientation)
+
+
+def spin_in_ball(turning: Turning) -> Vec3:
+    """Spin in the ball's frame, MuJoCo's coordinates."""
+    matrix = quaternion_matrix(turning.orientation)
+    return matvec(transpose(matrix), turning.spin)
+
+
+def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
+    """Spin and orientation one step later; the new spin turns the orientation."""
+    spin = vadd(turning.spin, scale(acceleration, dt))
+    squared = dot(spin, spin)
+    still = squared < float(jnp.finfo(squared.dtype).tiny)
+    inverse_speed = lax.rsqrt(jnp.where(still, 1.0, squared))
+    sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
+    rotation = (cosine, *scale(spin, sine * inverse_speed))
+    return Turning(spin, quaternion_product(rotation, turning.orientation))
+
+
+def turn(quaternion: Quaternion, spin: Vec3, duration: float) -> Quaternion:
+    """Quaternion [w, x, y, z] after turning at a constant spin (rad/s, body frame): the axis-angle
+    product of MuJoCo's mju_quatIntegrate."""
+    squared_speed = dot(spin, spin)
+    still = squared_speed == 0.0
+    speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
+    half_angle = 0.5 * duration * speed
+    sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
+    cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
+    return quaternion_product(_normalised(quaternion), (cosine, *scale(spin, sine)))
+
+
+def _normalised(quaternion: Quaternion) -> Quaternion:
+    w, x, y, z = quaternion
+    inverse_norm = lax.rsqrt(w * w + x * x + y * y + z * z)
+    return w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
