@@ -15,10 +15,10 @@ from bounce_mjx.physics import (
     PhysicsParameters,
     PhysicsState,
     edited_model,
-    fused,
     make_engine,
     servo_targets,
 )
+from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.world.randomization import RandomizationConfig
 from random_worlds import random_parameters
@@ -109,7 +109,7 @@ def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
 def test_one_step_of_several_balls_is_mujocos(num_balls, friction, record_property):
     """From states with one to all contacts at once."""
     model = balls_model(num_balls, friction)
-    assert fused.unsupported_feature(model) is None
+    assert unsupported_feature(model, "fused") is None
     count = 1000
     states = hostile_states(model, count, seed=0)
     pressed = num_pressed(model, states)

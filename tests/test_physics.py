@@ -22,6 +22,7 @@ from bounce_mjx.physics import (
     mjx_engine,
 )
 from bounce_mjx.physics.fused import chain, scalars
+from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import Addresses, find_addresses
 
@@ -586,7 +587,7 @@ def test_unsupported_models_are_refused(name):
     """The error names the feature and a remedy; it never advises an engine without the feature."""
     old, new, feature = UNSUPPORTED[name]
     model = edited(old, new)
-    found = fused.unsupported_feature(model)
+    found = unsupported_feature(model, "fused")
     assert feature in found
     with pytest.raises(UserError) as error:
         make_engine(model, "fused")

@@ -20,7 +20,7 @@ from bounce_mjx.commands import view as view_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.physics import fused
+from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
@@ -541,7 +541,7 @@ def test_a_base_and_a_marker_that_are_moved_from_outside(tmp_path) -> None:
     changes = "\n".join(found.arm.changes)
     assert "fixed the base base" in changes and "loose objects marker" in changes
     model = compile_spec(found.arm.spec, tmp_path)
-    assert fused.unsupported_feature(model) is None and model.neq == 0
+    assert unsupported_feature(model, "fused") is None and model.neq == 0
 
 
 def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import re
 from typing import NamedTuple
 
 import jax
@@ -18,12 +17,6 @@ from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
-_INTEGRATORS = (
-    mujoco.mjtIntegrator.mjINT_EULER,
-    mujoco.mjtIntegrator.mjINT_RK4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-)
-
 
 class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
@@ -37,7 +30,7 @@ class MjxModel(NamedTuple):
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
-    """Constants of a compiled model that has no `unsupported_feature`."""
+    """Constants of a compiled model that the engine supports (`support.py`)."""
     return MjxModel(
         mjx.put_model(mj_model),
         mjx.put_model(_with_frictional_pair(mj_model)),
@@ -53,92 +46,6 @@ def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
         fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
         model.pair_dim[:] = fields["pair_dim"]
     return model
-
-
-def unsupported_feature(mj_model: mujoco.MjModel) -> str | None:
-    """Name of a feature of the model that MJX does not simulate; None if it simulates them all.
-
-    MJX itself refuses some features and silently ignores others; this function checks both.
-    """
-    m = mj_model
-    integrator = mujoco.mjtIntegrator(m.opt.integrator)
-    ignored = {
-        f"the integrator {integrator.name.removeprefix('mjINT_').lower()} "
-        "(only Euler, RK4 and implicitfast)": integrator not in _INTEGRATORS,
-        "disabled actuators (actuatorgroupdisable)": m.opt.disableactuator != 0,
-        "limits of a servo whose gain depends on its state (gaintype affine)": (
-            integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and _has_limited_affine_gain(m)
-        ),
-        "plugins": m.nplugin > 0,
-        "flexes (flex, flexcomp)": m.nflex > 0,
-        "delayed actuators (delay)": np.any(m.actuator_delay),
-        "early activations (actearly)": np.any(m.actuator_actearly),
-        "damping or armature given to an actuator": (
-            np.any(m.actuator_damping)
-            or np.any(m.actuator_dampingpoly)
-            or np.any(m.actuator_armature)
-        ),
-        "nonlinear springs (stiffness with several numbers)": (
-            np.any(m.jnt_stiffnesspoly) or np.any(m.tendon_stiffnesspoly)
-        ),
-        "nonlinear damping (damping with several numbers)": (
-            np.any(m.dof_dampingpoly) or np.any(m.tendon_dampingpoly)
-        ),
-        "springs, damping or gravity compensation with the flag spring or damper disabled": (
-            _loses_passive_forces(m)
-        ),
-        "a solref with exactly one positive number": np.any(
-            np.sum(_all_constraints(m, "ref") > 0.0, axis=1) == 1
-        ),
-        "a solimp without a width": np.any(_all_constraints(m, "imp")[:, 2] <= mujoco.mjMINVAL),
-        "adhesion": np.any(m.pair_adhesion) or np.any(m.geom_adhesion),
-        "surface velocities (surfacevel)": np.any(m.geom_surfacevel),
-        "sleeping bodies (sleep)": m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
-        "the noslip solver (noslip_iterations)": m.opt.noslip_iterations > 0,
-    }
-    for feature, present in ignored.items():
-        if present:
-            return feature
-    try:
-        mjx.put_model(mj_model)
-    except NotImplementedError as error:
-        return f"a feature of the MJCF ({_in_words(str(error))})"
-    return None
-
-
-def _loses_passive_forces(m: mujoco.MjModel) -> bool:
-    """Whether MJX leaves out a force: with one of the two flags disabled, it has no passive force
-    at all."""
-    springs, dampers = (
-        not m.opt.disableflags & flag
-        for flag in (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
-    )
-    kept = (m.jnt_stiffness, m.tendon_stiffness) if springs else (m.dof_damping, m.tendon_damping)
-    return springs != dampers and bool(m.ngravcomp or any(map(np.any, kept)))
-
-
-def _all_constraints(m: mujoco.MjModel, kind: str) -> np.ndarray:
-    """`solref` or `solimp` (the kind "ref" or "imp") of everything that has one."""
-    owners = ("pair_{}", "geom_{}", "jnt_{}", "dof_{}", "eq_{}", "tendon_{}_lim", "tendon_{}_fri")
-    return np.concatenate([getattr(m, owner.format(f"sol{kind}")) for owner in owners])
-
-
-def _in_words(message: str) -> str:
-    """MJX's message without its enumerations: "(mjtGeom.mjGEOM_BOX, ...)" becomes "box, ..."."""
-    named = re.sub(r"mjt\w+\.mj[A-Z]+_(\w+)(: \d+)?", lambda match: match[1].lower(), message)
-    return re.sub(r"[][()<>]", "", named).rstrip(".")
-
-
-def _has_limited_affine_gain(m: mujoco.MjModel) -> bool:
-    """Whether a servo's gain depends on its state, and a limit acts on it.
-
-    MuJoCo's C engine differentiates such a force at the clipped input, and a saturated one not at
-    all; MJX's implicitfast integrator does neither.
-    """
-    affine = m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
-    by_velocity = affine & (m.actuator_gainprm[:, 2] != 0.0)
-    limited_input = by_velocity & m.actuator_ctrllimited.astype(bool)
-    return bool(np.any(limited_input | (affine & m.actuator_forcelimited.astype(bool))))
 
 
 def step(

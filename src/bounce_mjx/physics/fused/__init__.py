@@ -2,19 +2,16 @@
 
 The supported kind: a serial chain of hinges with position servos, one to three free balls, contact
 pairs of each ball (a sphere) with the paddle (a box) and of the balls with each other, with or
-without sliding friction, and the implicitfast integrator. `unsupported_feature` names what a
+without sliding friction, and the implicitfast integrator. `physics/support.py` names what a
 compiled `mujoco.MjModel` has beyond that; `read_model` reads the constants of one without.
 """
 
 from bounce_mjx.physics.fused.dynamics import paddle_position, step
 from bounce_mjx.physics.fused.model import FusedModel, read_model
-from bounce_mjx.physics.fused.support import is_elliptic, unsupported_feature
 
 __all__ = [
     "FusedModel",
-    "is_elliptic",
     "paddle_position",
     "read_model",
     "step",
-    "unsupported_feature",
 ]

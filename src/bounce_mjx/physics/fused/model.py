@@ -113,7 +113,7 @@ class FusedModel:
 
 
 def read_model(mj_model: mujoco.MjModel) -> FusedModel:
-    """Constants of a compiled model that has no `unsupported_feature`."""
+    """Constants of a compiled model that the engine supports (`physics/support.py`)."""
     m, addresses = mj_model, find_addresses(mj_model)
     links, frames = _read_links(m, addresses)
     compensated = _compensated_share(m, addresses)
