@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.physics.parameters import direct_solref, link_masses
+from bounce_mjx.physics.edited import direct_solref, link_masses
 from bounce_mjx.robot.model import find_addresses
 
 

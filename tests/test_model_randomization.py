@@ -1,6 +1,4 @@
-"""`adapters/randomization.py`: a randomised MuJoCo model as parameters of the physics."""
-
-import copy
+"""`adapters/randomization.py`: a randomised MuJoCo model as entries of the physics."""
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +7,13 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from bounce_mjx.adapters.randomization import domain_randomize, mixed_solref, parameters_of
+from bounce_mjx.adapters.randomization import domain_randomize, parameters_of
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, edited_model
+from bounce_mjx.physics import Control, PhysicsState, make_engine
+from bounce_mjx.physics.edited import edited_model
+from bounce_mjx.physics.parameters import PhysicsParameters
 from random_worlds import random_parameters
+from test_friction import assert_same_step, c_steps, converged, fused_steps, touching_states
 
 BATCH = 3
 
@@ -31,10 +32,23 @@ def batch_of(base: mjx.Model, **fields: np.ndarray) -> tuple[mjx.Model, mjx.Mode
 
 
 def read(mj_model: mujoco.MjModel, base: mjx.Model, **fields: np.ndarray) -> PhysicsParameters:
+    """The parameters of a batch, which the fused engine must accept."""
     model, axes = batch_of(base, **fields)
-    return jax.jit(
-        lambda: jax.vmap(lambda one: parameters_of(mj_model, base, one), in_axes=(axes,))(model)
-    )()
+    engine = make_engine(mj_model, "fused")
+    start = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
+
+    def of_one(one: mjx.Model) -> PhysicsParameters:
+        parameters = parameters_of(mj_model, base, one)
+        jax.eval_shape(
+            lambda p: engine.step(p, start, Control(jnp.zeros(mj_model.nu)), 1), parameters
+        )
+        return parameters
+
+    return jax.jit(lambda: jax.vmap(of_one, in_axes=(axes,))(model))()
+
+
+def one_of(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
+    return jax.tree.map(lambda x: np.asarray(x)[i], parameters)
 
 
 def scaled(array: np.ndarray) -> np.ndarray:
@@ -42,152 +56,142 @@ def scaled(array: np.ndarray) -> np.ndarray:
     return np.stack([array * factor for factor in (1.0, 1.1, 0.9)])
 
 
-FIELDS = {
-    "ball_mass": ["body_mass", "body_inertia", "body_invweight0", "dof_M0", "body_subtreemass"],
-    "ball_radius": ["geom_size", "geom_rbound", "geom_aabb", "body_inertia"],
-    "contact_stiffness": ["pair_solref"],
-    "contact_damping": ["pair_solref"],
-    "contact_friction": ["pair_friction"],
-    "servo_gain": ["actuator_gainprm", "actuator_biasprm"],
-    "servo_damping": ["actuator_biasprm"],
-    "force_limit": ["actuator_forcerange"],
-    "armature": ["dof_armature"],
-    "damping": ["dof_damping"],
-    "frictionloss": ["dof_frictionloss"],
-    "link_mass": ["body_mass", "body_inertia"],
-    "paddle_position": ["geom_pos"],
-    "paddle_rotation": ["geom_quat"],
-    "gravity": ["opt.gravity"],
-}
-
-
-def test_every_parameter_has_a_field():
-    assert set(FIELDS) == set(PhysicsParameters._fields)
-
-
-def test_parameters_are_read_back_from_edited_models(mj_model, base):
-    """The models of `edited_model`, which is the reference of every engine, give back the
-    parameters with which they were made, one parameter at a time and all together."""
-    drawn = random_parameters(mj_model, BATCH, seed=1)
-    drawn = drawn._replace(
-        contact_friction=np.array([0.1, 0.2, 0.3]),
-        frictionloss=np.full((BATCH, 6), 0.5),
-        force_limit=np.full((BATCH, 6), 30.0),
-    )
-    cases = [(name,) for name in FIELDS] + [tuple(FIELDS)]
-    for names in cases:
-        given = PhysicsParameters(**{name: getattr(drawn, name) for name in names})
-        models = [
-            edited_model(mj_model, jax.tree.map(lambda x, i=i: np.asarray(x)[i], given))
-            for i in range(BATCH)
-        ]
-        fields = {
-            field: np.stack([_field(model, field) for model in models])
-            for name in names
-            for field in FIELDS[name]
-        }
-        result = read(mj_model, base, **fields)
-        for name in names:
-            np.testing.assert_allclose(
-                getattr(result, name), getattr(given, name), rtol=1e-4, err_msg=name
-            )
-        if names != tuple(FIELDS) and names[0] not in ("contact_stiffness", "contact_damping"):
-            assert {n for n, x in result._asdict().items() if x is not None} == set(names)
-
-
-def _field(model: mujoco.MjModel, name: str) -> np.ndarray:
+def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
     owner, _, field = name.rpartition(".")
     return np.array(getattr(getattr(model, owner) if owner else model, field))
 
 
+FIELDS = (
+    "body_mass body_inertia body_invweight0 body_subtreemass dof_M0 geom_size geom_rbound "
+    "geom_aabb pair_solref pair_friction actuator_gainprm actuator_biasprm actuator_forcerange dof_armature "
+    "dof_damping dof_frictionloss geom_pos geom_quat opt.gravity"
+).split()
+
+
+def test_models_of_parameters_are_read_back(mj_model, base):
+    """The numbers of `edited_model`, given as a randomised model, give the same model again, one
+    parameter at a time and all together."""
+    drawn = random_parameters(mj_model, BATCH, seed=1)._replace(
+        contact_friction=np.array([0.1, 0.2, 0.3]),
+        frictionloss=np.full((BATCH, 6), 0.5),
+        force_limit=np.full((BATCH, 6), 30.0),
+    )
+    names = [name for name in PhysicsParameters._fields if name != "entries"]
+    for given in (*((name,) for name in names), names):
+        parameters = PhysicsParameters(**{name: getattr(drawn, name) for name in given})
+        models = [edited_model(mj_model, one_of(parameters, i)) for i in range(BATCH)]
+        fields = {name: np.stack([field_of(model, name) for model in models]) for name in FIELDS}
+        result = read(mj_model, base, **fields)
+        for i, model in enumerate(models):
+            again = edited_model(mj_model, one_of(result, i))
+            for name in (*FIELDS, "pair_dim", "actuator_forcelimited"):
+                np.testing.assert_allclose(
+                    field_of(again, name), field_of(model, name), 1e-5, 1e-12, err_msg=name
+                )
+
+
+@pytest.mark.usefixtures("float64")
+def test_entries_act_as_in_mujoco(mj_model):
+    """Random changes of every field that the fused engine reads, in one step against C."""
+    count, rng = 48, np.random.default_rng(0)
+    links, ball, paddle = range(2, 7), mj_model.body("ball_link").id, mj_model.geom("blocker").id
+    changed = {f"body_mass[{body}]": mj_model.body_mass[body] for body in (*links, ball)}
+    changed |= {
+        f"body_inertia[{links[2]}, {i}]": mj_model.body_inertia[links[2], i] for i in (0, 1)
+    }
+    changed |= {f"body_pos[{body}, {i}]": 0.1 for body in links for i in range(3)}
+    changed |= {f"body_invweight0[{ball}, 0]": mj_model.body_invweight0[ball, 0]}
+    changed |= {f"geom_size[{mj_model.geom('ball').id}, 0]": 0.019}
+    changed |= {f"geom_size[{paddle}, {i}]": mj_model.geom_size[paddle, i] for i in range(3)}
+    changed |= {f"geom_pos[{paddle}, {i}]": 0.02 for i in range(3)}
+    changed |= {f"pair_solref[0, {i}]": x for i, x in enumerate((0.01, 0.3))}
+    changed |= {f"pair_friction[0, {i}]": x for i, x in enumerate((0.2, 0.5))}
+    changed |= {f"opt.gravity[{i}]": x for i, x in enumerate((1.0, -1.0, -9.0))}
+    for joint in range(6):
+        changed |= {f"dof_damping[{joint}]": 3.0, f"dof_armature[{joint}]": 0.1}
+        changed |= {f"jnt_stiffness[{joint}]": 40.0, f"qpos_spring[{joint}]": 0.3}
+        changed |= {f"qpos0[{joint}]": 0.1, f"actuator_gainprm[{joint}, 0]": 2e4}
+        changed |= {f"actuator_biasprm[{joint}, {i}]": x for i, x in enumerate((5.0, -1e4, -90.0))}
+        changed |= {f"actuator_forcerange[{joint}, {i}]": x for i, x in enumerate((-90.0, 200.0))}
+    changed |= {"dof_frictionloss[1]": 20.0}
+    entries = {name: own * rng.uniform(0.7, 1.3, count) for name, own in changed.items()}
+    parameters = PhysicsParameters(entries=entries)
+    states = touching_states(mj_model, count, seed=4)
+    models = []
+    for i in range(count):
+        models.append(converged(edited_model(mj_model, one_of(parameters, i))))
+        for name, values in entries.items():
+            field, _, index = name[:-1].partition("[")
+            place = tuple(map(int, index.split(",")))
+            assert field_of(models[i], field)[place] == values[i]
+    expected, _ = c_steps(models, states)
+    assert_same_step(fused_steps(mj_model, parameters, states), expected)
+
+
 def test_friction_of_the_geoms_is_that_of_their_contact(mj_model, base):
-    """A contact has the larger friction of its two geoms."""
+    """A contact has the larger friction of its two geoms; that of the other geoms, which do not
+    collide, has no effect, as without a pair."""
     friction = np.array([base.geom_friction] * BATCH)
     friction[:, :, 0] = np.array([0.0, 0.3, 0.5])[:, None]
     friction[2, mj_model.geom("blocker").id, 0] = 0.2
     result = read(mj_model, base, geom_friction=friction)
-    np.testing.assert_allclose(result.contact_friction, [0.0, 0.3, 0.5])
-
-
-@pytest.mark.parametrize("second", [(0.004, 0.5), (-9e4, -25.0)], ids=["standard", "direct"])
-def test_solref_of_the_geoms_is_that_of_their_contact(second):
-    """MuJoCo's own contact of two geoms without a pair is the reference."""
-    xml = """
-      <mujoco><worldbody>
-        <geom name="a" size="0.1" solref="0.006 0.8" solmix="2"/>
-        <body pos="0.1 0 0"><freejoint/><geom name="b" size="0.1" solref="{} {}"/></body>
-      </worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml.format(*second))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    mixed = mixed_solref(model, (0, 1), *jnp.asarray(model.geom_solref))
-    np.testing.assert_allclose(mixed, data.contact.solref[0], rtol=1e-6)
-
-
-def test_standard_solref_becomes_direct(mj_model, base):
-    solref = (
-        np.tile(np.array([0.003, 0.1]), (BATCH, 1, 1)) * np.array([1.0, 1.1, 1.2])[:, None, None]
+    models = [edited_model(mj_model, one_of(result, i)) for i in range(BATCH)]
+    np.testing.assert_allclose(
+        [m.pair_friction[0, :2] for m in models], [[x] * 2 for x in (0.0, 0.3, 0.5)]
     )
-    result = read(mj_model, base, pair_solref=solref)
-    for i in range(BATCH):
-        model = copy.copy(mj_model)
-        model.pair_solref[:] = solref[i]
-        np.testing.assert_allclose(
-            (result.contact_stiffness[i], result.contact_damping[i]),
-            direct_solref(model),
-            rtol=1e-5,
-        )
+    assert all(model.pair_dim[0] == 3 for model in models)
 
 
 def test_equal_values_change_nothing(mj_model, base):
     """A function that only gives every field a batch axis is not a randomisation."""
-    fields = {name: np.stack([getattr(base, name)] * 2) for name in ("qpos0", "body_mass")}
+    fields = {
+        name: np.stack([getattr(base, name)] * 2)
+        for name in ("qpos0", "body_mass", "dof_frictionloss")
+    }
     assert read(mj_model, base, **fields) == PhysicsParameters()
 
 
+def test_dry_friction_acts_where_it_differs(mj_model, base):
+    """The other joints have none, and their program none of its solver."""
+    loss = np.zeros((2, mj_model.nv))
+    loss[1, 2] = 0.5
+    assert set(read(mj_model, base, dof_frictionloss=loss).entries) == {"dof_frictionloss[2]"}
+
+
 REFUSED = {
-    "qpos0": ("qpos0", ("qpos0, which this physics cannot vary", "leave it out")),
-    "floor": ("geom_size", (r"geom_size\[\d+, 0\]",)),
-    "gain without bias": ("actuator_gainprm", (r"actuator_biasprm\[0, 1\]",)),
-    "inertia without mass": ("body_inertia", (r"body_inertia\[1, 0\]",)),
-    "colour": ("geom_rgba", ("geom_rgba",)),
+    "axis": ("jnt_axis", r"jnt_axis\[0, 2\]"),
+    "floor": ("geom_size", r"geom_size\[\d+, 0\]"),
+    "ball": ("dof_damping", r"dof_damping\[6\]"),
+    "inertia of the ball": ("body_inertia", r"body_inertia\[7, 0\]"),
+    "bound": ("geom_rbound", "geom_rbound"),
+    "solref of geoms": ("geom_solref", "geom_solref"),
+    "colour": ("geom_rgba", "geom_rgba"),
 }
 
 
-@pytest.mark.parametrize("field, words", REFUSED.values(), ids=REFUSED)
-def test_changes_without_a_parameter_are_refused_by_name(field, words, mj_model, base):
+@pytest.mark.parametrize("field, word", REFUSED.values(), ids=REFUSED)
+def test_changes_without_an_effect_are_refused_by_name(field, word, mj_model, base):
     one = np.asarray(getattr(base, field))
-    changed = np.stack([one, 1.1 * one + (0.1 if field == "qpos0" else 0.0)])
-    with pytest.raises(UserError) as refused:
-        read(mj_model, base, **{field: changed})
-    for word in words:
-        assert refused.match(word)
-
-
-def test_damping_of_the_ball_is_refused(mj_model, base):
-    damping = np.stack([np.asarray(base.dof_damping) + added for added in (0.0, 1.0)])
-    with pytest.raises(UserError, match=r"dof_damping\[6\]"):
-        read(mj_model, base, dof_damping=damping)
-    damping[:, 6:] = 0.0
-    np.testing.assert_array_equal(read(mj_model, base, dof_damping=damping).damping[1], 1.0)
+    with pytest.raises(UserError, match=word):
+        read(mj_model, base, **{field: np.stack([one, 1.1 * one + 0.1 * (field == "dof_damping")])})
 
 
 def test_friction_of_the_floor_is_refused(mj_model, base):
     """Only the paddle touches the ball, so another geom's friction would change nothing."""
     friction = np.stack([base.geom_friction] * 2)
     friction[1, mj_model.geom("floor").id, 0] = 1.0
-    with pytest.raises(UserError, match="geom_friction, .* no effect"):
+    with pytest.raises(UserError, match="geom_friction"):
         read(mj_model, base, geom_friction=friction)
 
 
-def test_friction_of_geoms_and_of_the_pair_exclude_each_other(mj_model, base):
-    with pytest.raises(UserError, match="geom_friction and pair_friction"):
-        read(
-            mj_model,
-            base,
-            geom_friction=scaled(np.asarray(base.geom_friction) + 0.1),
-            pair_friction=scaled(np.asarray(base.pair_friction) + 0.1),
-        )
+def test_an_entry_of_no_model_is_refused(mj_model):
+    engine = make_engine(mj_model, "fused")
+    start = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
+    for name in ("dof_dampng[2]", "dof_damping[99]", "dof_damping", "geom_size[1]"):
+        with pytest.raises(UserError, match="no entry of an MjModel"):
+            engine.step(
+                PhysicsParameters(entries={name: 1.0}), start, Control(jnp.zeros(mj_model.nu)), 1
+            )
 
 
 def test_values_that_are_traced_are_refused(mj_model, base):
@@ -200,6 +204,11 @@ def test_values_that_are_traced_are_refused(mj_model, base):
 def test_the_projects_randomiser_draws_within_its_ranges(mj_model, base):
     model, axes = domain_randomize(mj_model, base, jax.random.split(jax.random.PRNGKey(0), 32))
     result = jax.vmap(lambda one: parameters_of(mj_model, base, one), in_axes=(axes,))(model)
-    share = np.asarray(result.ball_mass) / mj_model.body("ball_link").mass
+    ball = mj_model.body("ball_link")
+    share = np.asarray(result.entries[f"body_mass[{ball.id}]"]) / ball.mass
     assert 0.7 <= share.min() < 0.8 and 1.2 < share.max() <= 1.3
-    assert result.link_mass is None and result.contact_damping is not None
+    fields = {name.partition("[")[0] for name in result.entries}
+    assert fields == {
+        *("body_mass", "geom_size", "pair_solref", "opt.gravity"),
+        *("actuator_gainprm", "actuator_biasprm"),
+    }

@@ -20,8 +20,9 @@ from bounce_mjx.physics import (
     fused,
     make_engine,
     mjx_engine,
+    scalars,
 )
-from bounce_mjx.physics.fused import chain, scalars
+from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import Addresses, find_addresses

@@ -21,7 +21,7 @@ from bounce_mjx.physics import (
     edited_model,
     servo_targets,
 )
-from bounce_mjx.physics.parameters import contact_pairs
+from bounce_mjx.physics.edited import contact_pairs
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges

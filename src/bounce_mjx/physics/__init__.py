@@ -1,8 +1,9 @@
 """Physics engines behind one interface: `fused` (straight-line arithmetic) and `mjx`."""
 
 from bounce_mjx.physics.control import Control, servo_targets
+from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.engine import Engine, make_engine
-from bounce_mjx.physics.parameters import PhysicsParameters, edited_model
+from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 
 __all__ = [

@@ -12,8 +12,10 @@ from mujoco import mjx
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
+from bounce_mjx.physics.edited import MIN_FRICTION, edited, edited_model
 from bounce_mjx.physics.fused.turning import turning_of
-from bounce_mjx.physics.parameters import PhysicsParameters, edited_fields
+from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
@@ -41,11 +43,9 @@ def read_model(mj_model: mujoco.MjModel) -> MjxModel:
 
 def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     """Copy of the model with sliding friction in the contact pairs of ball and paddle, if any."""
-    model = copy.copy(mj_model)
     with contextlib.suppress(UserError):
-        fields, _ = edited_fields(model, PhysicsParameters(contact_friction=np.zeros(())))
-        model.pair_dim[:] = fields["pair_dim"]
-    return model
+        return edited_model(mj_model, PhysicsParameters(contact_friction=np.zeros(())))
+    return mj_model
 
 
 def step(
@@ -146,14 +146,14 @@ def paddle_position(
 
 def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     """Model with the parameters of one environment."""
-    numbers = jax.tree.map(jnp.asarray, parameters)
-    fields, options = edited_fields(constants.mj_model, numbers)
-    replaced = fields | {f"opt.{name}": value for name, value in options.items()}
+    numbers = scalars_of(parameters, jnp.result_type(float))
+    m = edited(constants.mj_model, numbers, constants.addresses).derive()
     # MJX transforms every geom, even one flagged as sharing its body's frame.
-    replaced.pop("geom_sameframe", None)
-    replaced.pop("pair_dim", None)
-    model = constants.model if parameters.contact_friction is None else constants.frictional
-    return model.tree_replace(replaced)
+    fields = {x: m.array(x) for x in m.fields if x not in ("geom_sameframe", "pair_dim")}
+    if "pair_friction" in fields:
+        fields["pair_friction"] = jnp.maximum(fields["pair_friction"], MIN_FRICTION)
+    model = constants.frictional if "pair_dim" in m.fields else constants.model
+    return model.tree_replace(fields)
 
 
 def _full_precision() -> contextlib.AbstractContextManager:

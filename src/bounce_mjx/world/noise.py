@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.fused.scalars import sine_cosine
+from bounce_mjx.physics.scalars import sine_cosine
 
 
 class Stream(enum.IntEnum):

@@ -22,7 +22,7 @@ from bounce_mjx.lazy import jax, jnp, mujoco, np
 
 if TYPE_CHECKING:
     from bounce_mjx.physics import PhysicsParameters
-    from bounce_mjx.physics.fused.scalars import Quaternion
+    from bounce_mjx.physics.scalars import Quaternion
 
 
 def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float, ...]:
@@ -45,6 +45,50 @@ Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 shape."""
 
 
+def scale(own: jax.Array, factor: jax.Array) -> jax.Array:
+    """The operation of a term that is a factor."""
+    return own * factor
+
+
+def shift(own: jax.Array, added: jax.Array) -> jax.Array:
+    """The operation of a term that is a difference."""
+    return own + added
+
+
+def replace(_: jax.Array | None, drawn: jax.Array) -> jax.Array:
+    """The operation of a term that is the value itself."""
+    return drawn
+
+
+def limit(own: jax.Array, most: jax.Array) -> jax.Array:
+    """The operation of a term that is an upper bound."""
+    return jnp.minimum(own, most)
+
+
+def tilt_frame(own: jax.Array, angles: jax.Array) -> jax.Array:
+    """The quaternion of a frame that turns about its own x axis, then about its new y axis."""
+    from bounce_mjx.physics.scalars import quaternion_product
+
+    return jnp.stack(quaternion_product(tuple(own), _rotation_xy(angles)))
+
+
+def tilt_vector(own: jax.Array, angles: jax.Array) -> jax.Array:
+    """A vector that turns about the x axis, then about the new y axis."""
+    from bounce_mjx.physics.scalars import matvec, quaternion_matrix
+
+    return jnp.stack(matvec(quaternion_matrix(_rotation_xy(angles)), tuple(own)))
+
+
+def _rotation_xy(angles: jax.Array) -> Quaternion:
+    """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
+    from bounce_mjx.physics.scalars import quaternion_product
+
+    a, b = 0.5 * angles[0], 0.5 * angles[1]
+    about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
+    about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
+    return quaternion_product(about_x, about_y)
+
+
 class Term(NamedTuple):
     """A quantity that may differ between episodes: the metadata of its range."""
 
@@ -55,6 +99,10 @@ class Term(NamedTuple):
     that does not grow."""
     limits: tuple[float, float]
     """Smallest and largest sensible value."""
+    parameter: str | None = None
+    """The field of `PhysicsParameters` that it changes."""
+    operation: Callable[[Any, Any], Any] | None = None
+    """(the model's own value, drawn value) -> value of the parameter; None for a restitution."""
 
     def shape(self, num_joints: int) -> tuple[int, ...]:
         """Shape of one episode's draw for an arm with this number of acting joints."""
@@ -74,16 +122,16 @@ class RandomizationConfig(StrictModel):
     """The world that each episode draws: a range for each term, null for off. In a file, a term of
     several joints or axes may have a range for each: two lists, of the lower and the upper ends."""
 
-    restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98))] = None
+    restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
     restitution_slope: Annotated[Range | None, Term((), 0.0, (0.0, 0.1))] = None
     """Drop of the restitution per m/s of impact speed above 2.45 m/s, the speed of the ITTF's drop
     test from 30.5 cm, s/m; needs restitution, of which 0.4 must be left at 4.5 m/s; slow impacts
     have at most 0.99. Balls bounce less in faster impacts (Hubbard and Stronge 2001, "Bounce of
     hollow balls on flat surfaces")."""
-    ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR)] = None
+    ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Range | None, Term((), 1.0, (0.1, 10.0))] = None
+    ball_radius: Annotated[Range | None, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
     """Factor of the ball's radius."""
     air_drag: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
@@ -93,29 +141,41 @@ class RandomizationConfig(StrictModel):
     velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
     speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
     "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
-    contact_friction: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
+    contact_friction: Annotated[
+        Range | None, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
+    ] = None
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
-    servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
+    servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR, "servo_gain", scale)] = None
     """Factor of each servo's stiffness."""
-    servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
+    servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR, "servo_damping", scale)] = None
     """Factor of each servo's damping."""
     servo_lag: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, 1e5))] = None
+    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = (
+        None
+    )
     """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4))] = None
+    joint_damping: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4))] = None
+    joint_frictionloss: Annotated[
+        Range | None, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)
+    ] = None
     """Dry friction of each joint, N m, in place of the model's."""
-    armature: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
+    armature: Annotated[Range | None, Term(None, 1.0, _FACTOR, "armature", scale)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR)] = None
+    link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR, "link_mass", scale)] = None
     """Factor of each link's mass."""
-    paddle_offset: Annotated[Range | None, Term((3,), 0.0, (-0.5, 0.5))] = None
+    paddle_offset: Annotated[
+        Range | None, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)
+    ] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0))] = None
+    paddle_tilt: Annotated[
+        Range | None, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)
+    ] = None
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0))] = None
+    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = (
+        None
+    )
     """Rotation of gravity about the world's x and y axis, rad."""
     action_latency: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
     """Time from an action to its servo targets, s."""
@@ -176,7 +236,7 @@ class RandomizationConfig(StrictModel):
         if self.push_interval is not None and self.push_speed is None:
             raise ValueError("push_interval is given without push_speed; give both, or neither")
         for name in self.terms:
-            ends, (size, _, (least, greatest)) = getattr(self, name), TERMS[name]
+            ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
             unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
             counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
             if len(counts) > 1 or (size is not None and not counts <= {0, *size}):
@@ -282,51 +342,20 @@ def draw_world(
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.fused.scalars import matvec, quaternion_matrix, quaternion_product
-    from bounce_mjx.physics.parameters import PhysicsParameters, direct_solref, link_masses
-    from bounce_mjx.robot.model import find_addresses
+    from bounce_mjx.physics.edited import own_parameters
+    from bounce_mjx.physics.parameters import PhysicsParameters
 
-    m, addresses = mj_model, find_addresses(mj_model)
-    servos, dofs = list(addresses.actuators), list(addresses.arm_qvel)
-    paddle = addresses.paddle_geom
-    given = {}
-    if "restitution" in world:
-        stiffness, _ = direct_solref(m)
-        given["contact_damping"] = contact_damping(world["restitution"], stiffness)
-    scaled = {
-        "ball_mass": ("ball_mass", m.body_mass[addresses.ball_body]),
-        "ball_radius": ("ball_radius", m.geom_size[addresses.ball_geom, 0]),
-        "servo_gain": ("servo_gain", m.actuator_gainprm[servos, 0]),
-        "servo_damping": ("servo_damping", -m.actuator_biasprm[servos, 2]),
-        "armature": ("armature", m.dof_armature[dofs]),
-        "link_mass": ("link_mass", link_masses(m)),
-    }
-    for term, (parameter, model_value) in scaled.items():
-        if term in world:
-            given[parameter] = world[term] * _array(model_value, world[term])
-    same = {"contact_friction": "contact_friction", "joint_frictionloss": "frictionloss"}
-    for term, parameter in same.items():
-        if term in world:
-            given[parameter] = world[term]
-    if "torque_limit" in world:
-        own = np.where(
-            m.actuator_forcelimited, np.min(np.abs(m.actuator_forcerange), axis=1), np.inf
-        )
-        limit = world["torque_limit"]
-        given["force_limit"] = jnp.minimum(limit, _array(own[servos], limit))
-    if "joint_damping" in world:
-        added = world["joint_damping"]
-        given["damping"] = added + _array(m.dof_damping[dofs], added)
-    if "paddle_offset" in world:
-        offset = world["paddle_offset"]
-        given["paddle_position"] = offset + _array(m.geom_pos[paddle], offset)
-    if "paddle_tilt" in world:
-        tilt = world["paddle_tilt"]
-        own = _array(m.geom_quat[paddle], tilt)
-        given["paddle_rotation"] = jnp.stack(quaternion_product(tuple(own), _rotation_xy(tilt)))
-    if "gravity_tilt" in world:
-        rotation = quaternion_matrix(_rotation_xy(world["gravity_tilt"]))
-        given["gravity"] = jnp.stack(matvec(rotation, tuple(m.opt.gravity.tolist())))
+    terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
+    if not terms:
+        return PhysicsParameters()
+    own, given = own_parameters(mj_model), {}
+    for name, (*_, parameter, operation) in terms.items():
+        drawn, value = world[name], getattr(own, parameter)
+        if operation is None:
+            given[parameter] = contact_damping(drawn, float(own.contact_stiffness))
+        else:
+            own_value = None if value is None else jnp.asarray(value, drawn.dtype)
+            given[parameter] = operation(own_value, drawn)
     return PhysicsParameters(**given)
 
 
@@ -345,17 +374,3 @@ def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
     ratio, e = np.array(_DROPS[::-1]).T
     zeta = jnp.interp(restitution, e, ratio)
     return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
-
-
-def _array(values: np.ndarray, like: jax.Array) -> jax.Array:
-    return jnp.asarray(values, like.dtype)
-
-
-def _rotation_xy(angles: jax.Array) -> Quaternion:
-    """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
-    a, b = 0.5 * angles[0], 0.5 * angles[1]
-    from bounce_mjx.physics.fused.scalars import quaternion_product
-
-    about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
-    about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
-    return quaternion_product(about_x, about_y)

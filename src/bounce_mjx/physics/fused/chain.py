@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.scalars import (
     IDENTITY3,
     ZERO3,
     Mat3,
@@ -31,6 +31,7 @@ from bounce_mjx.physics.fused.scalars import (
     scale,
     sine_cosine,
     sub,
+    symmetric,
     transpose,
     vadd,
     vsub,
@@ -43,7 +44,7 @@ SquareMatrix = list[list[Scalar]]
 class Link:
     """One joint and the bodies that move with it."""
 
-    offset: tuple[float, float, float]
+    offset: Vec3
     """Origin of the link in the frame of its parent at the joint position `zero_position`, m."""
     rotation: tuple[tuple[float, float, float], ...]
     """Orientation of the link in the frame of its parent at the joint position `zero_position`."""
@@ -51,7 +52,7 @@ class Link:
     """Unit axis of the joint."""
     slides: bool
     """Whether the joint is a slide, not a hinge."""
-    zero_position: float
+    zero_position: Scalar
     """Joint position at which `offset` and `rotation` hold, rad or m."""
     mass: Scalar
     """Mass, kg."""
@@ -63,9 +64,9 @@ class Link:
     """Rotor inertia reflected to the joint, kg m^2 or kg."""
     damping: Scalar
     """Viscous damping of the joint, N m s/rad or N s/m."""
-    stiffness: float = 0.0
+    stiffness: Scalar = 0.0
     """Stiffness of the joint's spring, N m/rad or N/m."""
-    spring_position: float = 0.0
+    spring_position: Scalar = 0.0
     """Joint position at which the spring is at rest, rad or m."""
     frictionloss: Scalar = 0.0
     """Largest force of the joint's dry friction, N m or N."""
@@ -285,8 +286,4 @@ def _inertia_to_parent(
         off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mul(mul(mass, p[i]), p[j]))
         return sub(add(rotated[i][j], diagonal if i == j else 0.0), off)
 
-    xx, xy, xz, yy, yz, zz = (
-        entry(i, j) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    )
-    shifted = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    return vadd(h, scale(p, mass)), shifted
+    return vadd(h, scale(p, mass)), symmetric(entry)

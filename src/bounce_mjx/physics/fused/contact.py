@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.scalars import (
     Mat3,
     Scalar,
     Vec3,

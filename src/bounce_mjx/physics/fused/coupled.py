@@ -23,7 +23,7 @@ from jax import lax
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.fused.pyramid import edge_regulariser
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.scalars import (
     Scalar,
     Vec3,
     add,

@@ -15,23 +15,25 @@ import jax.numpy as jnp
 from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, Moving, drag, servo_target
 from bounce_mjx.physics.fused import chain, joint_friction
-from bounce_mjx.physics.fused.model import FusedModel, Servo, in_world
+from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turn, turned, turning_of
+from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.scalars import (
     Quaternion,
     Scalar,
     Vec3,
     add,
     cross,
     is_constant,
+    is_zero,
     mul,
+    scalars_of,
     scale,
     stored,
     sub,
     vadd,
 )
-from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turn, turned, turning_of
-from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import BallAddresses
 
@@ -68,8 +70,8 @@ def step(
     orientation, unless the spin lifts the ball.
     """
     addresses = model.addresses
-    frictional = model.contacts[0].friction is not None or parameters.contact_friction is not None
-    turns = frictional or control.air_lift is not None
+    world = _in_any_world(model, parameters)
+    turns = world.contacts[0].friction is not None or control.air_lift is not None
     motion = Motion(
         q=tuple(state.qpos[i] for i in addresses.arm_qpos),
         v=tuple(state.qvel[i] for i in addresses.arm_qvel),
@@ -127,9 +129,33 @@ def _orientation_and_spin(at: BallAddresses, state: PhysicsState) -> tuple[Quate
     )
 
 
+def _in_any_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
+    """The model in a world with these parameters given, all of them 1.
+
+    Raises:
+      UserError: as `read_model`.
+    """
+
+    def ones(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
+        return (1.0,) * len(array) if jnp.ndim(array) else 1.0
+
+    return _in_world_of_ones(model, jax.tree.structure(jax.tree.map(ones, parameters)))
+
+
+@functools.lru_cache
+def _in_world_of_ones(model: FusedModel, given: jax.tree_util.PyTreeDef) -> FusedModel:
+    ones = given.unflatten([1.0] * given.num_leaves)
+    return read_model(model.mj_model, ones, model.addresses)
+
+
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    relevant = PhysicsParameters(paddle_position=parameters.paddle_position)
+    _in_any_world(model, parameters)
+    fields = ("body_pos[", "geom_pos[", "qpos0[")
+    entries = {x: y for x, y in (parameters.entries or {}).items() if x.startswith(fields)}
+    relevant = PhysicsParameters(
+        paddle_position=parameters.paddle_position, entries=entries or None
+    )
     numbers, given = jax.tree.flatten(scalars_of(relevant, qpos.dtype))
     # A separate kernel: XLA takes long to fuse such a chain with the surrounding program.
     position = elementwise(_paddle_position(model, given), num_results=3)
@@ -154,16 +180,6 @@ def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     )
 
 
-def scalars_of(arrays: Any, dtype: jnp.dtype) -> Any:
-    """Arrays of one environment as scalars, or tuples of scalars, of one dtype."""
-
-    def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
-        array = jnp.asarray(array, dtype)
-        return array if array.ndim == 0 else tuple(array[i] for i in range(len(array)))
-
-    return jax.tree.map(scalars, arrays)
-
-
 @functools.lru_cache
 def _substeps(
     model: FusedModel,
@@ -181,7 +197,7 @@ def _substeps(
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
-        world = in_world(model, parameters)
+        world = read_model(model.mj_model, parameters, model.addresses)
         air = {"air_drag": control.air_drag, "air_lift": control.air_lift}
         air = {name: value for name, value in air.items() if value is not None}
         world = dataclasses.replace(world, **air)
@@ -219,7 +235,7 @@ def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Calla
     n = len(model.links)
 
     def position(*scalars: Scalar) -> Vec3:
-        world = in_world(model, given.unflatten(scalars[n:]))
+        world = read_model(model.mj_model, given.unflatten(scalars[n:]), model.addresses)
         return paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
 
     return jax.jit(position, inline=True)
@@ -266,7 +282,7 @@ def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Sca
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
     gain, damping = servo.gain, servo.damping
-    if servo.gain_stiffness or servo.gain_damping:
+    if not (is_zero(servo.gain_stiffness) and is_zero(servo.gain_damping)):
         gain = gain + servo.gain_stiffness * q + servo.gain_damping * v
         damping = damping + servo.gain_damping * target
     force = gain * target + servo.stiffness * q + servo.damping * v + servo.bias

@@ -7,7 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.physics.fused.chain import Link
-from bounce_mjx.physics.fused.scalars import IDENTITY3, ZERO3, Mat3, Vec3
+from bounce_mjx.physics.scalars import (
+    IDENTITY3,
+    ZERO3,
+    Mat3,
+    Scalar,
+    Vec3,
+    congruence,
+    is_constant,
+    is_zero,
+    matmul,
+    matvec,
+    sub,
+)
 
 
 class Frame(NamedTuple):
@@ -24,10 +36,11 @@ def floats(values: np.ndarray) -> tuple[float, ...]:
 
 def exact(rotation: Sequence[Sequence[float]]) -> Mat3:
     """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
-    matrix = np.asarray(rotation)
-    nearest = np.round(matrix)
-    matrix = np.where(np.abs(matrix - nearest) < 1e-12, nearest, matrix)
-    return tuple(floats(row) for row in matrix)
+
+    def entry(x: Scalar) -> Scalar:
+        return float(round(x)) if is_constant(x) and abs(x - round(x)) < 1e-12 else x
+
+    return tuple(tuple(map(entry, row)) for row in rotation)
 
 
 def cheapest(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame]:
@@ -45,8 +58,8 @@ def _cost(chain: tuple[Sequence[Link], Frame]) -> int:
     axes, not 0 in their offsets."""
     links, _ = chain
     directions = [row for link in links for row in (*link.rotation, link.axis)]
-    offsets = [link.offset for link in links]
-    return int(np.sum(~np.isin(directions, (-1.0, 0.0, 1.0))) + np.count_nonzero(offsets))
+    offsets = sum(not is_zero(x) for link in links for x in link.offset)
+    return int(np.sum(~np.isin(directions, (-1.0, 0.0, 1.0)))) + offsets
 
 
 def _aligned(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame]:
@@ -69,22 +82,23 @@ def _aligned(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame
             angle = np.arctan2(-relative[0, 1], relative[0, 0])
             cosine, sine = np.cos(angle), np.sin(angle)
             relative = relative @ [[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]
-            zero -= float(angle)
+            zero = sub(zero, float(angle))
+        to_parent, to_link = (exact(frame.T.tolist()) for frame in (parent, turn))
         turned.append(
             dataclasses.replace(
                 link,
-                offset=floats(parent.T @ link.offset),
-                rotation=exact(relative),
-                axis=exact([turn.T @ link.axis])[0],
+                offset=matvec(to_parent, link.offset),
+                rotation=exact(relative.tolist()),
+                axis=exact([(turn.T @ link.axis).tolist()])[0],
                 zero_position=zero,
-                first_moment=floats(turn.T @ link.first_moment),
-                inertia=tuple(floats(row) for row in turn.T @ link.inertia @ turn),
-                floating_moment=floats(turn.T @ link.floating_moment),
+                first_moment=matvec(to_link, link.first_moment),
+                inertia=congruence(to_link, link.inertia),
+                floating_moment=matvec(to_link, link.floating_moment),
             )
         )
         parent = turn
-    origin, rotation = turn.T @ last_body.origin, turn.T @ last_body.rotation
-    return turned, Frame(floats(origin), exact(rotation))
+    rotation = exact(matmul(to_link, last_body.rotation))
+    return turned, Frame(matvec(to_link, last_body.origin), rotation)
 
 
 def _with_axis(axis: np.ndarray, normal: np.ndarray) -> np.ndarray:

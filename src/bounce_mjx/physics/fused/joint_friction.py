@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused import chain
-from bounce_mjx.physics.fused.scalars import Scalar, add, dot, is_constant, mul, neg, stored, sub
+from bounce_mjx.physics.scalars import Scalar, add, dot, is_zero, mul, neg, stored, sub
 
 Scalars = Sequence[Scalar]
 ContactForce = Callable[[tuple[Scalar, ...], tuple[Scalar, ...]], tuple[Scalar, ...]]
@@ -55,7 +55,7 @@ class DryFrictionProblem(NamedTuple):
 
 def has_friction(link: chain.Link) -> bool:
     """Whether the joint may have dry friction."""
-    return not (is_constant(link.frictionloss) and link.frictionloss == 0.0)
+    return not is_zero(link.frictionloss)
 
 
 def contact_and_friction(

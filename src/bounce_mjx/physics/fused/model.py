@@ -1,34 +1,40 @@
-"""Model of the fused engine: constants of a compiled MJCF, and parameters of one environment."""
+"""Model of the fused engine, read from an MJCF in the world of one environment."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics.edited import MIN_FRICTION, EditedModel, edited
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.fused.frames import Frame, cheapest, exact, floats
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
+from bounce_mjx.physics.scalars import (
     ZERO3,
     Mat3,
     Scalar,
     Vec3,
+    add,
+    congruence,
+    diagonal,
+    dot,
+    is_constant,
     matmul,
     matvec,
+    maximum,
     mul,
     neg,
     quaternion_matrix,
     scale,
+    sub,
+    symmetric,
     vadd,
 )
-from bounce_mjx.physics.parameters import MIN_FRICTION, PhysicsParameters
-from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
-
-# MuJoCo's mjMINVAL.
-_MIN_VALUE = 1e-15
+from bounce_mjx.robot.model import Addresses, BallAddresses, fingerprint, to_direct_solref
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,16 +46,14 @@ class Servo:
     """
 
     gain: Scalar
-    bias: float
+    bias: Scalar
     stiffness: Scalar
     damping: Scalar
-    gear: float
-    """Length of the actuator per joint position."""
-    ctrl_range: tuple[float, float] | None
+    ctrl_range: tuple[Scalar, Scalar] | None
     force_range: tuple[Scalar, Scalar] | None = None
     """Range of the servo's force at the joint (`forcerange`)."""
-    gain_stiffness: float = 0.0
-    gain_damping: float = 0.0
+    gain_stiffness: Scalar = 0.0
+    gain_damping: Scalar = 0.0
     joint_range: tuple[float, float] | None = None
     """Range of all forces of actuators at the joint (`actuatorfrcrange`)."""
     carries_weight: bool = False
@@ -72,11 +76,8 @@ class BallModel:
 
 @dataclasses.dataclass(frozen=True)
 class FusedModel:
-    """Model of the fused engine, in SI units.
-
-    `read_model` returns constants, which fold while tracing; `in_world` replaces some of them by
-    the scalars of one environment.
-    """
+    """Model of the fused engine, in SI units: constants, which fold while tracing, and scalars in
+    place of those that the parameters of an environment change."""
 
     dt: float
     gravity: Vec3
@@ -87,9 +88,7 @@ class FusedModel:
     """Centre of the paddle in the frame of the last link."""
     paddle_rotation: Mat3
     """Orientation of the paddle in the frame of the last link."""
-    paddle_body: Frame
-    """The paddle's body in the frame of the last link."""
-    paddle_half_size: tuple[float, float, float]
+    paddle_half_size: Vec3
     """Half sizes of the paddle, m."""
     balls: tuple[BallModel, ...]
     contacts: tuple[ContactModel, ...]
@@ -97,14 +96,16 @@ class FusedModel:
     addresses: Addresses
     nq: int
     nv: int
+    mj_model: mujoco.MjModel = dataclasses.field(repr=False, compare=False)
+    """Source of the model, to be read again in each world."""
+    fingerprint: bytes = b""
+    """Hash of the source, so that models of equal sources are equal; empty in a world."""
     weight: float = 1.0
     """Share of the links' weight that acts on the arm."""
     implicit_servos: bool = True
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
     """Whether the integrator is implicit in the joints' damping."""
-    dry_friction: bool = True
-    """Whether the joints' dry friction acts (the flag `frictionloss`)."""
     air_drag: Scalar = 0.0
     """Deceleration of a ball by the air divided by its squared speed, 1/m."""
     air_lift: Scalar = 0.0
@@ -112,186 +113,85 @@ class FusedModel:
     velocity."""
 
 
-def read_model(mj_model: mujoco.MjModel) -> FusedModel:
-    """Constants of a compiled model that the engine supports (`physics/support.py`)."""
-    m, addresses = mj_model, find_addresses(mj_model)
-    links, frames = _read_links(m, addresses)
-    compensated = _compensated_share(m, addresses)
+def read_model(
+    mj_model: mujoco.MjModel,
+    parameters: PhysicsParameters = MODEL_PARAMETERS,
+    addresses: Addresses | None = None,
+) -> FusedModel:
+    """Reads a compiled model that the engine supports (`physics/support.py`), in the world of one
+    environment.
+
+    Args:
+      parameters: numbers, or tuples of numbers: Python floats or scalars.
+
+    Raises:
+      UserError: the engine does not read an entry that the parameters change.
+    """
+    m = edited(mj_model, parameters, addresses)
+    c, addresses = m.model, m.addresses
+    links, frames = _read_links(m)
+    compensated = _compensated_share(c, addresses)
     if compensated is not None:
         links = [dataclasses.replace(x, floating_mass=0.0, floating_moment=ZERO3) for x in links]
-    links, paddle_body = cheapest(links, frames[int(m.geom_bodyid[addresses.paddle_geom])])
+    links, body = cheapest(links, frames[int(c.geom_bodyid[addresses.paddle_geom])])
     paddle = _geom_frame(m, addresses.paddle_geom)
-    implicit = m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    explicit_damping = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    return FusedModel(
-        dt=float(m.opt.timestep),
-        gravity=floats(m.opt.gravity),
+    implicit = c.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    explicit_damping = c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    model = FusedModel(
+        dt=float(c.opt.timestep),
+        gravity=m["opt.gravity", :],
         links=tuple(links),
         servos=tuple(
             _read_servo(m, actuator, joint)
             for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
         ),
-        paddle_origin=vadd(paddle_body.origin, matvec(paddle_body.rotation, paddle.origin)),
-        paddle_rotation=exact(matmul(paddle_body.rotation, paddle.rotation)),
-        paddle_body=paddle_body,
-        paddle_half_size=floats(m.geom_size[addresses.paddle_geom]),
+        paddle_origin=vadd(body.origin, matvec(body.rotation, paddle.origin)),
+        paddle_rotation=exact(matmul(body.rotation, paddle.rotation)),
+        paddle_half_size=m["geom_size", addresses.paddle_geom],
         balls=tuple(_read_ball(m, ball) for ball in addresses.balls),
-        contacts=_read_contacts(m, addresses),
+        contacts=_read_contacts(m),
         addresses=addresses,
-        nq=m.nq,
-        nv=m.nv,
+        nq=c.nq,
+        nv=c.nv,
+        mj_model=c,
+        fingerprint=fingerprint(c) if parameters == MODEL_PARAMETERS else b"",
         weight=1.0 - (compensated or 0.0),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
-        dry_friction=_has_dry_friction(m),
     )
-
-
-def in_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
-    """Model with the parameters of one environment.
-
-    Args:
-      parameters: scalars, or tuples of scalars; None keeps the model's own value.
-    """
-    p = parameters
-    none = (None,) * len(model.links)
-    links = zip(
-        model.links,
-        p.link_mass or none,
-        p.armature or none,
-        p.damping or none,
-        (p.frictionloss if model.dry_friction else None) or none,
-        strict=True,
-    )
-    servos = zip(
-        model.servos,
-        p.servo_gain or none,
-        p.servo_damping or none,
-        p.force_limit or none,
-        strict=True,
-    )
-    body, origin, rotation = model.paddle_body, p.paddle_position, p.paddle_rotation
-    return dataclasses.replace(
-        model,
-        gravity=_given(p.gravity, model.gravity),
-        links=tuple(_link_in_world(*link) for link in links),
-        servos=tuple(_servo_in_world(*servo) for servo in servos),
-        paddle_origin=model.paddle_origin
-        if origin is None
-        else vadd(body.origin, matvec(body.rotation, origin)),
-        paddle_rotation=model.paddle_rotation
-        if rotation is None
-        else matmul(body.rotation, quaternion_matrix(rotation)),
-        balls=tuple(_ball_in_world(ball, p) for ball in model.balls),
-        contacts=tuple(_contact_in_world(contact, model.balls, p) for contact in model.contacts),
-    )
-
-
-def _ball_in_world(ball: BallModel, p: PhysicsParameters) -> BallModel:
-    inertia = ball.inertia
-    if p.ball_mass is not None:
-        inertia = mul(p.ball_mass, inertia / ball.mass)
-    if p.ball_radius is not None:
-        ratio = mul(p.ball_radius, 1.0 / ball.radius)
-        inertia = mul(inertia, mul(ratio, ratio))
-    return dataclasses.replace(
-        ball,
-        radius=_given(p.ball_radius, ball.radius),
-        mass=_given(p.ball_mass, ball.mass),
-        inertia=inertia,
-    )
-
-
-def _contact_in_world(
-    contact: ContactModel, balls: Sequence[BallModel], p: PhysicsParameters
-) -> ContactModel:
-    """Contact with the parameters of one environment; `balls` are the model's own."""
-    changes: dict[str, Any] = {}
-    if p.ball_mass is not None:
-        paddle = contact.inverse_weights[: 2 - len(contact.balls)]
-        moved = zip(contact.inverse_weights[len(paddle) :], contact.balls, strict=True)
-        weights = [mul(weight, balls[i].mass / p.ball_mass) for weight, i in moved]
-        changes["inverse_weights"] = (*paddle, *weights)
-    if p.contact_friction is not None:
-        changes["friction"] = (jnp.maximum(p.contact_friction, MIN_FRICTION),) * 2
-    # MuJoCo scales the direct format of solref by the largest impedance.
-    max_impedance = contact.solimp[1]
-    if p.contact_stiffness is not None:
-        changes["stiffness"] = mul(p.contact_stiffness, 1.0 / max_impedance**2)
-    if p.contact_damping is not None:
-        changes["damping"] = mul(p.contact_damping, 1.0 / max_impedance)
-    return dataclasses.replace(contact, **changes)
-
-
-def _link_in_world(
-    link: chain.Link,
-    mass: Scalar | None,
-    armature: Scalar | None,
-    damping: Scalar | None,
-    frictionloss: Scalar | None,
-) -> chain.Link:
-    # A body with several joints is the link of the last one; the others have no mass.
-    if mass is not None and link.mass != 0.0:
-        ratio = mul(mass, 1.0 / link.mass)
-        link = dataclasses.replace(
-            link,
-            mass=mass,
-            first_moment=scale(link.first_moment, ratio),
-            inertia=tuple(scale(row, ratio) for row in link.inertia),
-            floating_mass=mul(link.floating_mass, ratio),
-            floating_moment=scale(link.floating_moment, ratio),
+    for name in m.unread():
+        raise UserError(
+            f"the fused physics cannot vary {name} between environments, so a change of it would "
+            "have no effect; leave it out"
         )
-    return dataclasses.replace(
-        link,
-        armature=_given(armature, link.armature),
-        damping=_given(damping, link.damping),
-        frictionloss=_given(frictionloss, link.frictionloss),
-    )
+    return model
 
 
-def _servo_in_world(
-    servo: Servo, gain: Scalar | None, damping: Scalar | None, force_limit: Scalar | None
-) -> Servo:
-    if gain is not None:
-        gain = mul(gain, servo.gear)
-        servo = dataclasses.replace(servo, gain=gain, stiffness=mul(gain, -servo.gear))
-    if damping is not None:
-        servo = dataclasses.replace(servo, damping=mul(damping, -(servo.gear**2)))
-    if force_limit is not None:
-        limit = mul(force_limit, abs(servo.gear))
-        servo = dataclasses.replace(servo, force_range=(neg(limit), limit))
-    return servo
-
-
-def _given(value, default):
-    return default if value is None else value
-
-
-def _rotation(quaternion: np.ndarray) -> Mat3:
+def _rotation(quaternion: Sequence[Scalar]) -> Mat3:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
+    if not all(map(is_constant, quaternion)):
+        return quaternion_matrix(quaternion)
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return exact(matrix.reshape(3, 3))
 
 
-def _read_links(
-    mj_model: mujoco.MjModel, addresses: Addresses
-) -> tuple[list[chain.Link], dict[int, Frame]]:
+def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
     """Links of the chain, and the frame of each body in its link; bodies that do not move are in
     the frame of the world. Welded bodies belong to the link of the last joint above them."""
-    m = mj_model
+    c = m.model
     links: list[chain.Link] = []
     frames, link_of = {0: Frame()}, {0: -1}
-    for body in range(1, m.nbody):  # parents come before their children
-        if m.body_weldid[body] in [ball.body for ball in addresses.balls]:
+    for body in range(1, c.nbody):  # parents come before their children
+        if c.body_weldid[body] in [ball.body for ball in m.addresses.balls]:
             continue
-        parent, link_of[body] = (x[int(m.body_parentid[body])] for x in (frames, link_of))
-        origin = vadd(parent.origin, matvec(parent.rotation, floats(m.body_pos[body])))
-        rotation = exact(matmul(parent.rotation, _rotation(m.body_quat[body])))
+        parent, link_of[body] = (x[int(c.body_parentid[body])] for x in (frames, link_of))
+        origin = vadd(parent.origin, matvec(parent.rotation, m["body_pos", body]))
+        rotation = exact(matmul(parent.rotation, _rotation(c.body_quat[body])))
         frame = Frame(origin, rotation)
-        for joint in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
-            slides = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-            anchor = ZERO3 if slides else floats(m.jnt_pos[joint])
+        for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
+            slides = c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+            anchor = ZERO3 if slides else floats(c.jnt_pos[joint])
             origin = vadd(frame.origin, matvec(frame.rotation, anchor))
             link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
@@ -302,49 +202,60 @@ def _read_links(
     return links, frames
 
 
-def _read_joint(mj_model: mujoco.MjModel, joint: int, frame: Frame) -> chain.Link:
+def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
     """Link without mass behind a joint, whose frame is given in the parent link."""
-    m = mj_model
-    dof, at = m.jnt_dofadr[joint], m.jnt_qposadr[joint]
-    springs = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
-    dmin, dmax = _impedance_limits(m.dof_solimp[dof, :2])
-    d = dmin if m.dof_solimp[dof, 2] > _MIN_VALUE else 0.5 * (dmin + dmax)
+    c = m.model
+    dof, at = c.jnt_dofadr[joint], c.jnt_qposadr[joint]
+    springs = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
+    dry = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+    dmin, dmax = _impedance_limits(c.dof_solimp[dof, :2])
+    d = dmin if c.dof_solimp[dof, 2] > mujoco.mjMINVAL else 0.5 * (dmin + dmax)
+    frictionloss = m["dof_frictionloss", dof]
     return chain.Link(
         offset=frame.origin,
         rotation=frame.rotation,
-        axis=floats(m.jnt_axis[joint]),
-        slides=bool(m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
-        zero_position=float(m.qpos0[at]),
+        axis=floats(c.jnt_axis[joint]),
+        slides=bool(c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
+        zero_position=m["qpos0", at],
         mass=0.0,
         first_moment=ZERO3,
         inertia=(ZERO3,) * 3,
-        armature=float(m.dof_armature[dof]),
-        damping=float(m.dof_damping[dof]),
-        stiffness=float(m.jnt_stiffness[joint]) if springs else 0.0,
-        spring_position=float(m.qpos_spring[at]),
-        frictionloss=float(m.dof_frictionloss[dof]) if _has_dry_friction(m) else 0.0,
-        friction_softness=float((1.0 - d) / d * m.dof_invweight0[dof]),
-        friction_damping=_reference_damping(m, m.dof_solref[dof], dmax),
+        armature=m["dof_armature", dof],
+        damping=m["dof_damping", dof],
+        stiffness=m["jnt_stiffness", joint] if springs else 0.0,
+        spring_position=m["qpos_spring", at],
+        frictionloss=frictionloss if dry else 0.0,
+        friction_softness=float((1.0 - d) / d * c.dof_invweight0[dof]),
+        friction_damping=_reference_damping(c, c.dof_solref[dof], dmax),
     )
 
 
-def _with_body(mj_model: mujoco.MjModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
+def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
     """Link with the mass of one more body, whose frame is given in the link."""
-    mass = float(mj_model.body_mass[body])
-    inertial = _inertial_frame(mj_model, body)
-    rotation = np.array(frame.rotation)
-    centre = np.array(frame.origin) + rotation @ np.array(inertial.origin)
-    principal = rotation @ np.array(inertial.rotation)
-    about_centre = principal @ np.diag(mj_model.body_inertia[body]) @ principal.T
-    about_origin = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    floating = float(_gravity_compensation(mj_model)[body])
+    mass, inertial = m["body_mass", body], _inertial_frame(m.model, body)
+    centre = vadd(frame.origin, matvec(frame.rotation, inertial.origin))
+    principal = matmul(frame.rotation, inertial.rotation)
+    lever = dot(centre, centre)
+    shift = tuple(
+        tuple(sub(lever if i == j else 0.0, mul(centre[i], centre[j])) for j in range(3))
+        for i in range(3)
+    )
+    if m.inertia_follows(body):
+        # One product for each entry, as only the mass is no constant.
+        own = m.model.body_mass[body]
+        per_mass = congruence(principal, diagonal(floats(m.model.body_inertia[body] / own)))
+        inertia = symmetric(lambda i, j: mul(add(per_mass[i][j], shift[i][j]), mass))
+    else:
+        about_centre = congruence(principal, diagonal(m["body_inertia", body]))
+        inertia = symmetric(lambda i, j: add(about_centre[i][j], mul(shift[i][j], mass)))
+    moment, floating = scale(centre, mass), _gravity_compensation(m.model)[body].item()
     return dataclasses.replace(
         link,
-        mass=link.mass + mass,
-        first_moment=floats(link.first_moment + mass * centre),
-        inertia=tuple(floats(row) for row in link.inertia + about_origin),
-        floating_mass=link.floating_mass + floating * mass,
-        floating_moment=floats(link.floating_moment + floating * mass * centre),
+        mass=add(link.mass, mass),
+        first_moment=vadd(link.first_moment, moment),
+        inertia=symmetric(lambda i, j: add(link.inertia[i][j], inertia[i][j])),
+        floating_mass=add(link.floating_mass, mul(mass, floating)),
+        floating_moment=vadd(link.floating_moment, scale(moment, floating)),
     )
 
 
@@ -355,12 +266,11 @@ def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
     return _as_flagged(m.body_sameframe[body], frame, frame)
 
 
-def _geom_frame(mj_model: mujoco.MjModel, geom: int) -> Frame:
+def _geom_frame(m: EditedModel, geom: int) -> Frame:
     """Frame of a geom in its body's frame."""
-    m = mj_model
-    frame = Frame(floats(m.geom_pos[geom]), _rotation(m.geom_quat[geom]))
-    inertial = _inertial_frame(m, int(m.geom_bodyid[geom]))
-    return _as_flagged(m.geom_sameframe[geom], frame, inertial)
+    frame = Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
+    inertial = _inertial_frame(m.model, int(m.model.geom_bodyid[geom]))
+    return _as_flagged(m["geom_sameframe", geom], frame, inertial)
 
 
 def _as_flagged(same: int, frame: Frame, inertial: Frame) -> Frame:
@@ -392,80 +302,88 @@ def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float 
     return float(shares[0]) if len(shares) == 1 and not (np.any(counts) and shares[0]) else None
 
 
-def _read_servo(mj_model: mujoco.MjModel, actuator: int, joint: int) -> Servo:
-    m = mj_model
-    gear = float(m.actuator_gear[actuator, 0])
-    gain, gain_stiffness, gain_damping = (float(g) for g in m.actuator_gainprm[actuator, :3])
-    if m.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED:
+def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
+    c = m.model
+    gear = float(c.actuator_gear[actuator, 0])
+    gain, gain_stiffness, gain_damping = m["actuator_gainprm", actuator, :3]
+    if c.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED:
         gain_stiffness = gain_damping = 0.0
-    bias, stiffness, damping = (float(b) for b in m.actuator_biasprm[actuator, :3])
-    limited = bool(m.actuator_ctrllimited[actuator])
-    force_limited = bool(m.actuator_forcelimited[actuator])
-    joint_limited = bool(m.jnt_actfrclimited[joint])
-    forces = np.sort(gear * m.actuator_forcerange[actuator])
+    bias, stiffness, damping = m["actuator_biasprm", actuator, :3]
+    forces = tuple(mul(limit, gear) for limit in m["actuator_forcerange", actuator])
+    joint_limited = bool(c.jnt_actfrclimited[joint])
     return Servo(
-        gain=gear * gain,
-        bias=gear * bias,
-        stiffness=gear**2 * stiffness,
-        damping=gear**2 * damping,
-        gear=gear,
-        ctrl_range=floats(m.actuator_ctrlrange[actuator]) if limited else None,
-        force_range=floats(forces) if force_limited else None,
-        gain_stiffness=gear**2 * gain_stiffness,
-        gain_damping=gear**2 * gain_damping,
-        joint_range=floats(m.jnt_actfrcrange[joint]) if joint_limited else None,
-        carries_weight=bool(m.jnt_actgravcomp[joint]),
+        gain=mul(gain, gear),
+        bias=mul(bias, gear),
+        stiffness=mul(stiffness, gear**2),
+        damping=mul(damping, gear**2),
+        ctrl_range=m["actuator_ctrlrange", actuator] if c.actuator_ctrllimited[actuator] else None,
+        force_range=forces[:: 1 if gear > 0.0 else -1]
+        if m["actuator_forcelimited", actuator]
+        else None,
+        gain_stiffness=mul(gain_stiffness, gear**2),
+        gain_damping=mul(gain_damping, gear**2),
+        joint_range=floats(c.jnt_actfrcrange[joint]) if joint_limited else None,
+        carries_weight=bool(c.jnt_actgravcomp[joint]),
     )
 
 
-def _read_ball(mj_model: mujoco.MjModel, ball: BallAddresses) -> BallModel:
+def _read_ball(m: EditedModel, ball: BallAddresses) -> BallModel:
     return BallModel(
-        radius=float(mj_model.geom_size[ball.geom, 0]),
-        mass=float(mj_model.body_mass[ball.body]),
-        inertia=float(mj_model.body_inertia[ball.body, 0]),
-        weight=1.0 - float(_gravity_compensation(mj_model)[ball.body]),
+        radius=m["geom_size", ball.geom, 0],
+        mass=m["body_mass", ball.body],
+        inertia=m.inertia(ball.body)[0],
+        weight=1.0 - _gravity_compensation(m.model)[ball.body].item(),
     )
 
 
-def _read_contacts(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[ContactModel, ...]:
+def _read_contacts(m: EditedModel) -> tuple[ContactModel, ...]:
     """The contacts in the order of `FusedModel.contacts`."""
-    m, balls = mj_model, {ball.geom: i for i, ball in enumerate(addresses.balls)}
+    balls = {ball.geom: i for i, ball in enumerate(m.addresses.balls)}
     contacts = [
         _read_contact(m, pair, tuple(sorted(balls[g] for g in map(int, geoms) if g in balls)))
-        for pair, geoms in enumerate(zip(m.pair_geom1, m.pair_geom2, strict=True))
+        for pair, geoms in enumerate(zip(m.model.pair_geom1, m.model.pair_geom2, strict=True))
     ]
     return tuple(sorted(contacts, key=lambda contact: (len(contact.balls), contact.balls)))
 
 
-def _read_contact(mj_model: mujoco.MjModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
-    m, addresses = mj_model, find_addresses(mj_model)
-    solref, solimp = m.pair_solref[pair], m.pair_solimp[pair]
-    dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]])
-    if solref[0] > 0.0:
-        time_constant = _time_constant(m, solref)
-        stiffness = 1.0 / (dmax * time_constant * solref[1]) ** 2
-    else:
-        stiffness = -solref[0] / dmax**2
+def _read_contact(m: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
+    c, addresses, solimp = m.model, m.addresses, m.model.pair_solimp[pair]
+    dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]]).tolist()
+    stiffness, damping = _direct_solref(c, m["pair_solref", pair])
     power = max(1.0, float(solimp[4]))
-    frictional = m.pair_dim[pair] > 1
-    friction = np.maximum(m.pair_friction[pair, :2], MIN_FRICTION)
     bodies = [addresses.balls[i].body for i in balls]
-    bodies = [m.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
+    bodies = [c.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
+    frictional = m["pair_dim", pair] > 1
     return ContactModel(
         balls=balls,
-        stiffness=float(stiffness),
-        damping=_reference_damping(m, solref, dmax),
+        # MuJoCo scales the direct format of solref by the largest impedance.
+        stiffness=mul(stiffness, 1.0 / dmax**2),
+        damping=mul(damping, 1.0 / dmax),
         solimp=(
-            float(dmin),
-            float(dmax),
+            dmin,
+            dmax,
             float(solimp[2]),
-            float(midpoint),
+            midpoint,
             int(power) if power.is_integer() else power,
         ),
-        inverse_weights=floats(m.body_invweight0[bodies, 0]),
-        friction=floats(friction) if frictional else None,
-        impratio=max(_MIN_VALUE, float(m.opt.impratio)),
+        inverse_weights=tuple(map(m.inverse_weight, bodies)),
+        friction=tuple(maximum(x, MIN_FRICTION) for x in m["pair_friction", pair][:2])
+        if frictional
+        else None,
+        impratio=max(mujoco.mjMINVAL, float(c.opt.impratio)),
     )
+
+
+def _direct_solref(
+    mj_model: mujoco.MjModel, solref: tuple[Scalar, Scalar]
+) -> tuple[Scalar, Scalar]:
+    """k and b of a `solref` in MuJoCo's direct format."""
+    first, second = solref
+    if is_constant(first) and first <= 0.0:
+        return neg(first), neg(second)
+    constant = is_constant(first) and is_constant(second)
+    direct = to_direct_solref(solref, mj_model.opt.timestep, np if constant else jnp)
+    return tuple(map(float, direct)) if constant else direct
 
 
 def _impedance_limits(solimp: np.ndarray) -> np.ndarray:
@@ -486,8 +404,3 @@ def _reference_damping(mj_model: mujoco.MjModel, solref: np.ndarray, max_impedan
 def _time_constant(mj_model: mujoco.MjModel, solref: np.ndarray) -> float:
     """Time constant of a `solref`, at least two steps, s."""
     return max(solref[0], 2.0 * mj_model.opt.timestep)
-
-
-def _has_dry_friction(mj_model: mujoco.MjModel) -> bool:
-    """Whether the flag `frictionloss` lets the joints' dry friction act."""
-    return not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS

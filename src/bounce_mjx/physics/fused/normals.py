@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.fused.scalars import Scalar, dot, neg, stored, upper_rows
+from bounce_mjx.physics.scalars import Scalar, dot, neg, stored, upper_rows
 
 
 def normal_forces(

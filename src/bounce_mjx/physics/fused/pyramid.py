@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused.contact import ContactModel
-from bounce_mjx.physics.fused.scalars import Scalar, Vec3, add, mul
+from bounce_mjx.physics.scalars import Scalar, Vec3, add, mul
 
 
 def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:

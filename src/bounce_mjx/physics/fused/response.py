@@ -28,7 +28,7 @@ from bounce_mjx.physics.fused.coupled import coupled_forces
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.normals import normal_forces
 from bounce_mjx.physics.fused.pyramid import pyramid_force
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.scalars import (
     ZERO3,
     Scalar,
     Vec3,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from bounce_mjx.physics.fused.scalars import (
+from bounce_mjx.physics.scalars import (
     Quaternion,
     Vec3,
     dot,

@@ -7,7 +7,7 @@ has thousands of operations: `jax.lax` traces them in a fraction of the time of 
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -30,6 +30,11 @@ def is_constant(a: Scalar) -> bool:
     return isinstance(a, float)
 
 
+def is_zero(a: Scalar) -> bool:
+    """Whether the scalar is known to be 0 while tracing."""
+    return is_constant(a) and a == 0.0
+
+
 def neg(a: Scalar) -> Scalar:
     """-a."""
     return -a if is_constant(a) else lax.neg(a)
@@ -37,18 +42,18 @@ def neg(a: Scalar) -> Scalar:
 
 def add(a: Scalar, b: Scalar) -> Scalar:
     """a + b."""
-    if is_constant(a) and a == 0.0:
+    if is_zero(a):
         return b
-    if is_constant(b) and b == 0.0:
+    if is_zero(b):
         return a
     return a + b if is_constant(a) and is_constant(b) else lax.add(a, b)
 
 
 def sub(a: Scalar, b: Scalar) -> Scalar:
     """a - b."""
-    if is_constant(a) and a == 0.0:
+    if is_zero(a):
         return neg(b)
-    if is_constant(b) and b == 0.0:
+    if is_zero(b):
         return a
     return a - b if is_constant(a) and is_constant(b) else lax.sub(a, b)
 
@@ -65,6 +70,11 @@ def mul(a: Scalar, b: Scalar) -> Scalar:
         if b == -1.0:
             return neg(a)
     return a * b if is_constant(a) and is_constant(b) else lax.mul(a, b)
+
+
+def maximum(a: Scalar, b: Scalar) -> Scalar:
+    """The larger one."""
+    return max(a, b) if is_constant(a) and is_constant(b) else jnp.maximum(a, b)
 
 
 def vadd(a: Vec3, b: Vec3) -> Vec3:
@@ -112,12 +122,23 @@ def matmul(a: Mat3, b: Mat3) -> Mat3:
     return tuple(tuple(dot(row, column) for column in columns) for row in a)
 
 
-def congruence(r: Mat3, s: Mat3) -> Mat3:
-    """r @ s @ r.T for a symmetric s, each entry of the symmetric result computed once."""
-    rs = matmul(r, s)
-    xx, xy, xz = dot(rs[0], r[0]), dot(rs[0], r[1]), dot(rs[0], r[2])
-    yy, yz, zz = dot(rs[1], r[1]), dot(rs[1], r[2]), dot(rs[2], r[2])
+def diagonal(v: Vec3) -> Mat3:
+    """Diagonal matrix."""
+    return ((v[0], 0.0, 0.0), (0.0, v[1], 0.0), (0.0, 0.0, v[2]))
+
+
+def symmetric(entry: Callable[[int, int], Scalar]) -> Mat3:
+    """Symmetric matrix, each entry computed once."""
+    xx, xy, xz, yy, yz, zz = (
+        entry(i, j) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    )
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def congruence(r: Mat3, s: Mat3) -> Mat3:
+    """r @ s @ r.T for a symmetric s."""
+    rs = matmul(r, s)
+    return symmetric(lambda i, j: dot(rs[i], r[j]))
 
 
 def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) -> Mat3:
@@ -215,6 +236,16 @@ def upper_rows(triangle: Sequence[Scalar], size: int) -> list[list[Scalar]]:
     """Rows of a symmetric matrix from its diagonal on, given one after another."""
     entries = iter(triangle)
     return [[next(entries) for _ in range(i, size)] for i in range(size)]
+
+
+def scalars_of(arrays: Any, dtype: jnp.dtype) -> Any:
+    """Arrays of one environment as scalars, or tuples of scalars, of one dtype."""
+
+    def scalars(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
+        array = jnp.asarray(array, dtype)
+        return array if array.ndim == 0 else tuple(array[i] for i in range(len(array)))
+
+    return jax.tree.map(scalars, arrays)
 
 
 def stored(values: Tree) -> Tree:
