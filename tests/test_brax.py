@@ -92,7 +92,7 @@ def test_randomization_by_brax_acts_on_the_physics():
         state = jax.jit(wrapped.step)(state, jnp.zeros((3, 6)))
         np.testing.assert_array_equal(state.done, 1.0)
     task = state.pipeline_state.task
-    np.testing.assert_allclose(task.parameters.gravity[:, 2], strengths)
+    np.testing.assert_allclose(task.parameters.entries["opt.gravity[2]"], strengths)
     # brax restores the first state at the end of an episode; one more step without an end.
     plain = jax.tree.map(lambda x: x[1], state)
     after = jax.jit(env.step)(plain, jnp.zeros(6))

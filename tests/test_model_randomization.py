@@ -63,8 +63,8 @@ def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 FIELDS = (
     "body_mass body_inertia body_invweight0 body_subtreemass dof_M0 geom_size geom_rbound "
-    "geom_aabb pair_solref pair_friction actuator_gainprm actuator_biasprm actuator_forcerange dof_armature "
-    "dof_damping dof_frictionloss geom_pos geom_quat opt.gravity"
+    "geom_aabb pair_solref pair_friction actuator_gainprm actuator_biasprm actuator_forcerange "
+    "dof_armature dof_damping dof_frictionloss geom_pos geom_quat opt.gravity"
 ).split()
 
 

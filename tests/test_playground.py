@@ -106,7 +106,8 @@ def test_randomization_by_playground_acts_on_the_physics():
         state.data.qvel[:, 6:9] - before, model.opt.gravity * env.dt, rtol=1e-3, atol=1e-6
     )
     ball = env.mj_model.body("ball_link").id
-    np.testing.assert_allclose(state.data.task.parameters.ball_mass, model.body_mass[:, ball])
+    entries = state.data.task.parameters.entries
+    np.testing.assert_allclose(entries[f"body_mass[{ball}]"], model.body_mass[:, ball])
     # Outside the randomised worlds, the model is the environment's own.
     assert env.mjx_model.body_mass.shape == (env.mj_model.nbody,)
 

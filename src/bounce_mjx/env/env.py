@@ -18,7 +18,7 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS, gives
 from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
     check_unedited,
@@ -238,7 +238,7 @@ class Env:
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, of_task))
         state = state._replace(task=task, command=self._moved(task, command))
-        if own_parameters.contact_damping is None:
+        if not gives(own_parameters, "contact_damping", "pair_solref"):
             impact = first_impact(world, self.mj_model)
             state = self._before_impact(state._replace(impact=impact), truth)
         if self._sensors.are_needed:

@@ -20,7 +20,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import Array, PhysicsParameters, check_shapes
 from bounce_mjx.physics.scalars import Scalar, add, maximum, mul, scale
 from bounce_mjx.robot.arm import raise_solver_limits
-from bounce_mjx.robot.model import Addresses, find_addresses, to_direct_solref
+from bounce_mjx.robot.model import find_addresses, to_direct_solref
 
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
 MIN_FRICTION = 1e-5
@@ -41,18 +41,19 @@ class Edit(NamedTuple):
     """Which of the parameter's numbers each entry has; by default, each has its own."""
 
 
-def edits(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[Edit, ...]:
+def edits(mj_model: mujoco.MjModel) -> tuple[Edit, ...]:
     """The table of the parameters' entries."""
+    addresses = find_addresses(mj_model)
     dofs, servos = np.array(addresses.arm_qvel), np.array(addresses.actuators)
     bodies, geoms = ([getattr(b, kind) for b in addresses.balls] for kind in ("body", "geom"))
-    pairs = _own_pairs(mj_model, addresses)
+    pairs = _own_pairs(mj_model)
     # A body with several joints is the link of the last one; the others have no mass.
-    links = link_bodies(mj_model, addresses)
+    links = link_bodies(mj_model)
     link = np.concatenate(links)
     joint = np.repeat(np.arange(len(links)), [len(x) for x in links])
     heavy = mj_model.body_mass[link] > 0.0
     link, joint = link[heavy], joint[heavy]
-    share = mj_model.body_mass[link] / link_masses(mj_model, addresses)[joint]
+    share = mj_model.body_mass[link] / link_masses(mj_model)[joint]
     return (
         Edit("ball_mass", "body_mass", bodies),
         Edit("ball_radius", "geom_size", (geoms, 0)),
@@ -81,8 +82,8 @@ class EditedModel:
     or scalars where they were edited. Reading is recorded.
     """
 
-    def __init__(self, mj_model: mujoco.MjModel, addresses: Addresses):
-        self.model, self.addresses = mj_model, addresses
+    def __init__(self, mj_model: mujoco.MjModel):
+        self.model, self.addresses = mj_model, find_addresses(mj_model)
         self.fields: dict[str, list[Scalar]] = {}
         """All entries, in C order, of each field that is edited or follows from edited ones."""
         self._edited: dict[str, set[int]] = {}
@@ -202,9 +203,7 @@ class EditedModel:
             entries[place] = value
 
 
-def edited(
-    mj_model: mujoco.MjModel, parameters: PhysicsParameters, addresses: Addresses | None = None
-) -> EditedModel:
+def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedModel:
     """The model in the world of one environment.
 
     Args:
@@ -213,14 +212,14 @@ def edited(
     Raises:
       UserError: an entry is not one of the model's, or the model lacks a contact pair.
     """
-    m, p = EditedModel(mj_model, addresses or find_addresses(mj_model)), parameters
+    m, p = EditedModel(mj_model), parameters
     if p.contact_stiffness is not None or p.contact_damping is not None:
         for pair in contact_pairs(mj_model):
             direct = to_direct_solref(mj_model.pair_solref[pair], mj_model.opt.timestep)
             m.put("pair_solref", pair, [-float(x) for x in direct])
     if p.contact_friction is not None:
         contact_pairs(mj_model)
-    for edit in edits(mj_model, m.addresses):
+    for edit in edits(mj_model):
         value = getattr(p, edit.parameter)
         if value is None:
             continue
@@ -231,12 +230,12 @@ def edited(
         each = [numbers[i if len(numbers) > 1 else 0] for i in of]
         m.put(edit.field, edit.index, list(map(mul, each, scales)))
     for name, value in (p.entries or {}).items():
-        m.put(*_entry(mj_model, name), [value])
+        m.put(*_entry(m, name), [value])
     _set_flags(m)
     return m
 
 
-def _entry(mj_model: mujoco.MjModel, name: str) -> tuple[str, tuple[int, ...]]:
+def _entry(m: EditedModel, name: str) -> tuple[str, tuple[int, ...]]:
     """Field and index of a name like `geom_size[3, 0]`.
 
     Raises:
@@ -245,22 +244,21 @@ def _entry(mj_model: mujoco.MjModel, name: str) -> tuple[str, tuple[int, ...]]:
     field, _, inner = name.removesuffix("]").partition("[")
     try:
         index = tuple(int(number) for number in inner.split(",") if number)
-        entry = EditedModel(mj_model, find_addresses(mj_model)).places(field, index)
+        if m.places(field, index).ndim == 0:
+            return field, index
     except (AttributeError, ValueError, IndexError):
-        entry = np.zeros(2)
-    if entry.ndim:
-        raise UserError(
-            f"the physics parameter entries has {name}, which is no entry of an MjModel; give a "
-            "field with the index of one number, such as dof_damping[2]"
-        )
-    return field, index
+        pass
+    raise UserError(
+        f"{name} is no entry of an MjModel; give a field with the index of one number, such as "
+        "dof_damping[2]"
+    )
 
 
 def _set_flags(m: EditedModel) -> None:
     """Sets what an edit needs in order to act. The friction of geoms acts as in a contact without a
     pair, and of other geoms than a pair's, only that of those that collide would."""
     rough, pairs = set(m.rows("geom_friction")), set(m.rows("pair_friction"))
-    for pair in _own_pairs(m.model, m.addresses):
+    for pair in _own_pairs(m.model):
         geoms = [int(m.model.pair_geom1[pair]), int(m.model.pair_geom2[pair])]
         if pair in pairs or not rough.intersection(geoms):
             continue
@@ -301,50 +299,40 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, as NumPy arrays. A servo without a limit has an infinite one, and
-    the friction of the contact is None."""
-    m, addresses = mj_model, find_addresses(mj_model)
-    own: dict[str, Array] = {}
-    for edit in edits(m, addresses):
+    """The model's own numbers, as NumPy arrays, except for the contact's. A servo without a limit
+    has an infinite one."""
+    m, own = mj_model, {}
+    for edit in edits(m):
         owner, _, name = edit.field.rpartition(".")
         values = getattr(m.opt if owner else m, name)[edit.index] / edit.scale
         own.setdefault(edit.parameter, np.array(values))
-    servos = list(addresses.actuators)
+    servos = list(find_addresses(m).actuators)
     least = np.min(np.abs(m.actuator_forcerange[servos]), axis=1)
     own["force_limit"] = np.where(m.actuator_forcelimited[servos], least, np.inf)
     own["link_mass"] = link_masses(m)
-    for name in ("ball_mass", "ball_radius"):
-        own[name] = own[name][0]
-    for name in ("contact_stiffness", "contact_damping", "contact_friction"):
-        own[name] = None
-    if _own_pairs(m, addresses):
-        own["contact_stiffness"], own["contact_damping"] = map(np.array, direct_solref(m))
+    own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
+    own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
     return PhysicsParameters(**own)
 
 
-def ball_radius(
-    mj_model: mujoco.MjModel, parameters: PhysicsParameters, addresses: Addresses
-) -> Scalar:
+def ball_radius(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> Scalar:
     """Radius of the first ball in the world of one environment, m."""
-    own = mj_model.geom_size[addresses.ball_geom, 0]
-    given = own if parameters.ball_radius is None else parameters.ball_radius
-    return (parameters.entries or {}).get(f"geom_size[{addresses.ball_geom}, 0]", given)
+    geom, given = find_addresses(mj_model).ball_geom, parameters.ball_radius
+    own = mj_model.geom_size[geom, 0] if given is None else given
+    return (parameters.entries or {}).get(f"geom_size[{geom}, 0]", own)
 
 
-def link_bodies(
-    mj_model: mujoco.MjModel, addresses: Addresses | None = None
-) -> tuple[np.ndarray, ...]:
+def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
     """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body with
     several joints belongs to the last one, and the others have no bodies."""
-    m, joints = mj_model, (addresses or find_addresses(mj_model)).arm_joints
+    m, joints = mj_model, find_addresses(mj_model).arm_joints
     last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
     return tuple(np.flatnonzero(last_joint == j) for j in joints)
 
 
-def link_masses(mj_model: mujoco.MjModel, addresses: Addresses | None = None) -> np.ndarray:
+def link_masses(mj_model: mujoco.MjModel) -> np.ndarray:
     """Masses [n] of the acting joints' links, kg."""
-    links = link_bodies(mj_model, addresses)
-    return np.array([np.sum(mj_model.body_mass[bodies]) for bodies in links])
+    return np.array([np.sum(mj_model.body_mass[bodies]) for bodies in link_bodies(mj_model)])
 
 
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
@@ -360,7 +348,7 @@ def contact_pairs(mj_model: mujoco.MjModel) -> list[int]:
     Raises:
       UserError: it has no pair.
     """
-    pairs = _own_pairs(mj_model, find_addresses(mj_model))
+    pairs = _own_pairs(mj_model)
     if not pairs:
         raise UserError(
             "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
@@ -369,8 +357,9 @@ def contact_pairs(mj_model: mujoco.MjModel) -> list[int]:
     return pairs
 
 
-def _own_pairs(mj_model: mujoco.MjModel, addresses: Addresses) -> list[int]:
+def _own_pairs(mj_model: mujoco.MjModel) -> list[int]:
     """`contact_pairs`; none if the first ball's with the paddle is missing."""
+    addresses = find_addresses(mj_model)
     geoms = {addresses.paddle_geom, *(ball.geom for ball in addresses.balls)}
     both = zip(mj_model.pair_geom1.tolist(), mj_model.pair_geom2.tolist(), strict=True)
     pairs = [set(pair) for pair in both]

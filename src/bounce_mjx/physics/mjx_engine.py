@@ -68,7 +68,7 @@ def step(
         return mjx.step(_with_saturated_servos(model, constants, data), data)
 
     with _full_precision():
-        model = in_world(constants, parameters)
+        model = world_model(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
             pushed = np.concatenate([ball.qvel[:3] for ball in balls])
@@ -139,15 +139,15 @@ def paddle_position(
 ) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
     with _full_precision():
-        model = in_world(constants, parameters)
+        model = world_model(constants, parameters)
         data = mjx.make_data(model).replace(qpos=qpos)
         return mjx.kinematics(model, data).geom_xpos[constants.addresses.paddle_geom]
 
 
-def in_world(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
+def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     """Model with the parameters of one environment."""
     numbers = scalars_of(parameters, jnp.result_type(float))
-    m = edited(constants.mj_model, numbers, constants.addresses).derive()
+    m = edited(constants.mj_model, numbers).derive()
     # MJX transforms every geom, even one flagged as sharing its body's frame.
     fields = {x: m.array(x) for x in m.fields if x not in ("geom_sameframe", "pair_dim")}
     if "pair_friction" in fields:

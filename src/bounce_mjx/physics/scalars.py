@@ -248,7 +248,13 @@ def scalars_of(arrays: Any, dtype: jnp.dtype) -> Any:
     return jax.tree.map(scalars, arrays)
 
 
-def stored(values: Tree) -> Tree:
+def zero_like(x: jax.Array) -> jax.Array:
+    """0 as a result of x: a constant would have another layout in a GPU kernel than the results of
+    a loop that starts with it."""
+    return lax.sub(x, x)
+
+
+def not_inlined(values: Tree) -> Tree:
     """The same scalars, each computed only once.
 
     On a CPU, XLA emits one loop per result and recomputes cheap intermediate values in each loop.
@@ -256,9 +262,9 @@ def stored(values: Tree) -> Tree:
     """
     leaves, tree = jax.tree.flatten(values)
     with set_xla_metadata(inlineable="false"):
-        computed = iter(_times_one(*(x for x in leaves if not is_constant(x))))
+        computed = iter(_same(*(x for x in leaves if not is_constant(x))))
     return tree.unflatten(x if is_constant(x) else next(computed) for x in leaves)
 
 
 # The product with 1 keeps the call: JAX removes a function that only returns its arguments.
-_times_one = jax.jit(lambda *leaves: tuple(lax.mul(x, jnp.ones_like(x)) for x in leaves))
+_same = jax.jit(lambda *leaves: tuple(lax.mul(x, jnp.ones_like(x)) for x in leaves))

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.lazy import silence_mjx
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters, gives
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 Feature = tuple[str, str, bool]
@@ -208,7 +208,10 @@ _WITH_SOLREF = ("pair_{}", "geom_{}", "jnt_{}", "dof_{}", "eq_{}", "tendon_{}_li
 
 def _friction(m: mujoco.MjModel, parameters: PhysicsParameters) -> Iterator[Feature]:
     """Features of sliding and dry friction, of the model or of a world."""
-    given = parameters.contact_friction is not None, parameters.frictionloss is not None
+    given = (
+        gives(parameters, "contact_friction", "pair_friction", "geom_friction"),
+        gives(parameters, "frictionloss", "dof_frictionloss"),
+    )
     sliding = bool(given[0] or np.any(m.pair_dim > 1))
     dry = bool(given[1] or np.any(m.dof_frictionloss))
     some = sliding and not given[0] and np.any(m.pair_dim == 1)

@@ -342,7 +342,7 @@ def draw_world(
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a drawn world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import own_parameters
+    from bounce_mjx.physics.edited import direct_solref, own_parameters
     from bounce_mjx.physics.parameters import PhysicsParameters
 
     terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
@@ -352,10 +352,10 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     for name, (*_, parameter, operation) in terms.items():
         drawn, value = world[name], getattr(own, parameter)
         if operation is None:
-            given[parameter] = contact_damping(drawn, float(own.contact_stiffness))
+            given[parameter] = contact_damping(drawn, direct_solref(mj_model)[0])
         else:
-            own_value = None if value is None else jnp.asarray(value, drawn.dtype)
-            given[parameter] = operation(own_value, drawn)
+            value = None if value is None else jnp.asarray(value, drawn.dtype)
+            given[parameter] = operation(value, drawn)
     return PhysicsParameters(**given)
 
 

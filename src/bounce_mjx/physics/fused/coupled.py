@@ -30,9 +30,10 @@ from bounce_mjx.physics.scalars import (
     dot,
     is_constant,
     mul,
-    stored,
+    not_inlined,
     sub,
     upper_rows,
+    zero_like,
 )
 
 # Steps, and steps of the line search in each. Of 180,000 problems of three contacts with the
@@ -79,12 +80,12 @@ def coupled_forces(
         Cone(touches, edge_regulariser(model, softness))
         for model, touches, softness in zip(models, touching, softnesses, strict=True)
     ]
-    q, c = stored((q, c))
+    q, c = not_inlined((q, c))
 
     def newton_step(_, x: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
         return _newton_step(cones, q, c, x)
 
-    start = tuple(entry - entry for entry in c)
+    start = tuple(map(zero_like, c))
     x = lax.fori_loop(0, _NEWTON_STEPS, newton_step, start)
     return tuple(map(mul, x, units))
 
@@ -106,7 +107,7 @@ def _newton_step(
     system = [[dot(column, of_q[k : k + 3]) for of_q in q_columns] for k, column in columns]
     for i, row in enumerate(system):
         row[i] = add(row[i], 1.0)
-    factor = stored(chain.cholesky(system))
+    factor = not_inlined(chain.cholesky(system))
     pulls = [dot(column, q_lack[k : k + 3]) for k, column in columns]
     z = chain.solve_upper(factor, chain.solve_lower(factor, pulls))
     step, y_step = list(lack), list(q_lack)
@@ -114,7 +115,7 @@ def _newton_step(
         for i in range(3):
             step[k + i] = sub(step[k + i], mul(column[i], size))
         y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, of_q, strict=True)]
-    x, y, step, y_step = stored((list(x), y, step, y_step))
+    x, y, step, y_step = not_inlined((list(x), y, step, y_step))
     return tuple(_ahead(x, _line_search(cones, (x, y), (step, y_step)), step))
 
 
@@ -150,7 +151,7 @@ def _line_search(
         inside = (length > low) & (length < high)
         return low, high, jnp.where(inside, length, 0.5 * (low + high))
 
-    zero = y_step[0] - y_step[0]
+    zero = zero_like(y_step[0])
     return lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))[2]
 
 

@@ -28,9 +28,9 @@ from bounce_mjx.physics.scalars import (
     is_constant,
     is_zero,
     mul,
+    not_inlined,
     scalars_of,
     scale,
-    stored,
     sub,
     vadd,
 )
@@ -142,10 +142,10 @@ def _in_any_world(model: FusedModel, parameters: PhysicsParameters) -> FusedMode
     return _in_world_of_ones(model, jax.tree.structure(jax.tree.map(ones, parameters)))
 
 
-@functools.lru_cache
+@functools.lru_cache(maxsize=16)
 def _in_world_of_ones(model: FusedModel, given: jax.tree_util.PyTreeDef) -> FusedModel:
     ones = given.unflatten([1.0] * given.num_leaves)
-    return read_model(model.mj_model, ones, model.addresses)
+    return read_model(model.mj_model, ones)
 
 
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
@@ -180,7 +180,7 @@ def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     )
 
 
-@functools.lru_cache
+@functools.lru_cache(maxsize=16)
 def _substeps(
     model: FusedModel,
     coordinates: jax.tree_util.PyTreeDef,
@@ -197,7 +197,7 @@ def _substeps(
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
-        world = read_model(model.mj_model, parameters, model.addresses)
+        world = read_model(model.mj_model, parameters)
         air = {"air_drag": control.air_drag, "air_lift": control.air_lift}
         air = {name: value for name, value in air.items() if value is not None}
         world = dataclasses.replace(world, **air)
@@ -228,14 +228,14 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
     return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
 
 
-@functools.lru_cache
+@functools.lru_cache(maxsize=16)
 def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec3]:
     """`paddle_position` as a function of the joint angles and the given parameters; cached
     like `_substeps`."""
     n = len(model.links)
 
     def position(*scalars: Scalar) -> Vec3:
-        world = read_model(model.mj_model, given.unflatten(scalars[n:]), model.addresses)
+        world = read_model(model.mj_model, given.unflatten(scalars[n:]))
         return paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
 
     return jax.jit(position, inline=True)
@@ -351,8 +351,8 @@ def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -
 
 
 def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
-    """`stored` in the long programs of models with friction, else the identity."""
+    """`not_inlined` in the long programs of models with friction, else the identity."""
     frictional = motion.balls[0].turning is not None or any(
         map(joint_friction.has_friction, model.links)
     )
-    return stored if frictional else lambda values: values
+    return not_inlined if frictional else lambda values: values

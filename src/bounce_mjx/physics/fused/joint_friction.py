@@ -23,7 +23,17 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused import chain
-from bounce_mjx.physics.scalars import Scalar, add, dot, is_zero, mul, neg, stored, sub
+from bounce_mjx.physics.scalars import (
+    Scalar,
+    add,
+    dot,
+    is_zero,
+    mul,
+    neg,
+    not_inlined,
+    sub,
+    zero_like,
+)
 
 Scalars = Sequence[Scalar]
 ContactForce = Callable[[tuple[Scalar, ...], tuple[Scalar, ...]], tuple[Scalar, ...]]
@@ -83,7 +93,7 @@ def contact_and_friction(
     if not joints:
         return contact_force(contact_matrix, contact_offset), friction
     units = [[1.0 if i == j else 0.0 for i in range(len(links))] for j in joints]
-    half = stored([chain.solve_lower(factor, unit) for unit in units])
+    half = not_inlined([chain.solve_lower(factor, unit) for unit in units])
     matrix = [[dot(a, b) for b in half] for a in half]
     for i, j in enumerate(joints):
         matrix[i][i] = add(matrix[i][i], links[j].friction_softness)
@@ -99,7 +109,7 @@ def contact_and_friction(
         contact_offset=contact_offset,
     )
     limits = [links[j].frictionloss for j in joints]
-    contact, solved = _solve(stored(problem), limits, contact_force)
+    contact, solved = _solve(not_inlined(problem), limits, contact_force)
     for j, force in zip(joints, solved, strict=True):
         friction[j] = force
     return contact, friction
@@ -113,14 +123,13 @@ def _solve(
     def one_round(_, forces):
         contact, friction = forces
         for _ in range(_SWEEPS):
-            friction = stored(_sweep(problem, limits, contact, friction))
+            friction = not_inlined(_sweep(problem, limits, contact, friction))
             if len(contact) == 1:
                 # Without sliding friction the contact's force costs next to nothing.
                 contact = contact_force(problem.contact_matrix, _contact_offset(problem, friction))
-        return stored(_eliminate_sticking(problem, limits, friction, contact_force))
+        return not_inlined(_eliminate_sticking(problem, limits, friction, contact_force))
 
-    # Not a constant, which Mosaic would keep in another layout than the loop's results.
-    none = tuple(x - x for x in problem.offset)
+    none = tuple(map(zero_like, problem.offset))
     start = contact_force(problem.contact_matrix, problem.contact_offset), none
     return lax.fori_loop(0, _ROUNDS, one_round, start)
 
@@ -155,14 +164,14 @@ def _eliminate_sticking(
         [entry if i == j else mul(entry, mul(sticks[i], sticks[j])) for j, entry in enumerate(row)]
         for i, row in enumerate(problem.matrix)
     ]
-    factor = stored(chain.cholesky(masked))
+    factor = not_inlined(chain.cholesky(masked))
     pulls = [
         mul(s, add(x, dot(row, kept)))
         for s, x, row in zip(sticks, problem.offset, problem.matrix, strict=True)
     ]
     half = chain.solve_lower(factor, pulls)
     half_rows = [chain.solve_lower(factor, list(map(mul, row, sticks))) for row in problem.coupling]
-    half, half_rows = stored((half, half_rows))
+    half, half_rows = not_inlined((half, half_rows))
     size = len(half_rows)
     pairs = [(i, j) for i in range(size) for j in range(i, size)]
     contact = contact_force(

@@ -114,9 +114,7 @@ class FusedModel:
 
 
 def read_model(
-    mj_model: mujoco.MjModel,
-    parameters: PhysicsParameters = MODEL_PARAMETERS,
-    addresses: Addresses | None = None,
+    mj_model: mujoco.MjModel, parameters: PhysicsParameters = MODEL_PARAMETERS
 ) -> FusedModel:
     """Reads a compiled model that the engine supports (`physics/support.py`), in the world of one
     environment.
@@ -127,7 +125,7 @@ def read_model(
     Raises:
       UserError: the engine does not read an entry that the parameters change.
     """
-    m = edited(mj_model, parameters, addresses)
+    m = edited(mj_model, parameters)
     c, addresses = m.model, m.addresses
     links, frames = _read_links(m)
     compensated = _compensated_share(c, addresses)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.scalars import Scalar, dot, neg, stored, upper_rows
+from bounce_mjx.physics.scalars import Scalar, dot, neg, not_inlined, upper_rows
 
 
 def normal_forces(
@@ -30,8 +30,8 @@ def normal_forces(
     if len(touching) == 1:
         forces = nonnegative(rows, pushes)
     else:
-        problem = stored(_with_touching_alone(rows, pushes, touching))
-        forces = stored(nonnegative(*problem))
+        problem = not_inlined(_with_touching_alone(rows, pushes, touching))
+        forces = not_inlined(nonnegative(*problem))
     return tuple(jnp.where(t, force, 0.0) for t, force in zip(touching, forces, strict=True))
 
 

@@ -43,7 +43,7 @@ from bounce_mjx.physics.scalars import (
 )
 
 Keep = Callable[[Any], Any]
-"""`stored`, or the identity."""
+"""`not_inlined`, or the identity."""
 
 
 class Response(NamedTuple):
