@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
-from bounce_mjx.physics.control import Control, Moving, drag, servo_target
+from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
 from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turn, turned, turning_of
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.scalars import (
-    Quaternion,
     Scalar,
     Vec3,
     add,
@@ -35,7 +34,6 @@ from bounce_mjx.physics.scalars import (
     vadd,
 )
 from bounce_mjx.physics.state import PhysicsState
-from bounce_mjx.robot.model import BallAddresses
 
 
 class Ball(NamedTuple):
@@ -69,64 +67,48 @@ def step(
     centre and the spin stays constant, so one rotation over the whole interval updates the
     orientation, unless the spin lifts the ball.
     """
-    addresses = model.addresses
+    at = model.addresses
+    qpos, qvel = _entries(state.qpos, range(model.nq)), _entries(state.qvel, range(model.nv))
     world = _in_any_world(model, parameters)
     turns = world.contacts[0].friction is not None or control.air_lift is not None
-    motion = Motion(
-        q=tuple(state.qpos[i] for i in addresses.arm_qpos),
-        v=tuple(state.qvel[i] for i in addresses.arm_qvel),
-        balls=tuple(_ball(at, state, turns) for at in addresses.balls),
-    )
+    spinning = [(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls]
+    velocities = [_entries(qvel, x.qvel[:3]) for x in at.balls]
     if control.ball_push is not None:
         pushes = jnp.reshape(control.ball_push, (-1, 3))
-        pushed = [
-            ball._replace(velocity=vadd(ball.velocity, tuple(pushes[k, i] for i in range(3))))
-            for k, ball in enumerate(motion.balls)
-        ]
-        motion = motion._replace(balls=tuple(pushed))
+        velocities = [vadd(v, _entries(pushes[k], range(3))) for k, v in enumerate(velocities)]
+    balls = [
+        Ball(_entries(qpos, x.qpos[:3]), velocity, turning_of(*spin) if turns else None)
+        for x, velocity, spin in zip(at.balls, velocities, spinning, strict=True)
+    ]
+    motion = Motion(_entries(qpos, at.arm_qpos), _entries(qvel, at.arm_qvel), tuple(balls))
     leaves, tree = jax.tree.flatten(motion)
-    inputs = (_arm_control(control, addresses.actuators), parameters)
+    inputs = (_arm_control(control, at.actuators), parameters)
     numbers, given = jax.tree.flatten(scalars_of(inputs, state.qpos.dtype))
     advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
     motion = tree.unflatten(advance(*leaves, *numbers))
-    turned = [
-        (turn(*_orientation_and_spin(at, state), num_substeps * model.dt), None)
-        if ball.turning is None
-        else (ball.turning.orientation, spin_in_ball(ball.turning))
-        for at, ball in zip(addresses.balls, motion.balls, strict=True)
-    ]
 
-    qpos = [state.qpos[i] for i in range(model.nq)]
-    qvel = [state.qvel[i] for i in range(model.nv)]
-    _put(qpos, addresses.arm_qpos, motion.q)
-    _put(qvel, addresses.arm_qvel, motion.v)
-    for at, ball, (quaternion, spin) in zip(addresses.balls, motion.balls, turned, strict=True):
-        _put(qpos, at.qpos, (*ball.position, *quaternion))
-        _put(qvel, at.qvel[:3], ball.velocity)
-        if spin is not None:
-            _put(qvel, at.qvel[3:], spin)
+    qpos, qvel = list(qpos), list(qvel)
+    _put(qpos, at.arm_qpos, motion.q)
+    _put(qvel, at.arm_qvel, motion.v)
+    for x, ball, spin in zip(at.balls, motion.balls, spinning, strict=True):
+        if ball.turning is None:
+            spin = turn(*spin, num_substeps * model.dt), spin[1]
+        else:
+            spin = ball.turning.orientation, spin_in_ball(ball.turning)
+        _put(qpos, x.qpos, (*ball.position, *spin[0]))
+        _put(qvel, x.qvel, (*ball.velocity, *spin[1]))
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 
-def _ball(at: BallAddresses, state: PhysicsState, turns: bool) -> Ball:
-    return Ball(
-        position=tuple(state.qpos[i] for i in at.qpos[:3]),
-        velocity=tuple(state.qvel[i] for i in at.qvel[:3]),
-        turning=turning_of(*_orientation_and_spin(at, state)) if turns else None,
-    )
+def _entries(
+    coordinates: jax.Array | Sequence[Scalar], indices: Sequence[int]
+) -> tuple[Scalar, ...]:
+    return tuple(coordinates[i] for i in indices)
 
 
 def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:
     for i, value in zip(indices, values, strict=True):
         coordinates[i] = value
-
-
-def _orientation_and_spin(at: BallAddresses, state: PhysicsState) -> tuple[Quaternion, Vec3]:
-    """Orientation and spin of a ball in MuJoCo's coordinates."""
-    return (
-        tuple(state.qpos[i] for i in at.qpos[3:]),
-        tuple(state.qvel[i] for i in at.qvel[3:]),
-    )
 
 
 def _in_any_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
@@ -165,19 +147,10 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
 def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     """Control of the arm's servos in the order of the joints, without the push."""
 
-    def chosen(ctrl: jax.Array | None) -> jax.Array | None:
-        return None if ctrl is None else jnp.stack([ctrl[i] for i in actuators])
+    def chosen(x: jax.Array) -> jax.Array:
+        return jnp.stack([x[i] for i in actuators]) if jnp.ndim(x) else x
 
-    moving = control.moving
-    if moving is not None:
-        moving = Moving(*map(chosen, moving[:-1]), moving.duration)
-    return control._replace(
-        moving=moving,
-        ctrl=chosen(control.ctrl),
-        previous=chosen(control.previous),
-        filtered=chosen(control.filtered),
-        ball_push=None,
-    )
+    return jax.tree.map(chosen, control._replace(ball_push=None))
 
 
 @functools.lru_cache(maxsize=16)
@@ -219,11 +192,9 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
 
     def of_servo(i: int) -> Control:
-        def own(entry: Any) -> Any:
-            return entry[i] if isinstance(entry, tuple) else entry
-
-        moving = control.moving and Moving(*map(own, control.moving))
-        return Control(*map(own, control._replace(moving=None)))._replace(moving=moving)
+        return jax.tree.map(
+            lambda x: x[i] if type(x) is tuple else x, control, is_leaf=lambda x: type(x) is tuple
+        )
 
     return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
 
