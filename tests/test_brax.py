@@ -68,12 +68,6 @@ def test_an_engine_of_brax_is_not_used():
     assert env.backend == "fused"
 
 
-def test_the_bare_environment_refuses_randomization_by_brax(env):
-    """It has no `sys`, which brax's domain randomisation replaces."""
-    with pytest.raises(UserError, match="randomization_fn"):
-        training.wrap(env, randomization_fn=lambda system: (system, None))
-
-
 @pytest.mark.slow
 def test_randomization_by_brax_acts_on_the_physics():
     """After a step of free fall, the ball's speed is that of the world's gravity; a time-out keeps

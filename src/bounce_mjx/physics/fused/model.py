@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -152,7 +153,7 @@ def read_model(
         nq=c.nq,
         nv=c.nv,
         mj_model=c,
-        fingerprint=fingerprint(c) if parameters == MODEL_PARAMETERS else b"",
+        fingerprint=b"" if jax.tree.leaves(parameters) else fingerprint(c),
         weight=1.0 - (compensated or 0.0),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
