@@ -161,20 +161,6 @@ def test_doctor_says_what_an_issue_needs(monkeypatch, capsys) -> None:
     assert said["extra all"] == "lacks nonesuch-plugin, nonesuch (pip install 'bounce_mjx[all]')"
 
 
-def test_missing_package(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    # None stands for a module that cannot be imported.
-    monkeypatch.setitem(sys.modules, "pydantic", None)
-    monkeypatch.delitem(sys.modules, "bounce_mjx.commands.plot", raising=False)
-    monkeypatch.delitem(sys.modules, "bounce_mjx.config.settings", raising=False)
-    monkeypatch.delitem(sys.modules, "bounce_mjx.config.command_line", raising=False)
-    with pytest.raises(SystemExit) as exit_info:
-        console_script.main(["plot"])
-    assert exit_info.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: the package pydantic is not installed"), error
-    assert "pip install -e ." in error
-
-
 PYTHON_3_10 = "import sys; sys.version_info = (3, 10, 9, 'final', 0)\n"
 
 
@@ -215,9 +201,7 @@ def test_a_start_without_compilation_is_said(capsys) -> None:
 
 def test_every_command_is_a_module() -> None:
     for name in console_script.COMMANDS:
-        assert callable(
-            importlib.import_module(f"bounce_mjx.commands.{name.replace('-', '_')}").main
-        )
+        assert callable(importlib.import_module(f"bounce_mjx.commands.{name}").main)
 
 
 @pytest.mark.parametrize("options", [[], ["-OO"]], ids=["", "without docstrings"])

@@ -296,7 +296,7 @@ PACKAGE = Path(bounce_mjx.__file__).parent
 
 def test_physics_page_names_the_commands_that_join_loops() -> None:
     (listed,) = re.findall(r"commands that simulate \((.+?)\)", content("physics.md"), re.DOTALL)
-    files = {name: f"commands/{name.replace('-', '_')}.py" for name in console_script.COMMANDS}
+    files = {name: f"commands/{name}.py" for name in console_script.COMMANDS}
     joining = {
         n for n, f in files.items() if re.search(r"set_up_jax\([^)]", (PACKAGE / f).read_text())
     }
@@ -316,6 +316,16 @@ def test_map_has_every_folder_of_the_package() -> None:
         for name in [*cell.split("`, `"), *re.findall(r"`([\w/]+(?:\.\w+|/))`", content)]:
             above = [CHECKOUT, *(CHECKOUT / first for first in cell.split("`, `"))]
             assert any((folder / name).exists() for folder in above), name
+
+
+def test_the_reading_order_is_of_files_and_short() -> None:
+    text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = text.split("## Read in this order\n")[1].split("\n## ")[0]
+    numbers, files = zip(
+        *re.findall(r"^\| (\d+) \| `(.+?)` \|", section, re.MULTILINE), strict=True
+    )
+    assert [*map(int, numbers)] == [*range(1, len(files) + 1)] and len(files) <= 25
+    assert not [f for f in files if not any((r / f).is_file() for r in (CHECKOUT, PACKAGE))]
 
 
 def test_task_page_has_the_weights() -> None:

@@ -8,12 +8,22 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import TopicsConfig
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import read_preset
+
+
+class TopicsConfig(StrictModel):
+    """Topics of a ROS bag."""
+
+    joints: str = "/joint_states"
+    """JointState with the measured joint angles."""
+    targets: str = "/servo_targets"
+    """JointState or Float64MultiArray with the servo targets."""
+    ball: str = "/ball"
+    """PointStamped or PoseStamped with the ball's position."""
 
 
 class IdentifyCommand(StrictModel):

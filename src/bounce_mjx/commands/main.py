@@ -9,7 +9,6 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from types import ModuleType
 
 import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -65,23 +64,6 @@ def main(args: Sequence[str] | None = None) -> None:
             # Where this library is missing, MuJoCo's import would fail, also in a command that
             # draws nothing; one that draws tries the library itself (`viewers.offscreen`).
             os.environ["MUJOCO_GL"] = "disabled"
-            _import("mujoco")
+            importlib.import_module("mujoco")
             os.environ["MUJOCO_GL"] = opengl
-        _import(f"bounce_mjx.commands.{name}").main(rest)
-
-
-def _import(name: str) -> ModuleType:
-    """Imports a command's module.
-
-    Raises:
-      UserError: a package that it needs is missing.
-    """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith("bounce_mjx"):
-            raise
-        raise UserError(
-            f"the package {error.name} is not installed for {sys.executable}; in the folder of "
-            "bounce_mjx run: pip install -e . (or start the command with uv run)"
-        ) from error
+        importlib.import_module(f"bounce_mjx.commands.{name}").main(rest)

@@ -121,17 +121,6 @@ class WorldCommand(ActorCommand):
         return config if self.world is None else in_world(config, self.world)[0]
 
 
-class TopicsConfig(StrictModel):
-    """Topics of a ROS bag."""
-
-    joints: str = "/joint_states"
-    """JointState with the measured joint angles."""
-    targets: str = "/servo_targets"
-    """JointState or Float64MultiArray with the servo targets."""
-    ball: str = "/ball"
-    """PointStamped or PoseStamped with the ball's position."""
-
-
 class PolicyCommand(RunCommand):
     """A command line about a trained policy."""
 

@@ -7,7 +7,7 @@ from rich.console import Console
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import PROG, config_of, read_command
+from bounce_mjx.training.command import config_of, read_command
 
 
 def main(args: Sequence[str]) -> None:
@@ -38,7 +38,7 @@ def main(args: Sequence[str]) -> None:
 
             address = command.watch_host, command.watch_port
             page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
-        run_command(command, PPOTrainer, PROG, page)
+        run_command(command, PPOTrainer, page)
         if page is not None:
             page.wait()
             # A thread that simulates cannot be stopped.

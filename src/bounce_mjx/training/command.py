@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import pydantic
 import tyro
@@ -96,15 +96,7 @@ class _FirstFlags(Options):
     total_steps: Steps | None = None
 
 
-CommandT = TypeVar("CommandT", bound=TrainCommand)
-
-
-def read_command(
-    args: Sequence[str],
-    machine: Path | None = None,
-    kind: type[CommandT] = TrainCommand,
-    prog: str = PROG,
-) -> CommandT:
+def read_command(args: Sequence[str], machine: Path | None = None) -> TrainCommand:
     """Reads a command line on top of the preset, or of the resumed run's config. Its `config` are
     the files of that preset, each of which lies on those before it.
 
@@ -115,9 +107,9 @@ def read_command(
       UserError: a flag or the preset is wrong, or a flag changes a key of the resumed run that must
         stay the same.
     """
-    first = parse_first(_FirstFlags, args, prog=prog)
+    first = parse_first(_FirstFlags, args, prog=PROG)
     if first.resume:
-        return _resumed(first, args, kind, prog)
+        return _resumed(first, args)
     if first.warm_start and first.robot:
         raise UserError(
             "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
@@ -128,13 +120,13 @@ def read_command(
         base = warm_config(first.warm_start, first.config, first.task, first.world, machine)
     else:
         base = read_preset(first.config, first.robot, first.task, first.world, machine)
-    command = _parse(args, base, kind, prog)
+    command = _parse(args, base)
     files = preset_files(first.config, base.task, machine)
     # The run of a warm start by its own name, if it was the latest.
     return command.model_copy(update={"config": tuple(files), "warm_start": base.warm_start})
 
 
-def _resumed(first: _FirstFlags, args: Sequence[str], kind: type[CommandT], prog: str) -> CommandT:
+def _resumed(first: _FirstFlags, args: Sequence[str]) -> TrainCommand:
     """A command line on top of a resumed run's config."""
     for flag in ("config", "robot", "world"):
         if getattr(first, flag):
@@ -154,7 +146,7 @@ def _resumed(first: _FirstFlags, args: Sequence[str], kind: type[CommandT], prog
         )
     longer = first.total_steps is not None and _is_solved(run)
     start = base.model_copy(update={"stop_when_solved": False}) if longer else base
-    command = _parse(args, start, kind, prog).model_copy(update={"resume": run, "task": base.task})
+    command = _parse(args, start).model_copy(update={"resume": run, "task": base.task})
     if changed := differing_keys(base, config_of(command)) - RESUMABLE_KEYS:
         raise UserError(
             f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or start "
@@ -163,10 +155,10 @@ def _resumed(first: _FirstFlags, args: Sequence[str], kind: type[CommandT], prog
     return command
 
 
-def _parse(args: Sequence[str], base: TrainConfig, kind: type[CommandT], prog: str) -> CommandT:
+def _parse(args: Sequence[str], base: TrainConfig) -> TrainCommand:
     """A command line on top of a config."""
-    own_class = train_config(base.env.task, kind)
-    return parse(own_class, args, prog=prog, default=own_class(**dict(base)))
+    own_class = train_config(base.env.task, TrainCommand)
+    return parse(own_class, args, prog=PROG, default=own_class(**dict(base)))
 
 
 def _is_solved(run: Path) -> bool:

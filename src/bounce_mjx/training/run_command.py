@@ -26,13 +26,11 @@ from bounce_mjx.training.trainer import Trainer, Watcher
 def run_command(
     command: TrainCommand,
     make_trainer: Callable[[TrainConfig, Env], Trainer],
-    prog: str,
     watcher: Watcher | None = None,
 ) -> None:
     """Trains according to the command, and prints the results.
 
     Args:
-      prog: the user's command, to which `--resume` may be added.
       watcher: receives the progress of the first seed.
 
     Raises:
@@ -49,7 +47,7 @@ def run_command(
         if command.warm_start is not None:
             say(console, f"warm start: {command.warm_start}")
     try:
-        seeds = train(config_of(command), console, make_trainer, command, watcher, prog)
+        seeds = train(config_of(command), console, make_trainer, command, watcher)
     except TrainingStopped as stop:
         say(console, str(stop))
         # Does not wait for a compilation or an evaluation in another thread.
