@@ -29,7 +29,7 @@ from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.gaussian import Gaussian
+from bounce_mjx.learning.networks import Gaussian
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import (

@@ -12,8 +12,7 @@ from brax.training.agents.ppo.networks import make_ppo_networks
 from brax.training.distribution import NormalDistribution
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.gaussian import Gaussian
-from bounce_mjx.learning.networks import orthogonal
+from bounce_mjx.learning.networks import Gaussian, orthogonal
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import (
     MAX_NORMALIZED,

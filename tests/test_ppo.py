@@ -12,8 +12,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning import policy, ppo
-from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import generalized_advantages
 from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.task import Task
 from bounce_mjx.tasks.bounce import Bounce

@@ -6,13 +6,11 @@ change.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-
-from bounce_mjx.learning.gaussian import Gaussian
 
 _GAIN = math.sqrt(2.0)
 # A small gain, so that the first mean actions are near 0.
@@ -44,6 +42,27 @@ def orthogonal(gain: float) -> Callable[..., jax.Array]:
         return gain * (columns if shape == size else columns.T)
 
     return init
+
+
+class Gaussian(NamedTuple):
+    """Independent normal distributions of A variables."""
+
+    mean: jax.Array
+    """Means [..., A], which are also the mode."""
+    std: jax.Array
+    """Standard deviations [..., A]."""
+
+    def log_prob(self, value: jax.Array) -> jax.Array:
+        """Logarithm [...] of the joint density at a value [..., A]."""
+        deviation = (value - self.mean) / self.std
+        log_density = (
+            -0.5 * jnp.square(deviation) - jnp.log(self.std) - 0.5 * math.log(2.0 * math.pi)
+        )
+        return jnp.sum(log_density, axis=-1)
+
+    def entropy(self) -> jax.Array:
+        """Differential entropy [...], nats: sum of log(std) + log(2 pi e) / 2."""
+        return jnp.sum(jnp.log(self.std) + 0.5 * math.log(2.0 * math.pi * math.e), axis=-1)
 
 
 class MLP(nn.Module):

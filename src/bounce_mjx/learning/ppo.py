@@ -22,15 +22,9 @@ from bounce_mjx.env.state import AnyEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, unpack
 from bounce_mjx.learning import statistics
-from bounce_mjx.learning.advantages import generalized_advantages
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.gaussian import Gaussian
-from bounce_mjx.learning.metrics import (
-    Metrics,
-    matching_metrics,
-    rollout_metrics,
-    step_metrics,
-)
+from bounce_mjx.learning.metrics import Metrics, matching_metrics, rollout_metrics, step_metrics
+from bounce_mjx.learning.networks import Gaussian
 from bounce_mjx.learning.policy import Networks, Policy, make_networks
 from bounce_mjx.learning.statistics import Normalizer, RunningStatistics, normalize
 
@@ -40,6 +34,10 @@ _LEARNING_RATE_FACTOR = 1.1
 # Minimum number of groups in which samples are shuffled, and the maximum number of environments per
 # group if there are more groups.
 _MIN_GROUPS, _GROUP_ENVS = 64, 64
+
+# Number of steps of the recursion that are unrolled into one kernel on a GPU. For each result XLA
+# writes out all steps before it, so the kernel's code grows with the square of this number.
+_UNROLL = 16
 
 # Quantities that must be finite, in the order in which an iteration computes them.
 CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
@@ -56,7 +54,7 @@ class PPO(NamedTuple):
     """Names of the environment's metrics that the value network sees."""
     networks: Networks
     optimizer: optax.GradientTransformation
-    """Gradient of the parameters -> direction in which the learning rate scales a step."""
+    """Gradient of the parameters -> direction of a step, which the learning rate scales."""
 
 
 class Params(NamedTuple):
@@ -141,7 +139,10 @@ def make_trainer(config: PPOConfig, env: AnyEnv, episode_steps: int) -> Training
     critic_metrics = names_of_critic_metrics(config, env)
     sizes = env.observation_size, env.action_size, len(critic_metrics)
     networks = make_networks(config, *sizes, dtype=config.compute_dtype)
-    ppo = PPO(config, env, episode_steps, critic_metrics, networks, make_optimizer(config))
+    # Adam on clipped gradients.
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    optimizer = optax.chain(clip, optax.scale_by_adam(eps=1e-5))
+    ppo = PPO(config, env, episode_steps, critic_metrics, networks, optimizer)
     return TrainingFunctions(functools.partial(init, ppo), functools.partial(run, ppo))
 
 
@@ -154,12 +155,6 @@ def names_of_critic_metrics(config: PPOConfig, env: AnyEnv) -> tuple[str, ...]:
     known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
     wanted = config.critic_metrics
     return matching_metrics(env.task.critic_metrics if wanted is None else wanted, known_metrics)
-
-
-def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam on clipped gradients."""
-    clip = optax.clip_by_global_norm(config.max_grad_norm)
-    return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
 
 
 def init(ppo: PPO, key: jax.Array) -> TrainingState:
@@ -341,6 +336,39 @@ def advantages(
     return advantage, advantage + values[:-1]
 
 
+def generalized_advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    discount: float,
+    gae_lambda: float,
+) -> jax.Array:
+    """Advantages [T, B] of T steps of B environments (Schulman et al. 2016, equation 16).
+
+    Args:
+      reward, value: reward of each step, and value of the state before it [T, B].
+      next_value: value of the state after the step [T, B]; at a time-out, the value of the old
+        episode's last state, not of the new episode's first one.
+      terminated: steps without a following value [T, B], bool.
+      truncated: steps whose following value counts, but across which no advantage is propagated
+        back [T, B], bool.
+    """
+    delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
+    carried = discount * gae_lambda * (~(terminated | truncated))
+
+    def backward(advantage, step):
+        delta, carried = step
+        advantage = delta + carried * advantage
+        return advantage, advantage
+
+    _, advantages = jax.lax.scan(
+        backward, jnp.zeros_like(delta[0]), (delta, carried), reverse=True, unroll=_UNROLL
+    )
+    return advantages
+
+
 class LearnerState(NamedTuple):
     """What a minibatch step changes."""
 
@@ -508,13 +536,9 @@ def adapt_learning_rate(
     """The learning rate [] after an update, adapted so that the KL divergence approaches target_kl
     (the adaptive rule of Schulman et al. 2017, section 4, applied to the learning rate)."""
     if config.target_kl > 0.0:
-        learning_rate = jnp.where(
-            kl > 2.0 * config.target_kl,
-            learning_rate / _LEARNING_RATE_FACTOR,
-            jnp.where(
-                kl < 0.5 * config.target_kl, learning_rate * _LEARNING_RATE_FACTOR, learning_rate
-            ),
-        )
+        is_large, is_small = kl > 2.0 * config.target_kl, kl < 0.5 * config.target_kl
+        factor = jnp.where(is_small, _LEARNING_RATE_FACTOR, 1.0)
+        learning_rate *= jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)
     return jnp.clip(learning_rate, config.min_learning_rate, limit)
 
 
@@ -534,15 +558,10 @@ def first_fault(
       params: the parameters after the update.
     """
     names = ("loss/value", "loss/policy", "loss/gradient_norm")
-    flags = jnp.stack([jnp.isfinite(minibatch_metrics[n]).ravel() for n in names], axis=-1)
-    finite = jnp.concatenate(
-        [
-            jnp.stack([jnp.isfinite(reward), all_finite(statistics)]),
-            flags.ravel(),
-            all_finite(params)[None],
-        ]
-    )
-    numbers = [1, 2] + [3, 4, 5] * flags.shape[0] + [6]
+    minibatches = jnp.stack([minibatch_metrics[name].ravel() for name in names], axis=-1)
+    before = jnp.stack([jnp.isfinite(reward), all_finite(statistics)])
+    finite = jnp.hstack([before, jnp.isfinite(minibatches).ravel(), all_finite(params)])
+    numbers = [1, 2] + [3, 4, 5] * len(minibatches) + [6]
     return jnp.where(finite.all(), 0, jnp.array(numbers)[jnp.argmin(finite)])
 
 

@@ -2,7 +2,6 @@
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.task.flight import GRAVITY, Flight, closest, flight
-from bounce_mjx.task.quantities import latest
 from bounce_mjx.task.results import (
     Episodes,
     Figure,
@@ -26,7 +25,7 @@ from bounce_mjx.task.rewards import (
     weighted_terms,
 )
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
-from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values
+from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values, latest
 from bounce_mjx.world.config import (
     PADDLE_HOME,
     ActionConfig,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
-from bounce_mjx.lazy import jax
+from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.world.config import WorldConfig
@@ -219,3 +219,16 @@ class Task:
         """Point at which a viewer looks, m: the paddle below the ball at a reset."""
         x, y, z = self.config.ball_init_pos
         return x, y, z - 0.4
+
+
+def latest(past: jax.Array, starts: jax.Array, changes: jax.Array, value: jax.Array) -> jax.Array:
+    """A history [H, size], the newest first, that moves on only where an event starts.
+
+    Args:
+      starts: whether a new event starts [], bool: the older values move on by one.
+      changes: whether the newest value changes [], bool.
+      value: the newest value then [size].
+    """
+    shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
+    newest = jnp.where(changes, value, shifted[0])
+    return jnp.concatenate([newest[None], shifted[1:]])
