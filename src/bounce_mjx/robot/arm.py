@@ -207,14 +207,16 @@ class _Builder:
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, actuators[j]) for j in joints)
         limits = tuple(_force_limit(model, actuators[j], j) for j in joints)
-        names, holder = self._name(joints, end, actuators)
+        names = tuple(joint_name(model, j) for j in joints)
+        holder = self._arm.bodies[end]
+        holder.name = holder.name or "end_effector"
         gripper = self._gripper(chain, joints, actuators)
         objects = self._objects(chain)
         self._check_loops(joints, end, gripper, objects)
         self._freeze(joints, actuators)
         self._strip(joints, gripper, objects, actuators)
         self._disable_contacts_and_limits(joints)
-        scene = self._attach(holder, position, quaternion)
+        scene = self._attach(holder.name, position, quaternion)
         self._replace_servos(scene, names)
         kept = [b for b in range(1, model.nbody) if not is_below(model, b, gripper + objects)]
         own = Own(model, joints, kept)
@@ -265,20 +267,6 @@ class _Builder:
                 f"no actuator on {_listed(idle)}; add one, or name the acting joints with --joints"
             )
         return actuators
-
-    def _name(
-        self, joints: list[int], end: int, actuators: dict[int, list[int]]
-    ) -> tuple[tuple[str, ...], str]:
-        """The names of the acting joints, and of the body that holds the paddle; those without one
-        get one."""
-        arm = self._arm
-        for joint in joints:
-            arm.joints[joint].name = arm.joints[joint].name or f"joint{joint}"
-            for actuator in actuators[joint]:
-                arm.actuators[actuator].target = arm.joints[joint].name
-        holder = arm.bodies[end]
-        holder.name = holder.name or "end_effector"
-        return tuple(arm.joints[joint].name for joint in joints), holder.name
 
     def _gripper(
         self, chain: list[int], joints: list[int], actuators: dict[int, list[int]]
@@ -561,7 +549,7 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
     actuator = actuators[0]
     gear = float(model.actuator_gear[actuator, 0])
     plain = len(actuators) == 1 and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-    if not (plain and _is_position(model, actuator)):
+    if not (plain and is_position_servo(model, actuator)):
         return None
     joint = int(model.actuator_trnid[actuator, 0])
     return ServoSettings(
@@ -571,21 +559,26 @@ def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
     )
 
 
-def _is_position(model: mujoco.MjModel, actuator: int) -> bool:
+def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator's control, or its filtered or integrated one, is a target position."""
+    gain, (offset, factor) = (
+        model.actuator_gainprm[actuator, 0],
+        model.actuator_biasprm[actuator, :2],
+    )
     return bool(
         model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
         and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
-        and model.actuator_gainprm[actuator, 0] > 0.0
-        and model.actuator_biasprm[actuator, 0] == 0.0
-        and model.actuator_biasprm[actuator, 1] == -model.actuator_gainprm[actuator, 0]
+        and gain > 0.0
+        and offset == 0.0
+        # Otherwise the joint would rest at another position than the control.
+        and np.isclose(factor, -gain)
     )
 
 
 def _servo_range(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
     """Joint positions that the targets of a joint's position servos reach."""
     least, greatest = -np.inf, np.inf
-    for actuator in filter(lambda a: _is_position(model, a), actuators):
+    for actuator in filter(lambda a: is_position_servo(model, a), actuators):
         control = model.actuator_ctrladr[actuator]
         limited, span = model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
         if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR:

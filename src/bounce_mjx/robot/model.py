@@ -19,6 +19,7 @@ from bounce_mjx.robot.arm import (
     PADDLE_GEOM_NAME,
     build_arm,
     compile_spec,
+    is_position_servo,
     joint_name,
     locate,
     read_spec,
@@ -255,23 +256,11 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
             f"an actuator ({name}) with {mj_model.actuator_ctrlnum[several[0]]} controls; drive "
             "each joint by a <position>, which has one"
         )
-    plain_or_filtered = (
-        mujoco.mjtDyn.mjDYN_NONE,
-        mujoco.mjtDyn.mjDYN_FILTER,
-        mujoco.mjtDyn.mjDYN_FILTEREXACT,
-    )
+    # An integrated control would be a velocity.
+    dynamics = mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
-        is_position_servo = (
-            mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-            and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
-            and mujoco.mjtDyn(mj_model.actuator_dyntype[actuator]) in plain_or_filtered
-            and mj_model.actuator_gainprm[actuator, 0] > 0.0
-            # Otherwise the joint would rest at another position than the control.
-            and np.isclose(
-                mj_model.actuator_biasprm[actuator, 1], -mj_model.actuator_gainprm[actuator, 0]
-            )
-        )
-        if not is_position_servo:
+        direct = int(mj_model.actuator_dyntype[actuator]) in dynamics
+        if not (direct and is_position_servo(mj_model, actuator)):
             name = joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is not a position servo; drive it by "

@@ -115,12 +115,11 @@ class _Search:
         # A servo whose joint is at its limit could move it one way only.
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
         self._inside = self._range[0] + margin, self._range[1] - margin
-        # A joint without limits, or with more than a turn, is searched within half a turn.
+        # The seeds of a hinge lie within half a turn.
         self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        wide, centre = np.where(self._hinge, np.pi, 0.5), model.qpos0[self._qpos]
-        self._low, self._high = (
-            np.clip(centre + side * wide, *self._inside) for side in (-1.0, 1.0)
-        )
+        wide = np.where(self._hinge, np.pi, np.where(free, 0.5, np.inf))
+        self._centre = centre = np.clip(model.qpos0[self._qpos], *self._inside)
+        self._seeds = [np.clip(centre + side * wide, *self._inside) for side in (-1.0, 1.0)]
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         mujoco.mj_kinematics(model, self._data)
@@ -171,13 +170,10 @@ class _Search:
         self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
         self._model.geom_pos[self._at.paddle_geom] = choice.position
 
-    def _random(self) -> np.ndarray:
-        return self._rng.uniform(self._low, self._high)
-
     def _reach(self) -> float:
         distances = []
         for _ in range(500):
-            paddle, _ = self._forward(self._random())
+            paddle, _ = self._forward(self._rng.uniform(*self._seeds))
             distances.append(np.hypot(*(paddle - self._base)[:2]))
         return float(max(distances))
 
@@ -204,7 +200,7 @@ class _Search:
             for height in heights:
                 goal = np.array([self._base[0] + distance, self._base[1], height])
                 for _ in range(_TRIES):
-                    angles = self._solved(self._random(), goal)
+                    angles = self._solved(self._rng.uniform(*self._seeds), goal)
                     if angles is not None:
                         yield angles
 
@@ -234,20 +230,15 @@ class _Search:
                 max_nfev=_EVALUATIONS,
                 args=(rows,),
             ).x
-        wrapped = self._wrapped(angles)
-        paddle, normal = self._forward(wrapped)
+        # The same pose within half a turn, where the range allows it.
+        turns = np.round((angles - self._centre) / (2.0 * np.pi))
+        turned = np.where(self._hinge, angles - 2.0 * np.pi * turns, angles)
+        angles = np.where(np.clip(turned, *self._inside) == turned, turned, angles)
+        paddle, normal = self._forward(angles)
         if normal[2] < 0.0 or np.linalg.norm(normal[:2]) > _LEVEL_TOLERANCE:
             return None
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
-        return wrapped if in_front and paddle[2] > 0.03 else None
-
-    def _wrapped(self, angles: np.ndarray) -> np.ndarray:
-        """The same pose with each free hinge within half a turn of its middle."""
-        low, high = self._inside
-        middle = 0.5 * (self._low + self._high)
-        turned = angles - 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
-        inside = self._hinge & (turned >= low) & (turned <= high)
-        return np.where(inside, turned, angles)
+        return angles if in_front and paddle[2] > 0.03 else None
 
     def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> PaddlePose | None:
         """The pose with its score; None if the arm is in the way of the ball or in the floor."""
