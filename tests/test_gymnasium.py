@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 
 import rest_task
-from bounce_mjx.adapters.gymnasium import batch, environments
+from bounce_mjx.adapters.gymnasium import environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
@@ -237,10 +237,8 @@ def test_target_option_holds_in_an_observation_with_a_history():
     ],
 )
 def test_wrong_options_give_one_sentence(vectorised, options, sentence):
-    kind = TypeError if "target_hight" in options else UserError
-    with pytest.raises(kind, match=sentence) as given:
+    with pytest.raises(UserError, match=sentence):
         vectorised.reset(options=options)
-    assert isinstance(given.value, UserError)
 
 
 @pytest.mark.parametrize(
@@ -262,12 +260,10 @@ def test_unknown_arguments_are_a_type_error(arguments, sentence):
     "arguments, sentence",
     [
         ({"render_mode": "human"}, "render_mode is 'human'"),
-        ({"autoreset_mode": "never"}, "autoreset_mode is 'never'; choose one of 'NextStep', 'S"),
-        ({"max_episode_steps": 0}, "max_episode_steps is 0, but must be a whole number"),
-        ({"max_episode_steps": 3000}, "lasts 2000 steps, .* give episode_seconds=30 instead"),
+        ({"max_episode_steps": 3000}, "must be from 1 to the 2000 steps .* episode_seconds makes"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
         ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
-        ({"render_mode": "rgb_array", "width": 0}, "width is 0, but must be a whole number"),
+        ({"render_mode": "rgb_array", "width": 0}, "the size is 0 x 480 pixels"),
     ],
 )
 def test_wrong_arguments_give_one_sentence(opengl, arguments, sentence):
@@ -278,22 +274,20 @@ def test_wrong_arguments_give_one_sentence(opengl, arguments, sentence):
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
     single, vector = environments.TaskEnv(), make_vec()
     for env in (single, vector):
-        with pytest.raises(gymnasium.error.ResetNeeded, match="before its reset"):
+        with pytest.raises(UserError, match="before its reset"):
             env.step(env.action_space.sample())
         env.reset(seed=0)
     with pytest.raises(UserError, match=r"shape \(5,\), but must have \(6,\)"):
         single.step(np.zeros(5))
     with pytest.raises(UserError, match=r"shape \(6,\), but must have \(3, 6\)"):
         vector.step(np.zeros(6))
-    with pytest.raises(UserError, match="must be an array of numbers"):
-        vector.step("up")
 
 
 def test_equal_environments_share_their_programs():
     first, second = make_vec(), make_vec(AutoresetMode.SAME_STEP)
     other = make_vec(physics_dt=0.002)
-    assert first._batch._programs is second._batch._programs
-    assert first._batch._programs is not other._batch._programs
+    assert first._programs is second._programs
+    assert first._programs is not other._programs
 
 
 def test_copies_and_pickles_continue_the_episodes(vectorised, single):
@@ -442,15 +436,15 @@ def test_rendering_failure_gives_one_sentence(monkeypatch):
 
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
     env = environments.TaskEnv()
-    monkeypatch.setattr(batch, "_jax_process", 1)
+    monkeypatch.setattr(environments, "_jax_process", 1)
     with pytest.raises(UserError, match='context="forkserver"'):
         env.reset()
 
 
 @pytest.mark.slow
 def test_async_environments_run_after_jax_ran_in_the_parent(tmp_path):
-    """Gymnasium's processes start from a server by default; a fork would hang. The compiled
-    programs are cached where the commands cache them."""
+    """Gymnasium's processes start from a server; a fork would hang. The compiled programs are
+    cached where the commands cache them."""
     kept = tmp_path / "bounce_mjx/jax"
     shutil.copytree(os.environ["JAX_COMPILATION_CACHE_DIR"], kept, copy_function=os.link)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
@@ -459,7 +453,8 @@ import gymnasium, jax, numpy as np, bounce_mjx
 if __name__ == "__main__":
     single = gymnasium.make({ENV_ID!r})
     expected, _ = single.reset(seed=3)
-    envs = gymnasium.make_vec({ENV_ID!r}, 1, vectorization_mode="async")
+    server = {{"context": "forkserver"}}
+    envs = gymnasium.make_vec({ENV_ID!r}, 1, vectorization_mode="async", vector_kwargs=server)
     observation, _ = envs.reset(seed=3)
     np.testing.assert_array_equal(observation[0], expected)
     envs.step(np.zeros((1, 6), np.float32))

@@ -66,23 +66,13 @@ def test_vec_env_equals_sb3s_vector_of_single_environments(envs):
     assert set(timeouts) == {False, True}
 
 
-def test_attributes_and_methods_reach_single_environments(envs):
-    envs.seed(0)
-    first = envs.reset()
+def test_attributes_are_common_and_stay(envs):
     assert envs.get_attr("dt", [0, 2]) == [0.01, 0.01]
-    assert not envs.has_attr("gravity")
-    assert envs.env_method("get_wrapper_attr", "num_envs") == [NUM_ENVS] * NUM_ENVS
-    ((observation, info),) = envs.env_method(
-        "reset", seed=1, options={"target_height": 0.7}, indices=1
-    )
-    assert observation[TARGET] == np.float32(0.7) and info == {}
-    # Seed 1 was the second environment's seed.
-    np.testing.assert_allclose(observation[:TARGET], first[1, :TARGET], atol=1e-6)
-    assert envs.env_method("render") == [None] * NUM_ENVS
-    with pytest.raises(UserError, match="methods reset, render, get_wrapper_attr"):
+    assert not envs.has_attr("gravity") and envs.env_is_wrapped(Monitor, 1) == [True]
+    with pytest.raises(UserError, match="no method jump; call seed"):
         envs.env_method("jump")
-    with pytest.raises(UserError, match="only some of the 3 environments"):
-        envs.set_attr("spec", None, indices=[0])
+    with pytest.raises(UserError, match="the attribute dt .* cannot be set"):
+        envs.set_attr("dt", 0.02)
     with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
         Sb3VecEnv(2, frameskip=2)
 
@@ -91,7 +81,7 @@ def test_attributes_and_methods_reach_single_environments(envs):
     "settings, steps", [({"task": "catch"}, 300), ({"episode_seconds": 30}, 3000)]
 )
 def test_the_time_limit_is_that_of_the_config(settings, steps):
-    assert Sb3VecEnv(2, **settings)._batch.episode_steps == steps
+    assert Sb3VecEnv(2, **settings)._envs.episode_steps == steps
 
 
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}

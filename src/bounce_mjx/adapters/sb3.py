@@ -1,7 +1,6 @@
 """Stable-Baselines3's `VecEnv` over a whole batch; SBX uses it too. It needs the extra `sb3`."""
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -13,8 +12,7 @@ with needed("Stable-Baselines3", "bounce_mjx[sb3]"):
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecEnv
 
-from bounce_mjx.adapters.gymnasium.batch import checked_commands
-from bounce_mjx.adapters.gymnasium.environments import TaskEnv, TaskVectorEnv
+from bounce_mjx.adapters.gymnasium.environments import TaskVectorEnv
 
 _SHOWN = 4
 
@@ -27,46 +25,37 @@ class Sb3VecEnv(VecEnv):
     because many dictionaries would take longer than the physics.
     """
 
-    def __init__(
-        self,
-        num_envs: int = 256,
-        max_episode_steps: int | None = None,
-        **settings: Any,
-    ):
+    def __init__(self, num_envs: int = 256, **settings: Any):
         """Makes the environments; the first reset compiles them.
 
         Args:
-          max_episode_steps: a shorter time limit than the config's, in steps.
-          settings: other arguments of `TaskVectorEnv`, such as episode_seconds=30. Of pictures, the
-            first four environments are tiled.
+          settings: other arguments of `TaskVectorEnv`, such as max_episode_steps=400 and
+            episode_seconds=30. Of pictures, the first four environments are tiled.
 
         Raises:
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        self._envs = TaskVectorEnv(
-            num_envs=num_envs,
-            max_episode_steps=max_episode_steps,
-            autoreset_mode=AutoresetMode.SAME_STEP,
-            **settings,
-        )
-        self._batch = self._envs._batch
+        same_step = AutoresetMode.SAME_STEP
+        self._envs = TaskVectorEnv(num_envs=num_envs, autoreset_mode=same_step, **settings)
         self._actions: np.ndarray | None = None
         self.render_mode = self._envs.render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
+        self.task, self.dt, self.mj_model = self._envs.task, self._envs.dt, self._envs.mj_model
         super().__init__(
-            self._envs.num_envs,
-            self._envs.single_observation_space,
-            self._envs.single_action_space,
+            num_envs, self._envs.single_observation_space, self._envs.single_action_space
         )
         self.metadata["render_fps"] = self._envs.metadata["render_fps"]
-
-    task, dt, mj_model = TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
 
     def reset(self) -> np.ndarray:
         """Starts a new episode in every environment: observations [B, N], float32. It uses the
         seeds of `seed` and the options of `set_options` once."""
-        observation = self._restart(np.arange(self.num_envs), self._seeds, self._options)
+        given = [self._envs.checked_commands(options) for options in self._options]
+        commands = {
+            name: np.array([one.get(name, np.nan) for one in given])
+            for name in self._envs.config.commands
+        }
+        observation = self._envs.restart(self._seeds, np.ones(self.num_envs, bool), commands)
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -93,7 +82,7 @@ class Sb3VecEnv(VecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """Pictures of the first four environments, each [height, width, 3], uint8."""
-        return self._drawn(range(min(self.num_envs, _SHOWN)))
+        return [self._envs.draw(i) for i in range(min(self.num_envs, _SHOWN))]
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -103,68 +92,33 @@ class Sb3VecEnv(VecEnv):
         """A common attribute of the environments, once for each index."""
         return [getattr(self, attr_name)] * len(self._get_indices(indices))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets an attribute of all environments.
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> NoReturn:
+        """Refuses: the environments are one program.
 
         Raises:
-          UserError: `indices` leaves some out, although the environments share their attributes.
+          UserError: always.
         """
-        if len(self._get_indices(indices)) != self.num_envs:
-            raise UserError(
-                f"set_attr of {attr_name} would change only some of the {self.num_envs} "
-                "environments, which share their attributes; omit indices"
-            )
-        setattr(self, attr_name, value)
+        raise UserError(
+            f"the attribute {attr_name} of compiled environments cannot be set; give the settings "
+            "to Sb3VecEnv, or the commands of the next reset to set_options"
+        )
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Calls a method of single environments: `reset`, `render` or `get_wrapper_attr`.
-
-        Returns:
-          The results of the environments with these indices.
+    def env_method(self, method_name: str, *_: Any, indices: Any = None, **__: Any) -> NoReturn:
+        """Refuses: the environments are one program.
 
         Raises:
-          UserError: there is no such method.
+          UserError: always.
         """
-        methods: dict[str, Callable[..., list[Any]]] = {
-            "reset": self._reset_some,
-            "render": self._drawn,
-            "get_wrapper_attr": lambda chosen, name: self.get_attr(name, chosen),
-        }
-        if method_name not in methods:
-            raise UserError(
-                f"env_method got {method_name!r}; the environments have the methods "
-                f"{', '.join(methods)}"
-            )
-        chosen = list(self._get_indices(indices))
-        return methods[method_name](chosen, *method_args, **method_kwargs)
+        raise UserError(
+            f"a single environment of a compiled batch has no method {method_name}; call seed, "
+            "set_options, reset and render of the whole one"
+        )
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
     ) -> list[bool]:
         """True for `Monitor`, whose statistics the infos have."""
         return [issubclass(wrapper_class, Monitor)] * len(self._get_indices(indices))
-
-    def _reset_some(
-        self, chosen: list[int], seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> list[tuple[np.ndarray, dict[str, Any]]]:
-        observation = self._restart(
-            np.array(chosen), [seed] * self.num_envs, [options] * self.num_envs
-        )
-        return [(observation[i], {}) for i in chosen]
-
-    def _restart(
-        self, chosen: np.ndarray, seeds: list[int | None], options: list[dict[str, Any] | None]
-    ) -> np.ndarray:
-        mask = np.isin(np.arange(self.num_envs), chosen)
-        commands = self._batch.config.commands
-        given = [checked_commands(one, commands) for one in options]
-        values = {name: np.array([one.get(name, np.nan) for one in given]) for name in commands}
-        return self._envs.restart(seeds, mask, values)
-
-    def _drawn(self, chosen: Iterable[int]) -> list[np.ndarray | None]:
-        return [self._envs._pictures.draw(i) for i in chosen]
 
 
 def _row(info: dict[str, Any], index: int) -> dict[str, Any]:

@@ -1,141 +1,48 @@
-"""The classes behind `gymnasium.make` and `gymnasium.make_vec`.
+"""The classes behind `gymnasium.make` and `gymnasium.make_vec`, with NumPy arrays.
 
-The arrays are NumPy arrays; `adapters/torch/gymnasium_env.py` has a vectorised environment with
-tensors that stay on JAX's device. Keyword arguments are the
-settings of the task's config.
+Keyword arguments are the settings of the task's config.
 """
 
 import dataclasses
-import multiprocessing
+import functools
+import os
 import time
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
+import jax
 import mujoco
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from bounce_mjx.adapters.gymnasium.batch import (
-    Batch,
-    StepArrays,
-    action_space,
-    checked_actions,
-    checked_commands,
-    observation_space,
-)
-from bounce_mjx.adapters.gymnasium.pictures import HEIGHT, WIDTH, Pictures
+from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, Step, shared_programs
+from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
+from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.viewers.offscreen import Renderer
+from bounce_mjx.world.config import WorldConfig
+
+# The process in which a program has run. JAX's threads are lost when this process forks.
+_jax_process: int | None = None
+
+Commands = dict[str, float | np.ndarray]
+"""Some of the task's commands, each [] or [B]; NaN draws it."""
 
 
-class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment. The config's `episode_seconds` limit its episodes; the argument
-    `max_episode_steps` of `gymnasium.make` can only shorten them."""
-
-    metadata = {"render_modes": ["rgb_array"]}
-    _spec: EnvSpec | None = None
-
-    def __init__(
-        self,
-        task: str | type[Task] = DEFAULT,
-        render_mode: str | None = None,
-        width: int = WIDTH,
-        height: int = HEIGHT,
-        camera: str | None = None,
-        **settings: Any,
-    ):
-        """Makes the environment. The first reset compiles it, unless an equal one exists.
-
-        Args:
-          task: its class, its name, or FILE.py:CLASS.
-          width: of the pictures, in pixels, as is `height`.
-          camera: name of a camera of the model; None for the overview.
-          settings: fields of the task's config, such as episode_seconds=30.
-
-        Raises:
-          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
-            argument is a TypeError too.
-        """
-        _prefer_forkserver()
-        self._batch = Batch(task, settings, 1, None)
-        self.metadata = self.metadata | {"render_fps": round(1.0 / self.dt)}
-        self.render_mode = render_mode
-        self.action_space = action_space(self.task)
-        self.observation_space = observation_space(self.task)
-        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How Gymnasium made the environment, with its time limit in steps."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec) -> None:
-        self._spec = dataclasses.replace(spec, max_episode_steps=self._batch.episode_steps)
-
-    @property
-    def task(self) -> Env:
-        """The environment on JAX; equal environments share it."""
-        return self._batch.task
-
-    @property
-    def dt(self) -> float:
-        """Time of one step, s."""
-        return self._batch.config.control_dt
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """MuJoCo's model, to read; edits have no effect."""
-        return self.task.mj_model
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode.
-
-        Args:
-          options: the task's commands of this episode by name, instead of drawn ones.
-
-        Returns:
-          The first observation [N] and an empty info.
-        """
-        super().reset(seed=seed)
-        given = checked_commands(options, self._batch.config.commands)
-        return self._batch.restart([seed], self.np_random, np.ones(1, bool), given)[0], {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances one control step under the action [n].
-
-        Returns:
-          Observation [N], reward, terminated, truncated, and the environment's metrics.
-        """
-        action = checked_actions(action, self.action_space.shape)
-        result = self._batch.step(action[None])
-        metrics = {name: float(value[0]) for name, value in result.metrics.items()}
-        return (
-            result.observation[0],
-            float(result.reward[0]),
-            bool(result.terminated[0]),
-            bool(result.truncated[0]),
-            metrics,
-        )
-
-    def render(self) -> np.ndarray | None:
-        """A picture [height, width, 3], uint8; None without render_mode="rgb_array"."""
-        return self._pictures.draw(0)
-
-    def close(self) -> None:
-        """Frees the renderer."""
-        self._pictures.close()
+class UnexpectedArgument(UserError, TypeError):
+    """An argument with an unknown name; libraries that try several expect a TypeError."""
 
 
 class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """B environments in one compiled step.
+    """B environments in one compiled step. They can be pickled and copied, including the state of
+    their episodes.
 
     Given the same seeds and actions, they return the same as a `gymnasium.vector.SyncVectorEnv` of
     B single environments up to float32 rounding, in every autoreset mode. In the same-step mode,
@@ -152,35 +59,87 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        width: int = WIDTH,
-        height: int = HEIGHT,
+        width: int = 640,
+        height: int = 480,
         camera: str | None = None,
         **settings: Any,
     ):
-        """Makes `num_envs` environments; the other arguments are as in `TaskEnv`.
+        """Makes `num_envs` environments. The first reset compiles them, unless equal ones exist.
 
         Args:
-          max_episode_steps: a shorter time limit than the config's, in steps.
+          task: its class, its name, or FILE.py:CLASS.
+          max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
+            config's.
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
+          width: of the pictures, in pixels, as is `height`.
+          camera: name of a camera of the model; None for the overview.
+          settings: fields of the task's config, such as episode_seconds=30.
+
+        Raises:
+          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
+            argument is a TypeError too.
         """
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self._batch = Batch(task, settings, num_envs, max_episode_steps)
+        self.config = _task_config(task, settings)
+        self.num_envs = num_envs
+        if num_envs < 1:
+            raise UserError(f"num_envs is {num_envs}, but must be at least 1")
+        self.episode_steps = self.config.episode_steps
+        """Time limit of an episode in steps."""
+        if max_episode_steps not in (None, -1):
+            if not 1 <= max_episode_steps <= self.episode_steps:
+                raise UserError(
+                    f"max_episode_steps is {max_episode_steps}, but must be from 1 to the "
+                    f"{self.episode_steps} steps of an episode; episode_seconds makes them longer"
+                )
+            self.episode_steps = max_episode_steps
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = self.metadata | {
             "render_fps": round(1.0 / self.dt),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.num_envs = self._batch.num_envs
-        self.render_mode = render_mode
-        self.single_action_space = action_space(self.task)
-        self.single_observation_space = observation_space(self.task)
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
+        if not (0 < width <= 4096 and 0 < height <= 4096):
+            raise UserError(f"the size is {width} x {height} pixels; choose 1 to 4096 of each")
+        self.render_mode, self._picture = render_mode, (width, height, camera)
+        self._renderer: Renderer | None = None
+        if render_mode is not None:
+            self._open_renderer()
+        self.single_action_space = Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self.single_observation_space = Box(
+            -np.inf, np.inf, (self.task.observation_size,), np.float32
+        )
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._pictures = Pictures(self._batch, render_mode, width, height, camera)
+        self._episodes: Episodes | None = None
         self._ended = np.zeros(num_envs, bool)
-        self._statistics = EpisodeStatistics(num_envs)
+        self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, int)
+        self._starts = np.zeros(num_envs)
 
-    spec, task, dt, mj_model = TaskEnv.spec, TaskEnv.task, TaskEnv.dt, TaskEnv.mj_model
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made the environments, with their time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec) -> None:
+        self._spec = dataclasses.replace(spec, max_episode_steps=self.episode_steps)
+
+    @property
+    def task(self) -> Env:
+        """The environment on JAX; equal environments share it."""
+        return self._programs.task
+
+    @property
+    def dt(self) -> float:
+        """Time of one step, s."""
+        return self.config.control_dt
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """MuJoCo's model, to read; edits have no effect."""
+        return self.task.mj_model
 
     def reset(
         self,
@@ -198,29 +157,73 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         Returns:
           The observations of all environments [B, N] and an empty info.
         """
-        given = checked_commands(options, self._batch.config.commands, "reset_mask")
-        mask = _checked_mask((options or {}).get("reset_mask"), self.num_envs)
-        seeds = _seeds(seed, self.num_envs)
-        super().reset(seed=seeds[0])
-        return self.restart(seeds, mask, given), {}
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
+            raise UserError(
+                f"the option reset_mask has the type {mask.dtype} and the shape {mask.shape}, but "
+                f"must be an array of bools of the shape {(self.num_envs,)} with at least one True"
+            )
+        commands = self.checked_commands(options)
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise UserError(
+                f"there are {len(seed)} seeds for {self.num_envs} environments; give as many"
+            )
+        super().reset(seed=seed[0])
+        return self.restart(seed, mask, commands), {}
+
+    def checked_commands(self, options: dict[str, Any]) -> Commands:
+        """The commands among the options of a reset.
+
+        Raises:
+          UserError: a command is not a number within its limits, or an option is unknown.
+        """
+        known = self.config.commands
+        for name in options:
+            if name not in known:
+                raise UserError(
+                    f"reset got an unexpected option {name!r}; known options are: "
+                    f"{', '.join(known) or 'none'}"
+                )
+        return {
+            name: known[name].checked(value, f"the option {name}")
+            for name, value in options.items()
+            if value is not None
+        }
 
     def restart(
-        self,
-        seeds: Sequence[int | None],
-        mask: np.ndarray,
-        commands: dict[str, float | np.ndarray],
+        self, seeds: Sequence[int | None], mask: np.ndarray, commands: Commands
     ) -> np.ndarray:
         """Starts new episodes where the mask [B] is true: the observations of all environments
-        [B, N]; the arguments are those of `Batch.restart`."""
-        observation = self._batch.restart(seeds, self.np_random, mask, commands)
+        [B, N].
+
+        Args:
+          seeds: seed of each environment; None continues its random numbers.
+        """
+        _check_process()
+        if not mask.all():
+            self._check_started()
+        if self._episodes is None:
+            drawn = self.np_random.integers(2**32, size=self.num_envs)
+            seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
+        seeded = np.array([s is not None for s in seeds])
+        numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
+        given = dict.fromkeys(self.config.commands, np.nan) | commands
+        values = {
+            name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
+            for name, value in given.items()
+        }
+        self._episodes = self._programs.start(self._episodes, mask, numbers, seeded, values)
         self._ended[mask] = False
-        self._statistics.restart(mask)
-        return observation
+        self._begin_statistics(mask)
+        return np.array(self._episodes.env.obs.T, np.float32)
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances every environment under the actions [B, n].
+        """Advances every environment under the actions [B, n], clipped to [-1, 1].
 
         Returns:
           Observations [B, N], rewards [B], terminated [B], truncated [B], and an info of the
@@ -232,19 +235,39 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 f"the episodes of the environments {np.flatnonzero(before).tolist()} have ended; "
                 'reset them with reset(options={"reset_mask": terminated | truncated})'
             )
+        actions = checked_actions(actions, self.action_space.shape)
+        self._check_started()
+        _check_process()
         same_step = mode is AutoresetMode.SAME_STEP
         # In the same-step mode, the ended ones have already been reset.
         skipped = np.zeros_like(before) if same_step else before
-        result = self._batch.step(actions, skipped, same_step)
+        self._episodes, result = self._programs.step(
+            self._episodes, actions, self.episode_steps, skipped, same_step
+        )
+        # Copies, because the arrays belong to the caller.
+        result = Step(*(np.array(x) for x in jax.device_get(result)))
         self._ended = result.terminated | result.truncated
-        info = self._info(result, skipped)
-        return result.observation, result.reward, result.terminated, result.truncated, info
+        reward = result.reward.astype(np.float64)
+        info = self._info(result, reward, skipped)
+        return result.observation, reward, result.terminated, result.truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [height, width, 3], uint8, of each environment; None without a render mode."""
+        return None if self.render_mode is None else tuple(map(self.draw, range(self.num_envs)))
+
+    def draw(self, index: int) -> np.ndarray | None:
+        """A picture [height, width, 3], uint8, of one environment; None without a render mode."""
         if self.render_mode is None:
             return None
-        return tuple(self._pictures.draw(i) for i in range(self.num_envs))
+        self._check_started()
+        if self._renderer is None:
+            self._open_renderer()
+        env, state = self._episodes.env, self._episodes.env.pipeline_state
+        command, metrics = (
+            {name: float(value[index]) for name, value in values.items()}
+            for values in (state.command, env.metrics)
+        )
+        return self._renderer.render(np.array(state.physics.qpos[:, index]), command, metrics)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """A common attribute of the environments, or the result of a method such as render, once
@@ -254,26 +277,46 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         value = getattr(self, name)
         return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """A common attribute of the environments, once for each environment [B]."""
-        return self.call(name)
-
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
-        self._pictures.close()
+        if self._renderer is not None:
+            self._close_renderer()
+            self._renderer = None
 
-    def _info(self, result: StepArrays, skipped: np.ndarray) -> dict[str, Any]:
+    @functools.cached_property
+    def _programs(self) -> Programs:
+        return shared_programs(self.config)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__ | {"_episodes": jax.device_get(self._episodes), "_renderer": None}
+        return {k: v for k, v in state.items() if k not in ("_programs", "_close_renderer")}
+
+    def _open_renderer(self) -> None:
+        self._renderer = Renderer(self.task, *self._picture, plain=True)
+        # Also closed at exit, where OpenGL would be unloaded before the renderer.
+        self._close_renderer = weakref.finalize(self, self._renderer.close)
+
+    def _check_started(self) -> None:
+        if self._episodes is None:
+            raise UserError("an environment was used before its reset; call reset() first")
+
+    def _info(self, result: Step, reward: np.ndarray, skipped: np.ndarray) -> dict[str, Any]:
         """The info in the form of `VectorEnv._add_info`: each key has a mask [B], `_key`."""
+        names = sorted(self._episodes.env.metrics)
+        metrics = dict(zip(names, result.metrics.astype(np.float64), strict=True))
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            return _masked(result.metrics, ~skipped)
-        statistics = self._statistics.step(result.reward, self._ended)
-        info = _masked(result.metrics, ~self._ended)
-        if self._ended.any():
+            return _masked(metrics, ~skipped)
+        self._returns += reward
+        self._lengths += 1
+        durations = np.round(time.perf_counter() - self._starts, 6)
+        statistics = {"r": self._returns.copy(), "l": self._lengths.copy(), "t": durations}
+        info, ended = _masked(metrics, ~self._ended), self._ended.copy()
+        if ended.any():
+            self._begin_statistics(ended)
             final_obs = np.full(self.num_envs, None, object)
-            for i in np.flatnonzero(self._ended):
+            for i in np.flatnonzero(ended):
                 final_obs[i] = result.final_observation[i]
-            ended = self._ended.copy()
-            final_info = _masked(result.metrics, ended) | {
+            final_info = _masked(metrics, ended) | {
                 "episode": _masked(statistics, ended),
                 "_episode": ended,
             }
@@ -281,33 +324,90 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             info |= {"final_info": final_info, "_final_info": ended}
         return info
 
+    def _begin_statistics(self, mask: np.ndarray) -> None:
+        self._returns[mask], self._lengths[mask] = 0.0, 0
+        self._starts[mask] = time.perf_counter()
 
-class EpisodeStatistics:
-    """Return, length and duration of the episodes of B environments that restart as they end."""
 
-    def __init__(self, num_envs: int):
-        self._returns = np.zeros(num_envs)
-        self._lengths = np.zeros(num_envs, int)
-        self._starts = np.full(num_envs, time.perf_counter())
+class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment. The config's `episode_seconds` limit its episodes; the argument
+    `max_episode_steps` of `gymnasium.make` can only shorten them."""
 
-    def restart(self, chosen: slice | np.ndarray) -> None:
-        """Begins new episodes; `chosen` is an index or a mask [B]."""
-        self._returns[chosen] = 0.0
-        self._lengths[chosen] = 0
-        self._starts[chosen] = time.perf_counter()
+    metadata = {"render_modes": ["rgb_array"]}
+    _spec: EnvSpec | None = None
 
-    def step(self, reward: np.ndarray, ended: np.ndarray) -> dict[str, np.ndarray]:
-        """Counts a step with rewards [B]; the episodes of the mask `ended` [B] end with it.
+    def __init__(self, task: str | type[Task] = DEFAULT, **arguments: Any):
+        """Makes the environment; the arguments are those of `TaskVectorEnv` that are about one
+        environment: `render_mode`, `width`, `height`, `camera`, and the settings."""
+        self._envs = TaskVectorEnv(task, 1, autoreset_mode=AutoresetMode.DISABLED, **arguments)
+        self.episode_steps = self._envs.episode_steps
+        self.metadata = self.metadata | {"render_fps": self._envs.metadata["render_fps"]}
+        self.render_mode = self._envs.render_mode
+        self.action_space = self._envs.single_action_space
+        self.observation_space = self._envs.single_observation_space
+
+    spec = TaskVectorEnv.spec
+
+    @property
+    def task(self) -> Env:
+        """The environment on JAX; equal environments share it."""
+        return self._envs.task
+
+    @property
+    def dt(self) -> float:
+        """Time of one step, s."""
+        return self._envs.dt
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """MuJoCo's model, to read; edits have no effect."""
+        return self._envs.mj_model
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+          options: the task's commands of this episode by name, instead of drawn ones.
 
         Returns:
-          r, the returns; l, the lengths in steps; and t, the durations in s [B].
+          The first observation [N] and an empty info.
         """
-        self._returns += reward
-        self._lengths += 1
-        durations = np.round(time.perf_counter() - self._starts, 6)
-        statistics = {"r": self._returns.copy(), "l": self._lengths.copy(), "t": durations}
-        self.restart(ended)
-        return statistics
+        super().reset(seed=seed)
+        observation, info = self._envs.reset(seed=seed, options=options)
+        return observation[0], info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advances one control step under the action [n], clipped to [-1, 1].
+
+        Returns:
+          Observation [N], reward, terminated, truncated, and the environment's metrics.
+        """
+        action = checked_actions(action, self.action_space.shape)
+        observation, reward, terminated, truncated, info = self._envs.step(action[None])
+        metrics = {name: float(x[0]) for name, x in info.items() if not name.startswith("_")}
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), metrics
+
+    def render(self) -> np.ndarray | None:
+        """A picture [height, width, 3], uint8; None without render_mode="rgb_array"."""
+        return self._envs.draw(0)
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._envs.close()
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The actions as an array, float32.
+
+    Raises:
+      UserError: they have another shape.
+    """
+    array = np.asarray(actions, np.float32)
+    if array.shape != shape:
+        raise UserError(f"the action has the shape {array.shape}, but must have {shape}")
+    return array
 
 
 def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
@@ -320,35 +420,25 @@ def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.nda
     return masked
 
 
-def _seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
-    if seed is None or isinstance(seed, int | np.integer):
-        return [None if seed is None else int(seed) + i for i in range(num_envs)]
-    if len(seed) != num_envs:
-        raise UserError(f"there are {len(seed)} seeds for {num_envs} environments; give as many")
-    return list(seed)
-
-
-def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
-    array = np.ones(num_envs, bool) if mask is None else np.asarray(mask)
-    if array.dtype != bool or array.shape != (num_envs,) or not array.any():
-        raise UserError(
-            f"the option reset_mask has the type {array.dtype} and the shape {array.shape}, but "
-            f"must be an array of bools of the shape {(num_envs,)} with at least one True"
-        )
-    return array
-
-
-def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+def _task_config(task: str | type[Task], settings: dict[str, Any]) -> WorldConfig:
+    config = task_config(task)
     try:
-        return AutoresetMode(mode)
-    except ValueError as error:
-        known = ", ".join(repr(m.value) for m in AutoresetMode)
-        raise UserError(f"autoreset_mode is {mode!r}; choose one of {known}") from error
+        return validate(config, settings, "the environment's settings")
+    except UserError as error:
+        unknown = [name for name in settings if name not in config.model_fields]
+        if not unknown:
+            raise
+        # Libraries look for this part of Python's own message.
+        python = f"got an unexpected keyword argument {unknown[0]!r}"
+        raise UnexpectedArgument(f"{error} ({python})") from error
 
 
-def _prefer_forkserver() -> None:
-    """Lets `gymnasium.vector.AsyncVectorEnv` start its processes from a server, as Python 3.14
-    does, unless the program has chosen a method: JAX hangs in a fork of a process that used it."""
-    available = "forkserver" in multiprocessing.get_all_start_methods()
-    if available and multiprocessing.get_start_method(allow_none=True) is None:
-        multiprocessing.set_start_method("forkserver")
+def _check_process() -> None:
+    global _jax_process
+    _jax_process = _jax_process or os.getpid()
+    if _jax_process != os.getpid():
+        raise UserError(
+            "this process was forked from one that had already used JAX, in which JAX hangs; "
+            'start it another way, with AsyncVectorEnv(..., context="forkserver") or '
+            'make_vec(..., vector_kwargs={"context": "forkserver"})'
+        )
