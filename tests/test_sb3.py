@@ -5,6 +5,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
 
@@ -64,6 +65,10 @@ def test_vec_env_equals_sb3s_vector_of_single_environments(envs):
             assert info["episode"]["l"] == reference_info["episode"]["l"]
             assert info["episode"]["r"] == pytest.approx(reference_info["episode"]["r"], abs=1e-2)
     assert set(timeouts) == {False, True}
+
+
+def test_sb3_checks_pass() -> None:
+    check_env(gymnasium.make(ENV_ID, max_episode_steps=LIMIT).unwrapped)
 
 
 def test_attributes_are_common_and_stay(envs):
