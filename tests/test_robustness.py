@@ -170,7 +170,7 @@ def test_a_list_and_a_group_are_settings_too(tmp_path: Path) -> None:
     )
     assert one.env.ball_init_pos == (0.6, 0.0, 0.5) and other.env.ball_init_pos == (0.6, 0.0, 0.6)
     assert (one.env.reward.target_x, one.env.reward.target_y) == (0.6, -0.5)
-    with pytest.raises(UserError, match="ball_init_pos is .*, but must"):
+    with pytest.raises(UserError, match="ball_init_pos is .*, but"):
         suite(tmp_path, dict(name="short", settings={"ball_init_pos": [0.6]}))
 
 

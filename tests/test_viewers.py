@@ -43,13 +43,8 @@ from bounce_mjx.runs.folders import latest_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
-from bounce_mjx.viewers import browser, native, offscreen, pace, show
+from bounce_mjx.viewers import browser, native, offscreen, show
 from bounce_mjx.viewers.browser import LivePage, reward_bars
-from bounce_mjx.viewers.controllers import (
-    make_policy_controller,
-    make_random_controller,
-    make_zero_controller,
-)
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display, _primitive, body_scenes, marker_body
 from bounce_mjx.viewers.guard import open_server
@@ -62,13 +57,17 @@ from bounce_mjx.viewers.simulation import (
     EnvFrame,
     SideBySide,
     Simulation,
+    at_index,
     frame_at,
-    of_environment,
+    in_real_time,
+    make_policy_controller,
+    make_random_controller,
+    make_zero_controller,
     resample,
 )
 from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 from bounce_mjx.viewers.watch import TrainingPage, _Panel, results_list
-from bounce_mjx.viewers.world import SLIDERS, drawn_ranges, sliders_for, with_sliders
+from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 from tiny_runs import TINY
@@ -102,7 +101,7 @@ def env() -> BounceBall:
 
 @pytest.fixture(scope="module")
 def mirrored(env: BounceBall) -> Simulation:
-    return Simulation(env, make_policy_controller(MirrorLaw(env), None), 2, seed=0)
+    return Simulation(env, make_policy_controller(MirrorLaw(env)), 2, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +118,7 @@ def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None
     display = Display(env)
     for step in (0, 57, 123):
         for i in range(2):
-            display.pose(
-                recording.qpos[step, i], of_environment(frame_at(recording, step).command, i)
-            )
+            display.pose(recording.qpos[step, i], at_index(frame_at(recording, step).command, i))
             geom = display.data.geom
             np.testing.assert_allclose(geom("ball").xpos, recording.ball[step, i], atol=1e-6)
             np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
@@ -371,9 +368,9 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
 # The camera of the page
 
 
-def projected(points: np.ndarray, focus, aspect: float, on_phone: bool, offsets) -> np.ndarray:
+def projected(points: np.ndarray, focus, aspect: float, offsets) -> np.ndarray:
     """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
-    position, gaze = camera_pose(offsets, focus, aspect, on_phone)
+    position, gaze = camera_pose(offsets, focus, aspect)
     forward = (gaze - position) / np.linalg.norm(gaze - position)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -381,8 +378,8 @@ def projected(points: np.ndarray, focus, aspect: float, on_phone: bool, offsets)
     return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
 
 
-PICTURES = [(0.85, False, -1.0), (2.0, False, -1.0), (0.46, True, 0.1)]
-"""Width / height, whether a phone shows it, and the lowest part above the controls."""
+ASPECTS = (0.46, 0.85, 2.0)
+"""Width / height of a picture."""
 
 HOMES = {
     "default": (0.58856, 0.0, 0.05),
@@ -394,16 +391,15 @@ HOMES = {
 
 @pytest.mark.parametrize("home", HOMES.values(), ids=HOMES)
 @pytest.mark.parametrize("number", [1, 2, 4, 16])
-@pytest.mark.parametrize(("aspect", "on_phone", "lowest"), PICTURES)
-def test_the_camera_sees_every_robot(number: int, home, aspect, on_phone, lowest) -> None:
-    """Base, paddle, and the ball at the highest target; a phone's controls cover the lower part."""
+@pytest.mark.parametrize("aspect", ASPECTS)
+def test_the_camera_sees_every_robot(number: int, home, aspect: float) -> None:
+    """Base, paddle, and the ball at the highest target."""
     x, y, z = home
     paddle = np.array([x, y, 0.0]) * (1.0 + 0.05 / np.hypot(x, y)) + (0.0, 0.0, z)
     parts = np.array([(-0.1, 0.0, 0.0), paddle, (x, y, z + 0.8)])
     offsets = scene_grid(number)
     points = (offsets[:, None] + parts).reshape(-1, 3)
-    across, up = projected(points, np.array(home), aspect, on_phone, offsets).T
-    assert np.all(np.abs(across) < 1.0) and np.all((lowest < up) & (up < 1.0))
+    assert np.all(np.abs(projected(points, np.array(home), aspect, offsets)) < 1.0)
 
 
 @pytest.mark.parametrize("number", [1, 2, 16])
@@ -422,11 +418,11 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
         targets = scene._bodies[body].batched_positions
         texts = [label.text for label in scene._labels]
     np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
-    for aspect, on_phone, lowest in PICTURES:
+    for aspect in ASPECTS:
         offsets = scene_grid(number)
-        across, up = projected(labels, np.array(env.task.focus()), aspect, on_phone, offsets).T
+        across, up = projected(labels, np.array(env.task.focus()), aspect, offsets).T
         # Room for the text of a label.
-        assert np.all(np.abs(across) < 0.9) and np.all((lowest < up) & (up < 0.93))
+        assert np.all(np.abs(across) < 0.9) and np.all((-1.0 < up) & (up < 0.93))
     assert (
         texts[-1]
         == {
@@ -442,9 +438,9 @@ def test_labels_are_above_the_highest_target_and_in_the_picture(
 
 def test_steps_become_due_with_the_clock(mirrored: Simulation, monkeypatch) -> None:
     now, speed = 0.0, 0.5
-    monkeypatch.setattr(pace.time, "monotonic", lambda: now)
-    monkeypatch.setattr(pace.time, "sleep", lambda _: None)
-    clock = pace.in_real_time(mirrored, 0.65, lambda: speed)
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    clock = in_real_time(mirrored, 0.65, lambda: speed)
     assert not next(clock)
     steps = []
     for _ in range(60):
@@ -1151,8 +1147,8 @@ def played() -> Simulation:
     )
     env = BounceBall(with_sliders(config))
     networks = make_networks(run.ppo, env.observation_size, env.action_size)
-    controller = make_policy_controller(networks, read_policy(checkpoint, run))
-    return Simulation(env, controller, 2, seed=0, ranges=drawn_ranges(config))
+    controller, policy = make_policy_controller(networks), read_policy(checkpoint, run)
+    return Simulation(env, controller, 2, 0, reset_ranges(config), policy)
 
 
 def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...]) -> EnvFrame:
@@ -1241,7 +1237,7 @@ def test_sliders_extend_the_ranges_of_a_task() -> None:
     widened = with_sliders(config).randomization
     assert (widened.action_latency, widened.restitution) == ((0.0, 0.2), (0.6, 0.98))
     assert sliders_for(widened) == SLIDERS and not sliders_for(config.randomization)
-    ranges = drawn_ranges(config)
+    ranges = reset_ranges(config)
     assert set(ranges) == set(widened.terms)
     np.testing.assert_allclose(ranges["restitution"], (0.7, 0.8))
     np.testing.assert_array_equal(ranges["paddle_tilt"], np.zeros((2, 2)))
@@ -1253,7 +1249,7 @@ def test_a_slider_extends_the_ranges_of_all_axes() -> None:
     widened = with_sliders(config).randomization
     assert widened.paddle_tilt == (-0.08, 0.2) and sliders_for(widened) == SLIDERS
     assert not sliders_for(config.randomization)
-    np.testing.assert_allclose(drawn_ranges(config)["paddle_tilt"], tilt)
+    np.testing.assert_allclose(reset_ranges(config)["paddle_tilt"], tilt)
 
 
 def test_another_robot_has_no_slider_for_the_restitution() -> None:
@@ -1463,7 +1459,7 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
     """Only the task of robust draws its worlds, unless the command draws them."""
 
     class Named:
-        def __init__(self, env, controller, num_envs, seed, ranges):
+        def __init__(self, env, controller, num_envs, seed, ranges, policy):
             self.env, self.num_envs = env, num_envs
 
     shown = []

@@ -16,9 +16,7 @@ from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
-    from bounce_mjx.env.env import Env
     from bounce_mjx.runs.folders import Checkpoint
-    from bounce_mjx.viewers.controllers import Controller
     from bounce_mjx.viewers.show import Shown
 
 
@@ -87,16 +85,12 @@ def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) 
     from bounce_mjx.reports.tables import count_text
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor
-    from bounce_mjx.viewers.controllers import make_policy_controller
     from bounce_mjx.viewers.show import Shown
+    from bounce_mjx.viewers.simulation import make_policy_controller
 
     checkpoint, policy, actor = read_actor(checkpoint, config)
     console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
-
-    def make_controller(env: "Env") -> "Controller":
-        return make_policy_controller(actor(env), policy)
-
     title = checkpoint.run.name
     if checkpoint is not MIRROR_LAW:
         title += f", {count_text(checkpoint.steps)} steps"
-    return Shown(config.env, make_controller, title)
+    return Shown(config.env, lambda env: make_policy_controller(actor(env)), title, policy)

@@ -1,8 +1,8 @@
 """Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
 
-import functools
 import os
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bounce_mjx.env.env import Env, world_model
-from bounce_mjx.evaluation.episodes import reset_episodes
-from bounce_mjx.evaluation.recording import empty_recording, record
-from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.env.env import Env, EnvState, world_model
+from bounce_mjx.env.state import State
+from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import (
+    Control,
     PhysicsParameters,
     PhysicsState,
     edited_model,
@@ -24,11 +25,13 @@ from bounce_mjx.physics import (
 from bounce_mjx.physics.edited import contact_pairs
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Recording
+from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
 _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
+_NUM_THREADS = os.cpu_count() or 1
 
 
 def make_mujoco_evaluator(
@@ -57,62 +60,99 @@ def make_recording_mujoco_evaluator(
 ) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `make_mujoco_evaluator`, but also returns a recording of the first `recorded`
     episodes."""
-    num_threads = os.cpu_count() or 1
 
     @jax.jit
-    def start(key, ranges):
-        return reset_episodes(env, key, episodes, ranges)
+    def start(key: jax.Array, ranges: Ranges | None) -> Batch:
+        return begin(env, reset_episodes(env, key, episodes, ranges), recorded)
 
     @jax.jit
-    def decide(policy, states):
+    def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, _Inputs]:
         now, actions = states.pipeline_state, actor.act(policy, states.obs.T).T
         control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
-        targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
-        damping = None if now.impact is None else now.parameters.contact_damping
-        air = control.air_drag, control.air_lift
-        return actions, actuation, targets, control.ball_push, damping, air
+        return actions, actuation, _inputs(env, now, control)
 
-    @functools.partial(jax.jit, donate_argnames="recording")
-    def finish(states, actions, actuation, physics, statistics, step, recording):
-        halves = states, actions, actuation, physics
-        states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves)
-        recording = record(env, recording, states, statistics.running, step)
-        return states, accumulate(env, statistics, states, step), recording
+    @jax.jit
+    def finish(
+        now: Batch, actions: jax.Array, actuation: Actuation, physics: PhysicsState
+    ) -> Batch:
+        halves = now.states, actions, actuation, physics
+        return add_step(env, now, jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves))
 
     def evaluate(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None
     ) -> tuple[Statistics, Recording]:
-        states = start(key, ranges)
-        simulated = full_states(env.mj_model, states.pipeline_state.physics)
-        ball_velocity = _ball_velocity(env.mj_model)
-        models = episode_models(env, states.pipeline_state.parameters)
-        data = [mujoco.MjData(models[0]) for _ in range(num_threads)]
-        statistics = empty_statistics(env, states)
-        recording = empty_recording(env, states, min(recorded, episodes))
-        with rollout.Rollout(nthread=num_threads) as pool:
+        now = start(key, ranges)
+        with rollout.Rollout(nthread=_NUM_THREADS) as pool:
+            physics = _Physics(env, now.states, pool)
             for step in range(env.config.episode_steps):
-                actions, actuation, *inputs = decide(policy, states)
-                targets, push, damping, air = jax.tree.map(
-                    lambda x: np.asarray(x, np.float64), inputs
-                )
-                if damping is not None:
-                    _set_damping(models, damping)
-                if push is not None:
-                    simulated[:, ball_velocity] += push.reshape(-1, episodes).T
-                simulated = _next_states(pool, models, data, simulated, targets, *air)
-                physics = physics_states(env.mj_model, simulated)
-                states, statistics, recording = finish(
-                    states, actions, actuation, physics, statistics, step, recording
-                )
+                actions, actuation, inputs = decide(policy, now.states)
+                now = finish(now, actions, actuation, physics.step(inputs))
                 if step % 100 < 99:
                     continue
-                if not np.any(statistics.running):
+                if not np.any(now.statistics.running):
                     break
                 if progress is not None:
                     progress((step + 1) / env.config.episode_steps)
-        return statistics, recording
+        return now.statistics, now.recording
 
     return evaluate
+
+
+class _Inputs(NamedTuple):
+    """What acts on the physics of N episodes in a control step."""
+
+    targets: jax.Array
+    """Servo targets [N, substeps, nu]."""
+    push: jax.Array | None
+    """Velocities that are added to the balls' [3 B, N], m/s."""
+    contact_damping: jax.Array | None
+    """Where an impact changes it [N], 1/s."""
+    air_drag: jax.Array | None
+    """That of `Control` [N]."""
+    air_lift: jax.Array | None
+    """Likewise."""
+
+
+def _inputs(env: Env, states: EnvState, control: Control) -> _Inputs:
+    """The inputs of states and a control, batch last."""
+    return _Inputs(
+        targets=jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps),
+        push=control.ball_push,
+        contact_damping=None if states.impact is None else states.parameters.contact_damping,
+        air_drag=control.air_drag,
+        air_lift=control.air_lift,
+    )
+
+
+class _Physics:
+    """The physics of N episodes on MuJoCo's C engine, in threads."""
+
+    def __init__(self, env: Env, states: State, pool: rollout.Rollout):
+        """
+        Args:
+          states: the episodes' first states, batch last.
+        """
+        now = states.pipeline_state
+        self._mj_model, self._pool = env.mj_model, pool
+        self._models = episode_models(env, now.parameters)
+        self._data = [mujoco.MjData(self._models[0]) for _ in range(_NUM_THREADS)]
+        self._states = full_states(env.mj_model, now.physics)
+
+    def step(self, inputs: _Inputs) -> PhysicsState:
+        """The physics [..., N] after one more control step."""
+        given = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
+        if given.contact_damping is not None:
+            pairs = contact_pairs(self._mj_model)
+            for model, damping in zip(self._models, given.contact_damping, strict=True):
+                model.pair_solref[pairs, 1] = -damping
+        if given.push is not None:
+            push = given.push.reshape(-1, len(self._states)).T
+            self._states[:, _ball_velocity(self._mj_model)] += push
+        self._states = _next_states(
+            self._pool, self._models, self._data, self._states,
+            given.targets, given.air_drag, given.air_lift,
+        )  # fmt: skip
+        return physics_states(self._mj_model, self._states)
 
 
 def _next_states(
@@ -141,17 +181,17 @@ def _next_states(
     drag, lift = (0.0 if x is None else x[:, None] * mass for x in (air_drag, air_lift))
     forces = np.zeros((len(states), models[0].nbody, 6))
 
-    def of_balls(start: int, entries: list[tuple[int, ...]]) -> np.ndarray:
+    def ball_entries(start: int, entries: list[tuple[int, ...]]) -> np.ndarray:
         return states[:, start + np.array(entries)]
 
     for target in np.moveaxis(targets, 1, 0):
-        velocity = of_balls(first_velocity, [ball.qvel[:3] for ball in balls])
+        velocity = ball_entries(first_velocity, [ball.qvel[:3] for ball in balls])
         speed = np.linalg.norm(velocity, axis=2)
         forces[:, bodies, :3] = -(drag * speed)[:, :, None] * velocity
         if air_lift is not None:
-            spin = _turned(
-                of_balls(1, [ball.qpos[3:] for ball in balls]),
-                of_balls(first_velocity, [ball.qvel[3:] for ball in balls]),
+            spin = _rotate(
+                ball_entries(1, [ball.qpos[3:] for ball in balls]),
+                ball_entries(first_velocity, [ball.qvel[3:] for ball in balls]),
             )
             forces[:, bodies, :3] += lift[:, :, None] * np.cross(spin, velocity)
         control = np.concatenate([target, forces.reshape(len(states), -1)], axis=1)[:, None]
@@ -160,19 +200,12 @@ def _next_states(
     return states
 
 
-def _turned(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def _rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] of a body's frame in the world, at its orientation [..., 4]."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     w, axis = unit[..., :1], unit[..., 1:]
     across = 2.0 * np.cross(axis, vector)
     return vector + w * across + np.cross(axis, across)
-
-
-def _set_damping(models: list[mujoco.MjModel], damping: np.ndarray) -> None:
-    """Sets the damping [N] of each model's contacts, 1/s."""
-    pairs = contact_pairs(models[0])
-    for model, value in zip(models, damping, strict=True):
-        model.pair_solref[pairs, 1] = -value
 
 
 def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:

@@ -16,8 +16,8 @@ from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
 
 
-class UnderWay(NamedTuple):
-    """Episodes under way, batch last."""
+class Batch(NamedTuple):
+    """E episodes that are being simulated, batch last."""
 
     states: State
     statistics: Statistics
@@ -45,18 +45,18 @@ def make_evaluator(
         return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
 
     @jax.jit
-    def start(key: jax.Array, ranges: Ranges | None) -> UnderWay:
+    def start(key: jax.Array, ranges: Ranges | None) -> Batch:
         return begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
 
     @jax.jit
-    def go_on(policy: Policy, now: UnderWay, last_step: jax.Array) -> UnderWay:
+    def run(policy: Policy, now: Batch, last_step: jax.Array) -> Batch:
         return run_until(env, actor, policy, now, last_step)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
         now, limit = start(key, ranges), env.config.episode_steps
         second = max(1, round(1.0 / env.dt))
         for done in range(0, limit, second):
-            now = go_on(policy, now, np.int32(min(done + second, limit)))
+            now = run(policy, now, np.int32(min(done + second, limit)))
             if not np.any(now.statistics.running):
                 break
             progress(min(1.0, (done + second) / limit))
@@ -87,14 +87,14 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
-    begun = begin(env, states, recorded)
-    ended = run_until(env, actor, policy, begun, env.config.episode_steps)
-    return ended.statistics, ended.recording
+    first = begin(env, states, recorded)
+    last = run_until(env, actor, policy, first, env.config.episode_steps)
+    return last.statistics, last.recording
 
 
-def begin(env: Env, states: State, recorded: int) -> UnderWay:
+def begin(env: Env, states: State, recorded: int) -> Batch:
     """Episodes before their first step, from initial states (batch last)."""
-    return UnderWay(
+    return Batch(
         states=states,
         statistics=empty_statistics(env, states),
         recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
@@ -106,25 +106,34 @@ def run_until(
     env: Env,
     actor: Actor,
     policy: Policy | None,
-    progress: UnderWay,
+    now: Batch,
     last_step: int | jax.Array,
-) -> UnderWay:
+) -> Batch:
     """Continues until all episodes have ended or `last_step` is reached."""
 
-    def unfinished(now: UnderWay) -> jax.Array:
+    def unfinished(now: Batch) -> jax.Array:
         return jnp.any(now.statistics.running) & (now.step < last_step)
 
-    def advance(now: UnderWay) -> UnderWay:
+    def advance(now: Batch) -> Batch:
         actions = actor.act(policy, now.states.obs.T)
         states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        return UnderWay(
-            states=states,
-            statistics=accumulate(env, now.statistics, states, now.step),
-            recording=record(env, now.recording, states, now.statistics.running, now.step),
-            step=now.step + 1,
-        )
+        return add_step(env, now, states)
 
-    return jax.lax.while_loop(unfinished, advance, progress)
+    return jax.lax.while_loop(unfinished, advance, now)
+
+
+def add_step(env: Env, before: Batch, states: State) -> Batch:
+    """The batch after one more control step.
+
+    Args:
+      states: the states after it.
+    """
+    return Batch(
+        states=states,
+        statistics=accumulate(env, before.statistics, states, before.step),
+        recording=record(env, before.recording, states, before.statistics.running, before.step),
+        step=before.step + 1,
+    )
 
 
 def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | None = None) -> State:

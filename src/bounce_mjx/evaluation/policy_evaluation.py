@@ -51,7 +51,7 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
-    env, commands, ranges = _prepared(env_config, options)
+    env, commands, ranges = _prepare(env_config, options)
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
@@ -74,14 +74,14 @@ def recorded_episodes(
     options: EvaluationOptions = DEFAULT_OPTIONS,
 ) -> Recording:
     """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`."""
-    env, _, ranges = _prepared(env_config, options)
+    env, _, ranges = _prepare(env_config, options)
     on_c = options.physics == "mujoco"
     make = make_recording_mujoco_evaluator if on_c else make_recording_evaluator
     evaluate = make(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
     return jax.device_get(evaluate(policy, jax.random.PRNGKey(options.seed), ranges)[1])
 
 
-def _prepared(
+def _prepare(
     config: WorldConfig, options: EvaluationOptions
 ) -> tuple[Env, dict[str, tuple[float, float]], Ranges | None]:
     """The environment, the changed ranges of commands, and the ranges of its resets."""

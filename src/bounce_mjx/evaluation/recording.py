@@ -16,7 +16,7 @@ RECORDED_EPISODES = 32
 
 def empty_recording(env: Env, states: State, episodes: int) -> Recording:
     """A recording of the first K of E environments (batch last) before the first step."""
-    states = _first(states, episodes)
+    states = _part(states, episodes)
     running = jnp.zeros(states.done.shape, bool)
     steps = env.config.episode_steps
     shapes = jax.eval_shape(lambda: _row(env, states, running, jnp.int32(0)))
@@ -38,11 +38,11 @@ def record(
     episodes = recording.running.shape[-1]
     if not episodes:
         return recording
-    now = _row(env, _first(states, episodes), running[..., :episodes], step)
+    now = _row(env, _part(states, episodes), running[..., :episodes], step)
     return jax.tree.map(lambda kept, new: kept.at[step].set(new), recording, now)
 
 
-def _first(states: State, episodes: int) -> State:
+def _part(states: State, episodes: int) -> State:
     return jax.tree.map(lambda x: x[..., :episodes], states)
 
 

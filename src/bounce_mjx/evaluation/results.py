@@ -4,7 +4,6 @@ import dataclasses
 from typing import Annotated, Any
 
 import jax
-import pydantic
 from pydantic import Field, InstanceOf
 
 from bounce_mjx.env.env import Env
@@ -13,19 +12,12 @@ from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.shown import Recording
 
 
-def _complete(details: dict[str, Figure]) -> dict[str, Figure]:
-    for name in ("episodes", "mean_return", "mean_length_s"):
-        if details.get(name) is None:
-            raise ValueError(f"{name} is missing")
-    return details
-
-
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """An evaluation of a policy over many episodes. Only a stored one is validated."""
+    """An evaluation of a policy over many episodes."""
 
     results: Annotated[tuple[Result, ...], Field(min_length=1)]
-    details: Annotated[dict[str, Figure], pydantic.AfterValidator(_complete)]
+    details: dict[str, Figure]
     """Further figures: episodes, the task's own, mean_return and mean_length_s."""
     recording: Annotated[InstanceOf[Recording] | None, Field(exclude=True)] = None
     """The first episodes, if they were recorded; not stored."""
@@ -84,7 +76,8 @@ def judge(
       commands: ranges of commands in these episodes, where they are not the config's.
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
-    episodes = episodes_of(env, s, commands or {})
+    trained = {name: (c.low, c.high) for name, c in env.config.commands.items()}
+    episodes = Episodes(s.tally.sums, s.tally.maxima, s.running, trained | (commands or {}))
     details = {
         "episodes": float(len(s.running)),
         **env.task.details(episodes),
@@ -92,15 +85,3 @@ def judge(
         "mean_length_s": float(s.steps.mean() * env.dt),
     }
     return Report(env.task.results(episodes), details)
-
-
-def episodes_of(
-    env: Env, statistics: Statistics, commands: dict[str, tuple[float, float]]
-) -> Episodes:
-    """What a task judges, from statistics of E episodes as NumPy arrays."""
-    return Episodes(
-        sums=statistics.tally.sums,
-        maxima=statistics.tally.maxima,
-        lasted=statistics.running,
-        commands={name: (c.low, c.high) for name, c in env.config.commands.items()} | commands,
-    )

@@ -201,7 +201,7 @@ def _check_keys(p: Perturbation, known: Sequence[str], source: str) -> None:
     if changes == p.trained_ranges:
         reason = "has both terms and trained_ranges" if changes else "changes nothing"
         raise UserError(f"{source}: it {reason}; give terms, settings or trained_ranges: true")
-    uses = any(_filled_in(values, 0.0) != values for values in (p.terms, p.settings))
+    uses = any(_fill_in(values, 0.0) != values for values in (p.terms, p.settings))
     if uses and not p.strengths:
         raise UserError(f"{source}: it has no strengths; give a list such as strengths: [1, 2]")
     if p.strengths and not uses:
@@ -227,7 +227,7 @@ def _condition(
     value = None if strength is None else strength * scale
     without = {"randomization": RandomizationConfig()}
     plain = world.model_copy(update=without)
-    env = _with_changes(plain, _filled_in(perturbation.settings, value), source)
+    env = _with_changes(plain, _fill_in(perturbation.settings, value), source)
     n = trained.num_joints
     if perturbation.trained_ranges:
         ranges = _ranges_of(trained)
@@ -235,7 +235,7 @@ def _condition(
     else:
         ranges = _ranges_of(world) | {
             term: _bounds(term, n, entry, source)
-            for term, entry in _filled_in(perturbation.terms, value).items()
+            for term, entry in _fill_in(perturbation.terms, value).items()
         }
     _check_limits(env, ranges, source)
     contained = not differing_keys(env, trained.model_copy(update=without)) and all(
@@ -275,12 +275,12 @@ def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> Wo
     return changed
 
 
-def _filled_in(value: Any, strength: float | None) -> Any:
+def _fill_in(value: Any, strength: float | None) -> Any:
     """A value from the suite with the number in place of each word strength."""
     if isinstance(value, dict):
-        return {key: _filled_in(inner, strength) for key, inner in value.items()}
+        return {key: _fill_in(inner, strength) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_filled_in(inner, strength) for inner in value]
+        return [_fill_in(inner, strength) for inner in value]
     return _SIGNS[value] * strength if isinstance(value, str) and value in _SIGNS else value
 
 

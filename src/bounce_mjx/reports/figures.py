@@ -123,7 +123,7 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _coloured(groups: Sequence[Group]) -> list[tuple[Group, str]]:
+def _with_colours(groups: Sequence[Group]) -> list[tuple[Group, str]]:
     return [(group, _COLOURS[i % len(_COLOURS)]) for i, group in enumerate(groups)]
 
 
@@ -142,7 +142,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
     standard deviation on each side. A dotted line shows where a run first met all results."""
     name, factor = shown.tag, shown.scale
-    for group, colour in _coloured(groups):
+    for group, colour in _with_colours(groups):
         for run in group.runs:
             if run.solved_steps is not None:
                 axes.axvline(run.solved_steps, color=colour, linestyle=":", linewidth=1.0)
@@ -168,7 +168,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
 def _add_legend(figure: Figure, groups: Sequence[Group], has_reference: bool = False) -> None:
     handles = [
         Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
-        for group, colour in _coloured(groups)
+        for group, colour in _with_colours(groups)
     ]
     if any(run.solved_steps is not None for group in groups for run in group.runs):
         handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))

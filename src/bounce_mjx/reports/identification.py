@@ -1,6 +1,5 @@
 """The page about an identified robot: estimates, fits, measured and simulated traces."""
 
-import base64
 import html
 from collections.abc import Sequence
 
@@ -9,10 +8,11 @@ from matplotlib.figure import Figure
 
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.words import estimates, sentences
-from bounce_mjx.reports.figures import image
-from bounce_mjx.reports.page import STYLE, table
+from bounce_mjx.reports.figures import style
+from bounce_mjx.reports.html_page import page, picture, table
 
-_SHOWN_WINDOWS = 6
+# Windows of the arm alone, and of a bounce.
+_NUM_WINDOWS = 3
 
 
 def identification_page(found: Identified, source: str, joint_names: Sequence[str]) -> str:
@@ -33,63 +33,47 @@ def identification_page(found: Identified, source: str, joint_names: Sequence[st
         for name in found.after
     ]
     said = "".join(f"<li>{html.escape(text)}</li>\n" for text in sentences(found, joint_names))
-    picture = base64.b64encode(image(traces_figure(found, joint_names), "svg")).decode()
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>bounce_mjx: identified from {html.escape(source)}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>Identified from {html.escape(source)}</h1>
+    body = f"""<h1>Identified from {html.escape(source)}</h1>
 <ul>
 {said}</ul>
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
-<h2>Measured and simulated</h2>
-<img alt="Measured and simulated traces" src="data:image/svg+xml;base64,{picture}">
+{picture("Measured (dots) and simulated (lines)", traces_figure(found, joint_names))}
 <h2>Estimates</h2>
-{table(["term", "estimate", "95% interval", "unit", ""], rows)}
-</body>
-</html>
-"""
+{table(["term", "estimate", "95% interval", "unit", ""], rows)}"""
+    return page(f"identified from {source}", body)
 
 
+@style()
 def traces_figure(found: Identified, joint_names: Sequence[str]) -> Figure:
-    """Measured (dots) and simulated (lines) angles and heights of the ball in some windows."""
-    w = found.windows
-    with_ball = np.flatnonzero(w.has_ball)
-    arm = np.flatnonzero(~w.has_ball)
+    """Measured (dots) and simulated (lines) joint angles and heights of the ball in some windows:
+    those of the arm alone, then those of a bounce."""
+    windows, predicted = found.windows, found.fit.predicted
     chosen = [
-        *arm[np.linspace(0, len(arm) - 1, min(3, len(arm))).astype(int)],
-        *with_ball[
-            np.linspace(0, len(with_ball) - 1, min(_SHOWN_WINDOWS - 3, len(with_ball))).astype(int)
-        ],
+        group[i]
+        for group in (np.flatnonzero(~windows.has_ball), np.flatnonzero(windows.has_ball))
+        for i in np.unique(np.linspace(0, len(group) - 1, _NUM_WINDOWS).astype(int))
+        if len(group)
     ]
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")
-    axes = figure.subplots(2, max(len(chosen), 1), squeeze=False)
-    for column, s in enumerate(chosen):
-        above, below = axes[:, column]
-        used = w.angle_weights[s] > 0.0
-        t = w.angle_times[s][used]
+    axes = figure.subplots(2, len(chosen), squeeze=False)
+    for (above, below), s in zip(axes.T, chosen, strict=True):
+        used = windows.angle_weights[s] > 0.0
+        times, measured = windows.angle_times[s, used], windows.angles[s, used]
+        means = np.mean(measured, axis=0)
         for j, name in enumerate(joint_names):
-            middle = np.mean(w.angles[s][used, j]) if len(t) else 0.0
-            colour = f"C{j}"
-            above.plot(t, w.angles[s][used, j] - middle, ".", ms=3, color=colour)
-            above.plot(
-                t, found.fit.predicted.angles[s][used, j] - middle, lw=1, color=colour, label=name
-            )
-        seen = w.picture_weights[s] > 0.0
-        t = w.picture_times[s][seen]
-        if len(t):
-            below.plot(t, w.balls[s][seen, 2], ".", ms=3, color="k")
-            below.plot(t, found.fit.predicted.balls[s][seen, 2], lw=1, color="C1")
-        else:
-            below.set_axis_off()
-        below.set_xlabel("time in the window [s]")
-    axes[0, 0].set_ylabel("joint angles minus their means [rad]")
+            above.plot(times, measured[:, j] - means[j], ".", ms=3, color=f"C{j}")
+            simulated = predicted.angles[s, used, j] - means[j]
+            above.plot(times, simulated, lw=1, color=f"C{j}", label=name)
+        above.set_xlabel("time in the window, s")
+        used = windows.picture_weights[s] > 0.0
+        times = windows.picture_times[s, used]
+        below.plot(times, windows.balls[s, used, 2], ".", ms=3, color="k")
+        below.plot(times, predicted.balls[s, used, 2], lw=1, color="C1")
+        below.set_xlabel("time in the window, s")
+        below.set_visible(bool(windows.has_ball[s]))
+    axes[0, 0].set_ylabel("joint angles minus their means, rad")
     axes[0, 0].legend(fontsize=7)
-    axes[1, -1].set_ylabel("height of the ball [m]")
+    for below in [below for below in axes[1] if below.get_visible()][:1]:
+        below.set_ylabel("height of the ball, m")
     return figure

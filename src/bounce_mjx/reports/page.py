@@ -3,10 +3,8 @@
 Training writes it after its results; `bounce-mjx report [RUN]` writes it again.
 """
 
-import base64
 import html
 import json
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jax
@@ -16,17 +14,15 @@ from matplotlib.figure import Figure
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.config import DEFAULT_SEED
-from bounce_mjx.evaluation.episodes import make_recording_evaluator
-from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (
     RETURN,
     curves_figure,
     evaluation_figure,
-    image,
     rewards_figure,
 )
+from bounce_mjx.reports.html_page import data_url, page, picture, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
 from bounce_mjx.resources import POLICIES, resource_path
@@ -46,9 +42,7 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
     _, policy, actor = read_actor(checkpoint, config)
-    env = Env(config.env)
-    evaluate = make_recording_evaluator(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
-    return evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED))[1]
+    return recorded_episodes(policy, config.env, actor)
 
 
 def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
@@ -78,14 +72,14 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
         **({} if robustness is None else {"Perturbed worlds": robustness_figure(robustness)}),
         "Reward terms": rewards_figure(groups),
     }
-    page = run / REPORT_FILE
+    path = run / REPORT_FILE
     try:
-        write_atomically(page, _html(run, config, env.engine.name, results, figures))
+        write_atomically(path, _html(run, config, env.engine.name, results, figures))
     except OSError as error:
         raise UserError(
-            f"{page} cannot be written ({error.strerror}); make the folder writable"
+            f"{path} cannot be written ({error.strerror}); make the folder writable"
         ) from error
-    return page, evaluation
+    return path, evaluation
 
 
 def _reference(config: TrainConfig) -> dict[str, float]:
@@ -110,16 +104,10 @@ def _html(
     run: Path, config: TrainConfig, engine: str, results: Results, figures: dict[str, Figure]
 ) -> str:
     report = results.best
-    pictures = ""
-    for title, figure in figures.items():
-        data = base64.b64encode(image(figure, "svg")).decode()
-        source = f"data:image/svg+xml;base64,{data}"
-        picture = f'<div class="wide"><img alt="{title}" src="{source}"></div>'
-        pictures += f"<h2>{title}</h2>\n{picture}\n"
+    pictures = "".join(picture(title, figure) for title, figure in figures.items())
     if (run / REPLAY_FILE).is_file():
-        data = base64.b64encode((run / REPLAY_FILE).read_bytes()).decode()
-        frame = f'<iframe title="Replay" src="data:text/html;base64,{data}"></iframe>'
-        pictures += f"<h2>Replay</h2>\n{frame}\n"
+        source = data_url("text/html", (run / REPLAY_FILE).read_bytes())
+        pictures += f'<h2>Replay</h2>\n<iframe title="Replay" src="{source}"></iframe>\n'
     seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
@@ -128,16 +116,7 @@ def _html(
         for e in results.evaluations
     ]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>bounce_mjx: {html.escape(run.name)}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>{report.summary}</h1>
+    body = f"""<h1>{report.summary}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
 the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
@@ -150,47 +129,11 @@ the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} 
 {table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
 <h2>All evaluations</h2>
 {table(["environment steps", *names, "all met"], evaluations)}
-<details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>
-</body>
-</html>
-"""
+<details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
+    return page(run.name, body)
 
 
 def _standing(evaluation: Evaluation) -> str:
     if evaluation.passed:
         return "pass"
     return "screening" if evaluation.screening else "-"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in HTML, with coloured verdicts. On a phone, it scrolls sideways by itself."""
-
-    def row(tag: str, cells: Sequence[str]) -> str:
-        classes = [{"pass": "pass", "FAIL": "fail"}.get(cell, "") for cell in cells]
-        inner = "".join(
-            f'<{tag} class="{name}">{html.escape(cell)}</{tag}>'
-            for name, cell in zip(classes, cells, strict=True)
-        )
-        return f"<tr>{inner}</tr>\n"
-
-    body = "".join(row("td", cells) for cells in rows)
-    return f'<div class="wide"><table>\n{row("th", header)}{body}</table></div>'
-
-
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222; background: #fff; }
-h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
-.wide { overflow-x: auto; }
-img { width: 100%; min-width: 44rem; }
-iframe { width: 100%; height: 30rem; border: 1px solid #ddd; }
-table { border-collapse: collapse; }
-th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
-.pass { color: #00704f; font-weight: bold; } .fail { color: #b00020; font-weight: bold; }
-code, pre { font-size: 13px; overflow-wrap: anywhere; white-space: pre-wrap; }
-summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
-@media (max-width: 30rem) {
-  th, td { padding-right: 0.4rem; font-size: 13px; }
-  .many, .many tbody, .many tr { display: block; }
-}
-"""

@@ -16,18 +16,18 @@ import viser.uplot
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.controls import Controls, words
+from bounce_mjx.viewers.display import TRAIL_RGB, TRAIL_SECONDS
 from bounce_mjx.viewers.options import PageStart
-from bounce_mjx.viewers.pace import in_real_time
 from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
     Simulation,
-    of_environment,
-    pose_of,
-    stacked,
+    at_index,
+    environment_pose,
+    in_real_time,
+    stack,
 )
-from bounce_mjx.viewers.trail import TRAIL_RGB, TRAIL_SECONDS
 
 # Plots per second.
 _PLOT_RATE = 8.0
@@ -113,7 +113,7 @@ class LivePage:
             return
         event.target.disabled = True
         try:
-            recording = jax.tree.map(lambda x: x[:, : self._scene.num_envs], stacked(frames))
+            recording = jax.tree.map(lambda x: x[:, : self._scene.num_envs], stack(frames))
             text = replay(self._simulation.env, recording, names=self._names)
             event.client.send_file_download("replay.html", text.encode(), save_immediately=True)
         finally:
@@ -150,7 +150,7 @@ class LivePage:
 
     def _levels(self, frame: EnvFrame) -> dict[str, float]:
         """The task's heights of the first environment."""
-        return self._simulation.env.task.levels(of_environment(frame.command, 0))
+        return self._simulation.env.task.levels(at_index(frame.command, 0))
 
     def _update_plots(self) -> None:
         env = self._simulation.env
@@ -174,7 +174,7 @@ def _reward_terms(frame: EnvFrame) -> dict[str, float]:
 
 def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
-    markers = env.task.markers(*pose_of(frame, 0)[1:])
+    markers = env.task.markers(*environment_pose(frame, 0)[1:])
     # Markers whose names differ by a number are parts of one.
     rows = {
         words(marker.name.rstrip("_ 0123456789")): 255.0 * np.array(marker.rgba[:3])
@@ -202,16 +202,16 @@ def reward_bars(terms: Mapping[str, float]) -> str:
         colour = "#2b8a3e" if value >= 0.0 else "#c92a2a"
         rows.append(
             f"<tr><td>{html.escape(words(name))}</td>"
-            f'<td style="text-align:right">{_rounded(value)}</td>'
+            f'<td style="text-align:right">{_format(value)}</td>'
             f'<td style="width:36%"><div style="height:9px;margin-left:{left:.1f}%;'
             f'width:{width:.1f}%;background:{colour}"></div></td></tr>'
         )
-    total = _rounded(sum(terms.values()))
+    total = _format(sum(terms.values()))
     rows.append(f'<tr><td colspan="3"><b>sum {total}</b> a step</td></tr>')
     return f'<table style="font:11px sans-serif;padding:0 12px;width:100%">{"".join(rows)}</table>'
 
 
-def _rounded(value: float) -> str:
+def _format(value: float) -> str:
     """Two decimals, without the sign of a negative zero."""
     return f"{round(value, 2) + 0.0:.2f}"
 
@@ -222,16 +222,11 @@ def free_port(host: str, port: int) -> int:
     Raises:
       UserError: the host is not an address of this machine, or none of the ports is free.
     """
-    reason = "no port is free"
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for candidate in range(port, min(port + 100, 2**16)):
         try:
-            family, kind, protocol, _, address = socket.getaddrinfo(
-                host, candidate, type=socket.SOCK_STREAM
-            )[0]
-            with socket.socket(family, kind, protocol) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-            return candidate
+            with socket.create_server((host, candidate), family=family):
+                return candidate
         except OSError as error:
             reason = error.strerror
     raise UserError(

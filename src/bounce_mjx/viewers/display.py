@@ -1,4 +1,4 @@
-"""The displayed model: the task's markers, and each visible geom as a mesh."""
+"""What viewers draw: the model with the task's markers, its geoms as meshes, the ball's path."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +12,7 @@ from bounce_mjx.robot.arm import compile_spec
 from bounce_mjx.robot.balls import add_balls
 from bounce_mjx.robot.model import scene_spec
 from bounce_mjx.task.shown import Marker
+from bounce_mjx.viewers.simulation import EnvFrame
 from bounce_mjx.world.config import WorldConfig
 
 # By default MuJoCo shows the geom groups 0 to 2.
@@ -20,6 +21,11 @@ _SEGMENTS = 40
 # Width of the outline of a frame, m.
 _EDGE = 0.004
 _CREASE_ANGLE = np.radians(30.0)
+
+TRAIL_SECONDS = 0.6
+"""Age of the end of the line, s."""
+TRAIL_RGB = np.array([235.0, 85.0, 0.0])
+"""Colour of its newest part, from 0 to 255."""
 
 NO_METRICS: Mapping[str, float] = defaultdict(float)
 """Metrics before the first step."""
@@ -160,3 +166,23 @@ def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
         roughnessFactor=0.55,
         alphaMode="OPAQUE" if rgba[3] >= 1.0 else "BLEND",
     )
+
+
+class Trail:
+    """The last positions of the balls of N environments, in frames that are `dt` seconds apart."""
+
+    def __init__(self, dt: float):
+        self.length = round(TRAIL_SECONDS / dt)
+        """Number P of positions."""
+        self.points: np.ndarray | None = None
+        """Positions [P, N, B, 3], the oldest first, m; where an episode is shorter, its first
+        position comes several times. None before the first frame."""
+
+    def add(self, frame: EnvFrame) -> None:
+        """Adds a frame's positions."""
+        if self.points is None:
+            self.points, self._time = np.tile(frame.balls, (self.length, 1, 1, 1)), frame.time
+        self.points = np.concatenate([self.points[1:], frame.balls[None]])
+        restarted = frame.time < self._time
+        self.points[:, restarted] = frame.balls[restarted]
+        self._time = frame.time

@@ -149,12 +149,12 @@ class _Connection(ServerConnection):
 
     async def recv(self, *args: Any, **options: Any) -> str | bytes:
         message = await super().recv(*args, **options)
-        while not _is_of_page(message):
+        while not _is_valid(message):
             message = await super().recv(*args, **options)
         return message
 
 
-def _is_of_page(data: str | bytes) -> bool:
+def _is_valid(data: str | bytes) -> bool:
     """Whether a message is one that a page sends: its camera, a key, or a control's new value."""
     # Any bytes may come.
     with contextlib.suppress(Exception):

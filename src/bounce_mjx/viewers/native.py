@@ -9,11 +9,9 @@ import mujoco
 import mujoco.viewer
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.display import Display, Trail
 from bounce_mjx.viewers.offscreen import draw_trail
-from bounce_mjx.viewers.pace import in_real_time
-from bounce_mjx.viewers.simulation import Simulation, pose_of
-from bounce_mjx.viewers.trail import Trail
+from bounce_mjx.viewers.simulation import Simulation, environment_pose, in_real_time
 
 
 def has_display() -> bool:
@@ -50,7 +48,7 @@ def show_window(
     """
     display, trail = Display(simulation.env), Trail(simulation.env.dt)
     trail.add(simulation.frame)
-    display.pose(*pose_of(simulation.frame, 0))
+    display.pose(*environment_pose(simulation.frame, 0))
     with mujoco.viewer.launch_passive(
         display.model, display.data, show_left_ui=False, show_right_ui=False
     ) as viewer:
@@ -63,7 +61,7 @@ def show_window(
             for frame in frames:
                 trail.add(frame)
             with viewer.lock():
-                display.pose(*pose_of(simulation.frame, 0))
+                display.pose(*environment_pose(simulation.frame, 0))
                 viewer.user_scn.ngeom = 0
                 draw_trail(viewer.user_scn, trail.points[:, 0])
             viewer.sync()

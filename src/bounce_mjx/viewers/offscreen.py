@@ -13,8 +13,7 @@ from mujoco.rendering.classic import gl_context
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.viewers.display import NO_METRICS, Display
-from bounce_mjx.viewers.trail import TRAIL_RGB
+from bounce_mjx.viewers.display import NO_METRICS, TRAIL_RGB, Display
 
 CAMERA = "overview"
 _TRAIL_RADIUS = 0.004

@@ -9,9 +9,8 @@ import numpy as np
 import viser
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.viewers.display import Display, body_scenes
-from bounce_mjx.viewers.simulation import EnvFrame, frame_readings, pose_of
-from bounce_mjx.viewers.trail import TRAIL_RGB, Trail
+from bounce_mjx.viewers.display import TRAIL_RGB, Display, Trail, body_scenes
+from bounce_mjx.viewers.simulation import EnvFrame, environment_pose, frame_readings
 
 _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
@@ -28,10 +27,6 @@ _HIGHEST = 0.85
 _FIELD_OF_VIEW = math.radians(40.0)
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
 _FULL_ASPECT = 0.9
-# On a page with fewer pixels across, viser's controls cover the lower part: the camera looks down
-# by this share of its field of view.
-_PHONE_WIDTH = 576
-_PHONE_SHIFT = 0.27
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
 _FOLLOWING = 0.1
@@ -57,7 +52,6 @@ class Scene:
         self._env = env
         self._names = names
         self._display = Display(env)
-        self._phones: set[int] = set()
         server.on_client_connect(self._welcome)
         self.show(num_envs)
 
@@ -130,7 +124,7 @@ class Scene:
             self._lost = np.where(over, frame.lost[:number], self._lost)
         with self._server.atomic():
             for i, label in enumerate(self._labels):
-                qpos, command, metrics = pose_of(frame, i)
+                qpos, command, metrics = environment_pose(frame, i)
                 display.pose(qpos, command, metrics)
                 positions[i], rotations[i] = display.data.xpos, display.data.xquat
                 # An empty label would be a white stroke.
@@ -174,9 +168,6 @@ class Scene:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a new page, and once more when its panels have taken their room."""
-        # Later the width is of the picture between the panels.
-        if client.camera.image_width < _PHONE_WIDTH:
-            self._phones.add(client.client_id)
         self._frame(client)
         aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
 
@@ -191,15 +182,13 @@ class Scene:
         """Turns the camera of a page towards the environments."""
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
-            on_phone = client.client_id in self._phones
-            aspect = client.camera.aspect
-            position, gaze = camera_pose(self._offsets, self._focus, aspect, on_phone)
+            position, gaze = camera_pose(self._offsets, self._focus, client.camera.aspect)
             if np.all(np.isfinite(position)):
                 client.camera.position, client.camera.look_at = position, gaze
 
 
 def camera_pose(
-    offsets: np.ndarray, focus: np.ndarray, aspect: float = 1.0, on_phone: bool = False
+    offsets: np.ndarray, focus: np.ndarray, aspect: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
 
@@ -207,7 +196,6 @@ def camera_pose(
       offsets: positions of the environments [N, 3], m.
       focus: the task's point [3] in the middle of the picture (`Task.focus`), m.
       aspect: width / height of the picture.
-      on_phone: whether the controls cover the lower part of the picture.
     """
     *aside, rise = focus - _USUAL_FOCUS
     rise = max(0.0, rise)
@@ -215,8 +203,7 @@ def camera_pose(
     look_at = _LOOK_AT + 0.5 * np.array([*aside, rise])
     extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
-    down = math.tan(_PHONE_SHIFT * _FIELD_OF_VIEW) if on_phone else 0.0
-    return look_at + view, look_at - (0.0, 0.0, down * np.linalg.norm(view))
+    return look_at + view, look_at
 
 
 def _grid(number: int) -> np.ndarray:

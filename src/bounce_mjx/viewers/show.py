@@ -11,13 +11,13 @@ from bounce_mjx.config.command_line import progress
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output
-from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.viewers.native import check_display, has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
-from bounce_mjx.viewers.simulation import SideBySide, Simulation
-from bounce_mjx.viewers.world import drawn_ranges, with_sliders
+from bounce_mjx.viewers.simulation import Controller, SideBySide, Simulation
+from bounce_mjx.viewers.world import reset_ranges, with_sliders
 from bounce_mjx.world.config import WorldConfig
 
 _RECORDED_SECONDS = 10.0
@@ -29,6 +29,7 @@ class Shown(NamedTuple):
     config: WorldConfig
     make_controller: Callable[[Env], Controller]
     title: str
+    policy: Policy | None = None
 
 
 def show(
@@ -167,9 +168,9 @@ def _simulate(
     is_drawn = all(one.config.randomization.terms for one in shown)
     simulations = []
     for one, env in zip(shown, envs, strict=True):
-        ranges = drawn_ranges(one.config) if has_sliders else None
+        ranges = reset_ranges(one.config) if has_sliders else None
         controller = one.make_controller(env)
-        simulation = Simulation(env, controller, num_envs, options.seed, ranges)
+        simulation = Simulation(env, controller, num_envs, options.seed, ranges, one.policy)
         simulation.command = commands
         simulation.world = None if is_drawn else {}
         simulations.append(simulation)

@@ -1,6 +1,7 @@
 """Episodes as NumPy frames: stepped live for a viewer, or recorded."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -10,10 +11,34 @@ import numpy as np
 
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.state import State
-from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.viewers.controllers import Controller
 from bounce_mjx.world.randomization import TERMS, Ranges, World
+
+_PICTURES_PER_SECOND = 50.0
+# If a simulation falls behind the clock by more than this, it slows down instead of catching up, s.
+_MAX_LAG = 0.1
+
+Controller = Callable[[Policy | None, State, jax.Array], jax.Array]
+"""A controller of N environments: (policy, if it has one; states, batch last; key, which is
+consumed) -> actions [n, N]."""
+
+
+def make_policy_controller(actor: Actor) -> Controller:
+    """The policy's most likely action."""
+    return lambda policy, states, key: actor.act(policy, states.obs.T).T
+
+
+def make_random_controller(env: Env) -> Controller:
+    """Uniform in [-1, 1]."""
+    return lambda _, states, key: jax.random.uniform(
+        key, (env.action_size, states.obs.shape[-1]), minval=-1.0, maxval=1.0
+    )
+
+
+def make_zero_controller(env: Env) -> Controller:
+    """Zero: the servos hold the measured angles."""
+    return lambda _, states, key: jnp.zeros((env.action_size, states.obs.shape[-1]))
 
 
 class EnvFrame(NamedTuple):
@@ -55,25 +80,25 @@ class _Changes(NamedTuple):
     """Terms of the world that have a nominal value; nan keeps an entry."""
 
 
-def of_environment(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
+def at_index(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
     """Commands or metrics [N] of one environment, each a number."""
     return {name: float(value[index]) for name, value in values.items()}
 
 
-def pose_of(frame: EnvFrame, index: int) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
+def environment_pose(
+    frame: EnvFrame, index: int
+) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
     """The positions [nq], the commands and the metrics of one environment of a frame."""
-    command, metrics = (of_environment(x, index) for x in (frame.command, frame.metrics))
+    command, metrics = (at_index(x, index) for x in (frame.command, frame.metrics))
     return frame.qpos[index], command, metrics
 
 
 def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
     """The task's readings of one environment of a frame."""
-    return env.task.readings(
-        of_environment(frame.command, index), of_environment(frame.metrics, index)
-    )
+    return env.task.readings(at_index(frame.command, index), at_index(frame.metrics, index))
 
 
-def stacked(frames: Sequence[EnvFrame]) -> EnvFrame:
+def stack(frames: Sequence[EnvFrame]) -> EnvFrame:
     """T frames as a recording."""
     return jax.tree.map(lambda *values: np.stack(values), *frames)
 
@@ -99,7 +124,7 @@ class Simulation:
 
         Args:
           ranges: from which the resets draw the worlds, see `Env.reset`.
-          policy: the first value of `policy`, for an exchangeable controller.
+          policy: the first value of `policy`.
         """
         self.env = env
         self.num_envs = num_envs
@@ -156,10 +181,10 @@ class Simulation:
         return self.frame
 
     def record(self, seconds: float) -> EnvFrame:
-        """The current frame and the frames of the following `seconds`, stacked."""
+        """The current frame and the frames of the following `seconds`."""
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
-        return stacked(frames)
+        return stack(frames)
 
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
@@ -193,7 +218,7 @@ class Simulation:
 
     def _advance(self, policy, key, states, steps, changes):
         key, action_key = jax.random.split(key)
-        states = _changed(self.env, states, changes)
+        states = _apply(self.env, states, changes)
         actions = self._controller(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
@@ -234,6 +259,27 @@ class SideBySide(Simulation):
         return self.frame
 
 
+def in_real_time(
+    simulation: Simulation, seconds: float | None, speed: Callable[[], float]
+) -> Iterator[list[EnvFrame]]:
+    """Steps a simulation with the clock, and yields for each picture the frames since the last one.
+
+    Args:
+      seconds: simulated time; None for no end.
+      speed: the present factor of real time; 0 is a pause.
+    """
+    dt = simulation.env.dt
+    left = float("inf") if seconds is None else round(seconds / dt)
+    owed, last = 0.0, time.monotonic()
+    while left > 0:
+        now = time.monotonic()
+        owed += speed() * min(now - last, _MAX_LAG) / dt
+        due, last = min(int(owed), left), now
+        owed, left = owed - due, left - due
+        yield [simulation.step() for _ in range(due)]
+        time.sleep(1.0 / _PICTURES_PER_SECOND)
+
+
 def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     """A recording [T, N, ...] at another rate.
 
@@ -266,7 +312,7 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     )
 
 
-def _changed(env: Env, states: State, changes: _Changes) -> State:
+def _apply(env: Env, states: State, changes: _Changes) -> State:
     """States [..., N] with the changes of a user."""
     before = states.pipeline_state
     qvel = before.physics.qvel
@@ -274,11 +320,11 @@ def _changed(env: Env, states: State, changes: _Changes) -> State:
         qvel = qvel.at[jnp.array(ball.qvel[:3])].add(changes.push[:, None])
     changed = before._replace(
         physics=before.physics._replace(qvel=qvel),
-        command=_given_or_drawn(changes.command, before.command),
+        command=_replace_given(changes.command, before.command),
     )
 
     def with_world(state: EnvState) -> EnvState:
-        return env.with_world(state, _given_or_drawn(changes.world, state.world))
+        return env.with_world(state, _replace_given(changes.world, state.world))
 
     if changes.world:
         changed = jax.vmap(with_world, in_axes=-1, out_axes=-1)(changed)
@@ -286,7 +332,7 @@ def _changed(env: Env, states: State, changes: _Changes) -> State:
     return states.replace(pipeline_state=changed, obs=observation)
 
 
-def _given_or_drawn(given: World, drawn: World) -> World:
+def _replace_given(given: World, drawn: World) -> World:
     """Drawn values by name, some of which are replaced; nan replaces none."""
     return drawn | {
         name: jnp.where(jnp.isnan(value), drawn[name], value) for name, value in given.items()

@@ -14,16 +14,16 @@ from bounce_mjx.errors import MissingPackage, UserError, install_command
 from bounce_mjx.files import new_file
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.runs.files import writable
+from bounce_mjx.viewers.display import Trail
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
     Simulation,
+    environment_pose,
     frame_at,
     frame_readings,
-    pose_of,
     resample,
 )
-from bounce_mjx.viewers.trail import Trail
 
 SUFFIXES = (".mp4", ".gif")
 # A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
@@ -137,7 +137,7 @@ class VideoWriter:
             for i in range(len(frames.time)):
                 frame = frame_at(frames, i)
                 trail.add(frame)
-                picture = renderer.render(*pose_of(frame, 0), trail.points[:, 0])
+                picture = renderer.render(*environment_pose(frame, 0), trail.points[:, 0])
                 yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 

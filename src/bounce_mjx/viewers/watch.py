@@ -22,10 +22,9 @@ from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
 from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
-from bounce_mjx.viewers.controllers import make_exchangeable_controller
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
-from bounce_mjx.viewers.simulation import Simulation
+from bounce_mjx.viewers.simulation import Simulation, make_policy_controller
 
 _ROBOTS = 4
 _RETURN = Curve("episode/return", "", title="return of an episode")
@@ -103,7 +102,7 @@ class TrainingPage:
             networks, env.observation_size, jax.random.PRNGKey(config.seed)
         )
         robots = _ROBOTS if env.engine.name == "fused" else 1
-        controller = make_exchangeable_controller(networks)
+        controller = make_policy_controller(networks)
         untrained = jax.device_get(untrained)
         return Simulation(env, controller, robots, config.seed, policy=untrained)
 

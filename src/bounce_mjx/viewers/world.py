@@ -62,7 +62,7 @@ def with_sliders(config: WorldConfig) -> WorldConfig:
     return config.model_copy(update={"randomization": randomization})
 
 
-def drawn_ranges(config: WorldConfig) -> Ranges:
+def reset_ranges(config: WorldConfig) -> Ranges:
     """Ranges with which a reset of `with_sliders(config)` draws the worlds of `config`."""
     nominal = {
         name: jnp.full(TERMS[name].shape(config.num_joints), TERMS[name].nominal, jnp.float32)

@@ -1,0 +1,69 @@
+"""The parts of an HTML page: its frame, pictures and tables."""
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+
+from matplotlib.figure import Figure
+
+from bounce_mjx.reports.figures import image
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; background: #fff; }
+h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
+.wide { overflow-x: auto; }
+img { width: 100%; min-width: 44rem; }
+iframe { width: 100%; height: 30rem; border: 1px solid #ddd; }
+table { border-collapse: collapse; }
+th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
+.pass { color: #00704f; font-weight: bold; } .fail { color: #b00020; font-weight: bold; }
+code, pre { font-size: 13px; overflow-wrap: anywhere; white-space: pre-wrap; }
+summary { cursor: pointer; margin-top: 2rem; font-weight: bold; }
+@media (max-width: 30rem) {
+  th, td { padding-right: 0.4rem; font-size: 13px; }
+}
+"""
+
+
+def page(title: str, body: str) -> str:
+    """A self-contained page."""
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>bounce_mjx: {html.escape(title)}</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def picture(title: str, figure: Figure) -> str:
+    """A figure below its title."""
+    source = data_url("image/svg+xml", image(figure, "svg"))
+    return f'<h2>{title}</h2>\n<div class="wide"><img alt="{title}" src="{source}"></div>\n'
+
+
+def data_url(kind: str, content: bytes) -> str:
+    """A file of a media type as the address of itself."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in HTML, with coloured verdicts. On a phone, it scrolls sideways by itself."""
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        classes = [{"pass": "pass", "FAIL": "fail"}.get(cell, "") for cell in cells]
+        inner = "".join(
+            f'<{tag} class="{name}">{html.escape(cell)}</{tag}>'
+            for name, cell in zip(classes, cells, strict=True)
+        )
+        return f"<tr>{inner}</tr>\n"
+
+    body = "".join(row("td", cells) for cells in rows)
+    return f'<div class="wide"><table>\n{row("th", header)}{body}</table></div>'
