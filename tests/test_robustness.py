@@ -574,7 +574,6 @@ CRAFTED_OUTCOMES = {
     "no outcomes": None,
     "unknown engine": {"physics": "other"},
     "no results": {"values": {}},
-    "other results": {"values": {"stable": 1.0}},
 }
 
 
