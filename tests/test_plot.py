@@ -355,7 +355,7 @@ def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
 
 BAD_PLOTS = {
     "no run": ("nowhere", "nowhere", "give a run's folder"),
-    "unknown format": ("{run} --formats gif", "--formats", "gif", "{png,svg}"),
+    "unknown format": ("{run} --formats gif", "--formats is gif", "'png' or 'svg'"),
     "no format": ("{run} --formats", "--formats", "at least 1 item"),
     "out is a file": ("{run} --out {run}/config.yaml", "cannot be written", "--out"),
 }
