@@ -155,7 +155,7 @@ def test_doctor_says_what_an_issue_needs(monkeypatch, capsys) -> None:
     said = dict(line.split(": ", 1) for line in lines)
     assert said["bounce_mjx"].startswith(f"{bounce_mjx.__version__} in ")
     assert f"numpy {np.__version__}" in said["packages"]
-    assert said["devices"] == "none, as JAX does not start (no GPU)"
+    assert said["devices"] == "none (no GPU)"
     assert "JAX_TEST_VARIABLE=3" in said["variables"]
     assert said["extra sim"] == "lacks nonesuch-plugin (pip install 'bounce_mjx[sim]')"
     assert said["extra all"] == "lacks nonesuch-plugin, nonesuch (pip install 'bounce_mjx[all]')"

@@ -5,7 +5,7 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import bounce_mjx
@@ -44,10 +44,10 @@ def described() -> Iterator[tuple[str, str]]:
     chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
     yield "variables", ", ".join(f"{n}={v}" for n, v in sorted(chosen.items())) or "none"
     yield "processors", f"{os.cpu_count()}"
-    yield "devices", _devices()
-    yield "cache", _cache()
-    yield "pictures", _opengl()
-    yield "videos", _ffmpeg()
+    yield "devices", _tried(_devices)
+    yield "cache", _tried(_cache)
+    yield "pictures", _tried(_opengl)
+    yield "videos", _tried(_ffmpeg)
     for extra, packages in sorted(extras().items()):
         missing = [package for package in packages if version_of(package) is None]
         command = install_command(f"{_DISTRIBUTION}[{extra}]")
@@ -83,45 +83,41 @@ def _packages(distribution: str, extra: str) -> Iterator[str]:
                     yield from _packages(name, inner)
 
 
-def _devices() -> str:
-    # Imported late, as all of these: a broken installation is what this command is for.
+def _tried(describe: Callable[[], str]) -> str:
+    """A description, or why there is none: a broken installation is what this command is for, so
+    each description imports its libraries itself."""
     try:
-        import jax
-
-        return ", ".join(f"{device.device_kind} ({device})" for device in jax.devices())
+        return describe()
     except Exception as error:
-        return f"none, as JAX does not start ({reason_of(error)})"
+        return f"none ({reason_of(error)})"
+
+
+def _devices() -> str:
+    import jax
+
+    return ", ".join(f"{device.device_kind} ({device})" for device in jax.devices())
 
 
 def _cache() -> str:
-    try:
-        import jax
+    import jax
 
-        from bounce_mjx.training.setup import cache_compilations
+    from bounce_mjx.training.setup import cache_compilations
 
-        cache_compilations()
-        folder = jax.config.jax_compilation_cache_dir
-        if folder is None:
-            return "none"
-        sizes = [path.stat().st_size for path in Path(folder).glob("*") if path.is_file()]
-    except Exception as error:
-        return f"unknown ({reason_of(error)})"
+    cache_compilations()
+    folder = jax.config.jax_compilation_cache_dir
+    if folder is None:
+        return "none"
+    sizes = [path.stat().st_size for path in Path(folder).glob("*") if path.is_file()]
     return f"{folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB"
 
 
 def _opengl() -> str:
-    try:
-        from bounce_mjx.viewers.offscreen import choose_backend
+    from bounce_mjx.viewers.offscreen import choose_backend
 
-        return choose_backend()
-    except Exception as error:
-        return f"none ({reason_of(error)})"
+    return choose_backend()
 
 
 def _ffmpeg() -> str:
-    try:
-        from bounce_mjx.viewers.video import find_ffmpeg
+    from bounce_mjx.viewers.video import find_ffmpeg
 
-        return find_ffmpeg()
-    except Exception as error:
-        return f"none ({reason_of(error)})"
+    return find_ffmpeg()

@@ -294,11 +294,8 @@ def read_preset(
       UserError: a file is missing or invalid.
     """
     files = preset_files(path, task, machine)
-    robot, world = (
-        robot and _named(robot, ROBOTS, "robot"),
-        world and _named(world, WORLDS, "world"),
-    )
-    return load_config(files, robot, task, world)
+    robot = robot and _named(robot, ROBOTS, "robot")
+    return load_config(files, robot, task, world and _named(world, WORLDS, "world"))
 
 
 def preset_files(
