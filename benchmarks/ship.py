@@ -28,17 +28,17 @@ from bounce_mjx.runs.config import (
     read_preset,
     runs_folder,
 )
-from bounce_mjx.runs.files import MANIFEST_FILE
+from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
     Checkpoint,
     best_checkpoint,
     find_checkpoint,
     write_config,
 )
-from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import read_networks, read_policy
+from bounce_mjx.runs.progress import RESULTS_FILE, load_results
+from bounce_mjx.runs.reading import NETWORKS, POLICY, read_networks, read_policy
 from bounce_mjx.runs.robot import ROBOT, copy_robot
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -165,11 +165,11 @@ def write_policy(
             made = Path(scratch) / name
             made.mkdir()
             write_config(made, config)
-            writer = CheckpointWriter(made, config)
-            writer.save(("best",), checkpoint.steps, policy, networks=start, results=results)
-            writer.close()
-            if writer.problem():
-                raise UserError(f"{writer.problem()}; free space or give another --out")
+            items = {POLICY: policy}
+            if networks:
+                items[NETWORKS] = dict(zip(("params", "statistics"), start, strict=True))
+            save_checkpoint(made, config, checkpoint.steps, items, score=report.score)
+            write_atomically(made / RESULTS_FILE, to_json(results))
             onnx_file = export_onnx(best_checkpoint(made))
             (made / f"{name}.onnx").write_bytes(onnx_file)
             for other in _policies_inside(out):

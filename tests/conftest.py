@@ -22,7 +22,7 @@ import pytest
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.training.loop_fusion import OPTION
+from bounce_mjx.training.setup import JOINED_LOOPS
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
@@ -38,7 +38,7 @@ if OPTIONAL and not importlib.util.find_spec("stable_baselines3"):
 
 
 # Before JAX starts its devices.
-os.environ.setdefault("XLA_FLAGS", OPTION)
+os.environ.setdefault("XLA_FLAGS", JOINED_LOOPS)
 # `uv run pytest` sets it, and the hints of errors would begin with uv.
 os.environ.pop("UV_RUN_RECURSION_DEPTH", None)
 
@@ -62,10 +62,10 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Tests that compile MJX run in a process of their own, as XLA aborts if it joins its loops."""
     marked = pyfuncitem.get_closest_marker("separate_loops") is not None
-    if not marked or OPTION not in os.environ["XLA_FLAGS"]:
+    if not marked or JOINED_LOOPS not in os.environ["XLA_FLAGS"]:
         return None
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", pyfuncitem.nodeid]
-    flags = os.environ["XLA_FLAGS"].replace(OPTION, "")
+    flags = os.environ["XLA_FLAGS"].replace(JOINED_LOOPS, "")
     done = subprocess.run(
         command,
         cwd=pyfuncitem.config.rootpath,

@@ -1,11 +1,11 @@
 """Checkpoints are plain data; each loads unchanged or is refused in one sentence."""
 
+import concurrent.futures
 import hashlib
 import json
 import os
 import random
 import re
-import resource
 import shutil
 import subprocess
 import sys
@@ -15,8 +15,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
-import tensorstore
 
 import bounce_mjx
 from bounce_mjx.deploy.export import export_onnx
@@ -24,11 +24,20 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
-from bounce_mjx.runs import files, writing
+from bounce_mjx.resources import POLICIES
+from bounce_mjx.runs import files
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
-from bounce_mjx.runs.folders import create_run, find_checkpoint
-from bounce_mjx.runs.reading import load_training_state, read_policy
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.folders import (
+    best_checkpoint,
+    create_run,
+    find_checkpoint,
+    latest_checkpoint,
+    pretrained_checkpoint,
+    stored_checkpoints,
+)
+from bounce_mjx.runs.old import is_old
+from bounce_mjx.runs.reading import read_policy, read_training
+from bounce_mjx.runs.writing import CheckpointWriter, save_checkpoint
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 
@@ -46,14 +55,15 @@ def state() -> TrainingState:
     return jax.jit(trainer.init)(jax.random.PRNGKey(0))
 
 
+def items_of(state: TrainingState) -> dict:
+    return {"policy": policy_of(state, OBSERVATION.size), "training": state}
+
+
 def write_run(folder: Path, state: TrainingState, steps: int = 64) -> Path:
     """Writes a run with one checkpoint."""
     run = create_run(CONFIG.model_copy(update={"log_dir": folder}))
-    writer = CheckpointWriter(run, CONFIG)
     progress = {"best": None, "best_steps": 0, "solved_steps": None, "evaluations": []}
-    writer.save(["latest"], steps, policy_of(state, OBSERVATION.size), state, progress)
-    assert writer.problem() is None
-    writer.close()
+    save_checkpoint(run, CONFIG, steps, items_of(state), progress)
     return run
 
 
@@ -69,7 +79,7 @@ def run(written: Path, tmp_path: Path) -> Path:
 
 
 def step_of(run: Path) -> Path:
-    return run / "checkpoints/latest/64"
+    return run / "checkpoints/64"
 
 
 def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
@@ -77,7 +87,7 @@ def load_both(run: Path, state: TrainingState) -> tuple[Policy, TrainingState]:
     checkpoint = find_checkpoint(run)
     policy = read_policy(checkpoint, load_run_config(run))
     template = jax.eval_shape(lambda: state)
-    return policy, load_training_state(checkpoint, template)[0]
+    return policy, read_training(checkpoint, template)[0]
 
 
 def assert_identical(a, b) -> None:
@@ -99,13 +109,90 @@ def test_what_is_written_is_read(run: Path, state: TrainingState) -> None:
 
 def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -> None:
     run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
-    writer = CheckpointWriter(run, CONFIG)
-    writer.save(["best"], 64, policy_of(state, OBSERVATION.size))
-    writer.close()
+    save_checkpoint(run, CONFIG, 64, {"policy": policy_of(state, OBSERVATION.size)})
     checkpoint = find_checkpoint(run)
     assert_identical(read_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
-    with pytest.raises(UserError, match="holds no training state to continue from"):
-        load_training_state(checkpoint, state)
+    with pytest.raises(UserError, match="holds no training state of this version"):
+        read_training(checkpoint, state)
+
+
+def assert_read_by_orbax(folder: Path, policy: Policy) -> None:
+    with ocp.CheckpointManager(folder.parent.absolute()) as manager:
+        wanted = ocp.args.Composite(
+            policy=ocp.args.StandardRestore(), record=ocp.args.JsonRestore()
+        )
+        found = manager.restore(int(folder.name), args=wanted)
+    assert found["record"]["steps"] == int(folder.name)
+    expected = jax.tree_util.tree_leaves_with_path(policy)
+    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in expected]
+    theirs = {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(found["policy"])
+    }
+    assert theirs.keys() == set(names)
+    for name, (_, leaf) in zip(names, expected, strict=True):
+        np.testing.assert_array_equal(theirs[name], leaf)
+
+
+def test_orbax_alone_reads_a_checkpoint(written: Path, state: TrainingState) -> None:
+    assert_read_by_orbax(step_of(written), policy_of(state, OBSERVATION.size))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_orbax_alone_reads_a_policy_of_the_package(name: str) -> None:
+    checkpoint = pretrained_checkpoint(name)
+    if is_old(checkpoint.folder):
+        pytest.skip("written by version 0.1")
+    policy = read_policy(checkpoint, load_run_config(checkpoint.run))
+    assert_read_by_orbax(checkpoint.folder, policy)
+
+
+def test_the_latest_and_the_best_checkpoint_are_kept(tmp_path: Path, state) -> None:
+    """Each save opens the folder anew, as after a restart."""
+    run, items = create_run(CONFIG.model_copy(update={"log_dir": tmp_path})), items_of(state)
+    kept = []
+    for steps, score in (
+        (10, (True, 3, 0.5, 1.0)),
+        (20, ()),
+        (30, (True, 4, 0.1, 0.0)),
+        (40, (False, 5, 1.0, 9.0)),
+        (50, ()),
+        (50, (True, 3, 0.5, 2.0)),
+        (60, (True, 4, 0.1, 0.0)),
+        (70, ()),
+    ):
+        save_checkpoint(run, CONFIG, steps, items, score=score)
+        kept.append(sorted(checkpoint.steps for checkpoint in stored_checkpoints(run)))
+        assert latest_checkpoint(run).steps == kept[-1][-1]
+    assert kept == [[10], [10, 20], [30], [30, 40], [30, 50], [30, 51], [60], [60, 70]]
+    assert best_checkpoint(run).steps == 60
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"60", "70"}
+
+
+def test_a_checkpoint_without_a_manifest_is_read_with_a_warning(run, state, capsys) -> None:
+    (step_of(run) / files.MANIFEST_FILE).unlink()
+    assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
+    assert "has no manifest.json to find damage by" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda x: {**x, "extra": np.zeros(3)}, "policy.extra is float64[3], and should be miss"),
+        (lambda x: {"params": x["params"]}, "policy.normalizer.mean is missing, and should be fl"),
+        (lambda x: jax.tree.map(lambda y: y[None], x), "is float32[1, 29], and should be float32"),
+        (lambda x: jax.tree.map(np.float64, x), "is float64[29], and should be float32[29]"),
+    ],
+    ids=["another array", "a missing array", "another shape", "another type"],
+)
+def test_arrays_are_compared_before_they_are_read(change, sentence, tmp_path, state) -> None:
+    policy = jax.tree.map(np.asarray, policy_of(state, OBSERVATION.size))._asdict()
+    policy["normalizer"] = policy["normalizer"]._asdict()
+    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
+    save_checkpoint(run, CONFIG, 64, {"policy": change(policy)})
+    with pytest.raises(UserError, match="damaged or of another version") as refused:
+        read_policy(find_checkpoint(run), CONFIG)
+    assert sentence in str(refused.value)
 
 
 @pytest.mark.parametrize("part", ["mean", "std", "weight"])
@@ -120,9 +207,7 @@ def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state
         wrong = getattr(policy.normalizer, part).at[3].set(jnp.nan)
         policy = policy._replace(normalizer=policy.normalizer._replace(**{part: wrong}))
     run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
-    writer = CheckpointWriter(run, CONFIG)
-    writer.save(["best"], 64, policy)
-    writer.close()
+    save_checkpoint(run, CONFIG, 64, {"policy": policy})
     name = "in params." if part == "weight" else f"in normalizer.{part};"
     for reads in (
         lambda: read_policy(find_checkpoint(run), CONFIG),
@@ -133,64 +218,43 @@ def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state
             reads()
 
 
-def test_newer_checkpoint_replaces_the_older(tmp_path: Path, state: TrainingState) -> None:
-    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
-    writer = CheckpointWriter(run, CONFIG)
-    for steps in (64, 128, 128):
-        changed = state._replace(iteration=state.iteration + steps)
-        writer.save(["latest"], steps, policy_of(changed, OBSERVATION.size), changed, {})
-    writer.close()
-    assert [p.name for p in (run / "checkpoints/latest").iterdir()] == ["128"]
-    assert load_training_state(find_checkpoint(run), state)[0].iteration == 128
-
-
-@pytest.mark.parametrize("while_writing", [False, True], ids=["between saves", "in a save"])
-def test_a_folder_that_was_moved_is_made_again(
-    tmp_path: Path, state: TrainingState, monkeypatch, while_writing: bool
-) -> None:
+def test_a_folder_that_was_moved_is_made_again(tmp_path: Path, state: TrainingState) -> None:
     run, moved = write_run(tmp_path, state), tmp_path / "moved"
-    write_arrays = writing._save_arrays
-
-    def move_and_write(*args) -> None:
-        if run.exists() and not moved.exists():
-            run.rename(moved)
-        write_arrays(*args)
-
-    if while_writing:
-        monkeypatch.setattr(writing, "_save_arrays", move_and_write)
-    else:
-        run.rename(moved)
-    writer = CheckpointWriter(run, CONFIG)
+    run.rename(moved)
     changed = state._replace(iteration=state.iteration + 128)
-    writer.save(["latest"], 128, policy_of(changed, OBSERVATION.size), changed, {})
-    while writer.problem() is not None:
-        writer.retry()
-    writer.close()
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        writer = CheckpointWriter(run, CONFIG, pool)
+        writer.save(128, items_of(changed), {})
+        assert writer.problem() is None
     assert find_checkpoint(moved).steps == 64
     assert load_run_config(run) == CONFIG
-    assert load_training_state(find_checkpoint(run), state)[0].iteration == 128
+    template = jax.eval_shape(lambda: state)
+    assert read_training(find_checkpoint(run), template)[0].iteration == 128
 
 
-def test_a_failed_write_prints_no_traceback(tmp_path: Path) -> None:
+def test_a_failed_write_prints_no_traceback_and_the_next_one_succeeds(tmp_path: Path) -> None:
     script = """
-import resource, sys
+import concurrent.futures, resource, sys
 from pathlib import Path
 import numpy as np
-from bounce_mjx.runs import writing
 from bounce_mjx.runs.config import TrainConfig
-writer = writing.CheckpointWriter(Path(sys.argv[1]), TrainConfig())
-writer.save(["latest"], 1, {"small": np.zeros(3)})
-print(writer.problem())
-resource.setrlimit(resource.RLIMIT_FSIZE, (2**18, 2**18))
-writer.save(["latest"], 2, {name: np.random.rand(2**17) for name in "abcd"})
-print(writer.problem())
-writer.close()
+from bounce_mjx.runs.folders import stored_checkpoints
+from bounce_mjx.runs.writing import CheckpointWriter
+run, big = Path(sys.argv[1]), {name: np.random.rand(2**17) for name in "abcd"}
+with concurrent.futures.ThreadPoolExecutor(1) as pool:
+    writer = CheckpointWriter(run, TrainConfig(), pool)
+    for steps, limit in ((1, None), (2, 2**18), (3, None)):
+        if limit or steps == 3:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit or -1, -1))
+        writer.save(steps, {"policy": big}, {})
+        print(writer.problem(), sorted(x.steps for x in stored_checkpoints(run)))
 """
     done = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True
     )
     said = done.stdout.splitlines()
-    assert said == ["None", f"{tmp_path} cannot be written (File too large)"], done.stderr
+    problem = f"{tmp_path} cannot be written (File too large)"
+    assert said == ["None [1]", f"{problem} [1]", "None [3]"], done.stderr
     assert done.stderr == ""
 
 
@@ -248,18 +312,10 @@ def test_damage_is_refused_or_does_no_harm(
     assert refused > 150
 
 
-def test_checkpoint_of_another_place_is_refused(run: Path, state: TrainingState) -> None:
-    # A folder with a changed number of steps would resume from a wrong count.
-    step_of(run).rename(step_of(run).with_name("128"))
-    assert_refused(run, state, "it was written after 64 steps")
-
-
 def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -> None:
     config = load_config(run / "config.yaml").model_copy(update={"seed": 3})
     shutil.rmtree(step_of(run))
-    writer = CheckpointWriter(run, config)
-    writer.save(["latest"], 64, policy_of(state, OBSERVATION.size), state, {})
-    writer.close()
+    save_checkpoint(run, config, 64, items_of(state))
     assert_refused(run, state, "a different config", "differs in seed;", "restore that file")
 
 
@@ -272,7 +328,8 @@ def test_nothing_is_read_that_could_run(run: Path) -> None:
     names."""
     banned = (
         r"\b(c?pickle|cloudpickle|dill|joblib|marshal|shelve)\b|\beval\(|\bexec\(|__import__"
-        r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)?load\b|yaml\.Loader|Unsafe|FullLoader"
+        r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)load\b|yaml\.load\((?!.+, _Loader\))"
+        r"|yaml\.Loader|Unsafe|FullLoader"
     )
     for path in set(SOURCES.rglob("*.py")) - {SOURCES / "tasks/registry.py"}:
         for number, line in enumerate(path.read_text().splitlines(), 1):
@@ -281,9 +338,11 @@ def test_nothing_is_read_that_could_run(run: Path) -> None:
         if not path.is_file():
             continue
         data = path.read_bytes()
-        if path.suffix == ".json":
+        if path.name in ("metadata", "metrics", "_METADATA", "_CHECKPOINT_METADATA"):
             json.loads(data)
-        else:
+        elif path.suffix == ".json":
+            json.loads(data)
+        elif path.name != "commit_success.txt":
             # OCDBT: https://google.github.io/tensorstore/kvstore/ocdbt
             magic = {0x0CDB3A2A, 0x0CDB1234, 0x0CDB20DE}
             raw = path.parent.name == "d" and int.from_bytes(data[:4], "big") not in magic
@@ -346,7 +405,7 @@ def test_manifest_leads_nowhere(run: Path, state: TrainingState, name: str) -> N
 
 
 @pytest.mark.parametrize("target", ["/dev/zero", "/etc/passwd", "policy"])
-@pytest.mark.parametrize("name", ["manifest.json", "run.json", "policy/manifest.ocdbt", "policy"])
+@pytest.mark.parametrize("name", ["manifest.json", "record/metadata", "policy/d", "policy"])
 def test_links_are_not_followed(run: Path, state: TrainingState, name: str, target: str) -> None:
     path = step_of(run) / name
     shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -362,39 +421,7 @@ def test_a_checkpoint_that_is_a_link_is_refused(run: Path, state: TrainingState)
 
 
 def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
-    path = step_of(run) / "run.json"
+    path = step_of(run) / "record/metadata"
     path.unlink()
     os.mkfifo(path)
     assert_refused(run, state, "damaged", "is not a regular file")
-
-
-def write_array(run: Path, name: str, **metadata) -> None:
-    """Puts a crafted array into the policy of a checkpoint, with a valid manifest."""
-    item = step_of(run) / "policy"
-    database = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{item}/"}}
-    store = tensorstore.KvStore.open(database).result()
-    key = f"{name}/.zarray"
-    plain = json.loads(store.read(key).result().value) | metadata
-    store.write(key, json.dumps(plain).encode()).result()
-    files.seal(step_of(run))
-
-
-HUGE = 2**40
-CRAFTED = {
-    "huge shape": {"shape": [HUGE], "chunks": [30]},
-    "huge shape in one chunk": {"shape": [HUGE], "chunks": [HUGE]},
-    "huge chunk": {"chunks": [HUGE]},
-    "blosc": {"compressor": {"id": "blosc", "cname": "zstd", "clevel": 5, "shuffle": 0}},
-    "other type": {"dtype": "<f8"},
-    "objects": {"dtype": "|O"},
-    "negative": {"shape": [-1]},
-    "more dimensions": {"shape": [29] * 30, "chunks": [29] * 30},
-}
-
-
-@pytest.mark.parametrize("metadata", CRAFTED.values(), ids=CRAFTED)
-def test_crafted_array_takes_no_memory(run: Path, state: TrainingState, metadata: dict) -> None:
-    write_array(run, "normalizer.mean", **metadata)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert_refused(run, state, "damaged")
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KB

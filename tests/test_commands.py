@@ -323,16 +323,16 @@ def damage(item: Path, pattern: str, how: Callable[[Path], None]) -> None:
 
 @pytest.mark.parametrize("case", DAMAGES.values(), ids=DAMAGES)
 def test_damaged_checkpoint_is_not_evaluated(fails: Fails, run: Path, case: tuple) -> None:
-    damage(run / f"checkpoints/latest/{STEPS}/policy", *case)
-    sentence = fails(eval_command.main, ["run/checkpoints/latest"])
-    assert_says(sentence, (f"run/checkpoints/latest/{STEPS}", "damaged", "give another"))
+    damage(run / f"checkpoints/{STEPS}/policy", *case)
+    sentence = fails(eval_command.main, [f"run/checkpoints/{STEPS}"])
+    assert_says(sentence, (f"run/checkpoints/{STEPS}", "damaged", "give another"))
 
 
 @pytest.mark.parametrize("name", ["arrays halved", "index deleted"])
 def test_damaged_checkpoint_is_not_resumed(fails: Fails, run: Path, name: str) -> None:
-    damage(run / f"checkpoints/latest/{STEPS}/training", *DAMAGES[name])
+    damage(run / f"checkpoints/{STEPS}/training", *DAMAGES[name])
     sentence = fails(train_command.main, ["--resume", "run", "--total-steps", "512"])
-    assert_says(sentence, (f"run/checkpoints/latest/{STEPS}", "damaged", "give another"))
+    assert_says(sentence, (f"run/checkpoints/{STEPS}", "damaged", "give another"))
 
 
 @pytest.mark.parametrize("layers", ["[8]", "[16, 16]"])
@@ -386,9 +386,9 @@ def test_whole_process_exits_without_a_traceback(tmp_path: Path, command: list) 
 
 
 def test_whole_process_exits_without_a_traceback_on_a_damaged_checkpoint(run: Path) -> None:
-    damage(run / f"checkpoints/latest/{STEPS}/policy", *DAMAGES["arrays halved"])
+    damage(run / f"checkpoints/{STEPS}/policy", *DAMAGES["arrays halved"])
     done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx.eval", "run/checkpoints/latest"],
+        [sys.executable, "-m", "bounce_mjx.eval", f"run/checkpoints/{STEPS}"],
         cwd=run.parent,
         capture_output=True,
         text=True,
@@ -539,15 +539,14 @@ def test_run_keeps_the_resolved_config(trained: Path) -> None:
 
 
 def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
-    assert [p.name for p in (trained / "checkpoints/latest").iterdir()] == [str(STEPS)]
     results = json.loads((trained / "results.json").read_text())
     assert results["trained_steps"] == STEPS
     assert results["solved_steps"] is None and results["passed"] is False
     assert results["version"] == bounce_mjx.__version__
     head = (trained / "config.yaml").read_text().splitlines()[0]
     assert head == f"# bounce_mjx {bounce_mjx.__version__}"
-    best = [p.name for p in (trained / "checkpoints/best").iterdir()]
-    assert best == [str(results["best_steps"])]
+    kept = {int(path.name) for path in (trained / "checkpoints").iterdir()}
+    assert kept == {STEPS, results["best_steps"]}
     assert tuple(result["name"] for result in results["results"]) == RESULT_NAMES
 
 
@@ -603,11 +602,11 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
 def test_eval_finds_the_checkpoint(trained: Path, tmp_path: Path, monkeypatch) -> None:
     best = json.loads((trained / "results.json").read_text())["best_steps"]
     monkeypatch.chdir(trained.parent.parent.parent)
-    latest = f"checkpoints/latest/{STEPS}"
+    latest = f"checkpoints/{STEPS}"
     for given, found in (
-        ([], f"checkpoints/best/{best}"),
-        ([trained.relative_to(Path.cwd())], f"checkpoints/best/{best}"),
-        ([trained / "checkpoints/latest"], latest),
+        ([], f"checkpoints/{best}"),
+        ([trained.relative_to(Path.cwd())], f"checkpoints/{best}"),
+        ([trained / "checkpoints"], f"checkpoints/{best}"),
         ([trained / latest], latest),
     ):
         report = evaluate(given, tmp_path / "a.json")
@@ -651,10 +650,10 @@ def test_policy_is_read_as_orbax_reads_it() -> None:
 
 def test_newest_run_is_one_with_a_finished_checkpoint(tmp_path: Path) -> None:
     for folder in (
-        "2026-01-01/checkpoints/latest/64",
-        "2026-01-02/checkpoints/best/128",
-        "2026-01-03/checkpoints/latest/64.orbax-checkpoint-tmp",
-        "2026-01-04/checkpoints/latest",
+        "2026-01-01/checkpoints/64",
+        "2026-01-02/checkpoints/128",
+        "2026-01-03/checkpoints/64.orbax-checkpoint-tmp",
+        "2026-01-04/checkpoints/replaced/64",
     ):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder.split("/")[0] / "config.yaml").touch()

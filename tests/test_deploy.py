@@ -31,7 +31,7 @@ from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
 from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.sensing import Sensing, remember
@@ -190,10 +190,7 @@ def make_run(folder: Path, env: dict, task: str = "bounce") -> Path:
     params["params"]["Dense_0"]["kernel"] *= 20.0
     folder.mkdir()
     save_config(folder, config)
-    writer = CheckpointWriter(folder, config)
-    writer.save(("best",), 64, Policy(normalizer, params))
-    writer.close()
-    assert writer.problem() is None
+    save_checkpoint(folder, config, 64, {"policy": Policy(normalizer, params)})
     return folder
 
 

@@ -361,7 +361,7 @@ def test_troubleshooting_quotes_the_errors(
     (tmp_path / "rk4.xml").write_text(mjcf.replace('"implicitfast"', '"RK4"'))
     (tmp_path / "nameless.xml").write_text(mjcf.replace('"blocker"', '"bat"'))
     (tmp_path / "wrong.yaml").write_text("num_envs: 64")
-    (tmp_path / "run/checkpoints/latest/64").mkdir(parents=True)
+    (tmp_path / "run/checkpoints/64").mkdir(parents=True)
     (tmp_path / "run/config.yaml").write_text(dump_config(TrainConfig()))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as exit_info:

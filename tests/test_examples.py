@@ -49,16 +49,15 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.training.command import config_of, read_command
 
 config = config_of(read_command(sys.argv[1:]))
 layers = {"hidden_layers": load_run_config(pretrained_checkpoint().run).ppo.hidden_layers}
 config = config.model_copy(update={"ppo": config.ppo.model_copy(update=layers)})
 run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())
-writer = CheckpointWriter(run, config)
-writer.save(("best",), 64, read_policy(pretrained_checkpoint(), config), results=results)
-writer.close()
+save_checkpoint(run, config, 64, {"policy": read_policy(pretrained_checkpoint(), config)})
+(run / "results.json").write_text(json.dumps(results))
 with SummaryWriter(logdir=str(run)) as log:
     log.add_scalar("episode/return", 1.0, 1000)
     log.add_scalar("episode/return", 2.0, 2000)

@@ -186,7 +186,8 @@ def of_run(config: TrainConfig) -> tuple:
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         config = in_whole_blocks(config)
-        job = _Job(config, Console(quiet=True), PPOTrainer, Options(), stack)
+        job = _Job(config, Console(quiet=True), PPOTrainer, Evaluators, Options(), stack)
+        job.open()
 
         def run_block() -> None:
             blocks.append(job.steps)

@@ -14,12 +14,12 @@ import yaml
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import default_preset, read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.training.loop_fusion import OPTION, join_loops
+from bounce_mjx.training.setup import JOINED_LOOPS, join_loops
 
 # Two results of one value: with the option, one loop computes both.
 PROGRAM = """
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.training.loop_fusion import join_loops
+from bounce_mjx.training.setup import join_loops
 join_loops(EnvConfig(physics="{physics}"))
 import jax
 import jax.numpy as jnp
@@ -60,9 +60,9 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("user", "joined"),
     [
-        (None, OPTION),
+        (None, JOINED_LOOPS),
         ("", ""),
-        ("--xla_cpu_enable_fast_math=false", f"--xla_cpu_enable_fast_math=false {OPTION}"),
+        ("--xla_cpu_enable_fast_math=false", f"--xla_cpu_enable_fast_math=false {JOINED_LOOPS}"),
         ("--xla_backend_extra_options=a", "--xla_backend_extra_options=a"),
         ("flags.txt", "flags.txt"),
     ],
@@ -133,7 +133,7 @@ def test_each_command_decides_before_jax_starts_its_devices(
         capture_output=True,
         text=True,
     )
-    assert f"flags: {OPTION if joins else None}" in done.stdout, done.stdout + done.stderr
+    assert f"flags: {JOINED_LOOPS if joins else None}" in done.stdout, done.stdout + done.stderr
 
 
 def test_the_presets_of_all_machines_have_one_task() -> None:

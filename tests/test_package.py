@@ -358,7 +358,7 @@ def test_imports_beside_a_compilation_leave_the_environment_alone() -> None:
     starts processes with it at any moment."""
     script = """
 import importlib, os, sys
-from bounce_mjx.training.job import REPORT_MODULE
+from bounce_mjx.training.job import CHECKPOINT_MODULE, REPORT_MODULE
 from bounce_mjx.training.setup import set_up_jax
 set_up_jax()
 known = set(os.environ)
@@ -366,7 +366,7 @@ def hook(event, args):
     if event == "os.putenv" and os.fsdecode(args[0]) not in known:
         print(args[0])
 sys.addaudithook(hook)
-for module in ("tensorboardX", REPORT_MODULE):
+for module in ("tensorboardX", CHECKPOINT_MODULE, REPORT_MODULE):
     importlib.import_module(module)
 """
     environment = {k: v for k, v in os.environ.items() if k != "CRC32C_SW_MODE"}

@@ -180,7 +180,7 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, console, cap
 def test_a_run_is_preferred_to_it(tmp_path: Path, monkeypatch, console, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("2026-01-01", "2026-01-02"):
-        folder = LOG_DIR / name / "checkpoints" / "best" / "64"
+        folder = LOG_DIR / name / "checkpoints" / "64"
         folder.mkdir(parents=True)
         (LOG_DIR / name / "config.yaml").touch()
     chosen = choose_checkpoint(None, LOG_DIR, console)

@@ -4,6 +4,8 @@ not finite. The resumed training reaches exactly the state of an undisturbed one
 import concurrent.futures
 import contextlib
 import dataclasses
+import errno
+import functools
 import io
 import itertools
 import json
@@ -11,7 +13,6 @@ import multiprocessing
 import os
 import random
 import re
-import resource
 import shlex
 import shutil
 import signal
@@ -35,9 +36,9 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, Result, judge
-from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
+from bounce_mjx.runs import writing
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import (
@@ -50,7 +51,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_actor, read_policy, read_record
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.writing import CheckpointWriter, save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
@@ -58,10 +59,9 @@ from bounce_mjx.training.command import Options, TrainCommand, config_of
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.log import open_log
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.warm_start import present_start
-from tiny_runs import STEPS, TIMEOUT, TINY, Job, arrays, contents, job
+from tiny_runs import STEPS, TIMEOUT, TINY, arrays, contents, job
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -119,7 +119,7 @@ def evaluations(run: Path) -> list[dict]:
 def assert_same_training(run: Path, straight: Path) -> None:
     """Checks that state, evaluations and best checkpoint are the same bit for bit."""
     for find in (latest_checkpoint, best_checkpoint):
-        assert find(run).steps == find(straight).steps
+        assert read_record(find(run)).steps == read_record(find(straight)).steps
         ours, theirs = arrays(find(run)), arrays(find(straight))
         assert ours.keys() == theirs.keys()
         for name in theirs:
@@ -177,79 +177,33 @@ def test_results_that_are_newer_than_the_checkpoint_do_not_count(run: Path, stra
     # As after a crash that lost the last checkpoint, but not the files that were written after it.
     for newer in ("results.json", "config.yaml"):
         shutil.copy(straight / newer, run)
-    shutil.rmtree(run / "checkpoints/best")
-    shutil.copytree(straight / "checkpoints/best", run / "checkpoints/best")
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
 
 
-@pytest.mark.slow
-def test_best_checkpoint_that_was_not_yet_written_is_written(run: Path, straight: Path) -> None:
-    assert best_checkpoint(run).steps == latest_checkpoint(run).steps
-    shutil.rmtree(run / "checkpoints/best")
-    # As after a kill in the middle of a write.
+def test_what_a_killed_process_was_writing_is_removed(run: Path, straight: Path) -> None:
+    folder, (latest,) = run / "checkpoints", (run / "checkpoints").iterdir()
+    shutil.copytree(latest, folder / "256.orbax-checkpoint-tmp")
+    shutil.copytree(latest, folder / "replaced/64")
     (run / ".unfinished-0123.json").touch()
-    resume(run)
-    assert best_checkpoint(run).steps == latest_checkpoint(run).steps
+    assert latest_checkpoint(run).folder == latest
+    resume(run, "--total-steps", str(STEPS))
+    assert_same_training(run, straight)
     assert not list(run.rglob(".unfinished-*"))
-    resume(run, "--total-steps", str(STEPS))
-    assert_same_training(run, straight)
-
-
-def test_a_warm_start_has_a_best_checkpoint_though_it_was_killed_before(
-    half: Path, tmp_path: Path, monkeypatch
-) -> None:
-    save = CheckpointWriter.save
-
-    def save_latest(writer: CheckpointWriter, names, *rest, **named) -> None:
-        save(writer, ("latest",), *rest, **named)
-        writer.close()
-        raise SystemExit
-
-    with monkeypatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(CheckpointWriter, "save", save_latest)
-        train(tmp_path, 64, "--warm-start", str(half))
-    (run,) = tmp_path.iterdir()
-    assert latest_checkpoint(run).steps == 0 and not (run / "checkpoints/best").exists()
-    # As if no later policy were better.
-    monkeypatch.setattr(Progress, "improves", lambda *_: False)
-    resume(run)
-    assert best_checkpoint(run).steps == 0
-
-
-@pytest.mark.parametrize("moment", ["while it is written", "between the renamings", "at the end"])
-def test_a_checkpoint_counts_until_the_next_is_complete(
-    run: Path, straight: Path, moment: str
-) -> None:
-    # As after a crash while a checkpoint was being replaced by another one of the same steps.
-    latest = latest_checkpoint(run).folder
-    partial, old = (latest.with_name(latest.name + end) for end in (".partial", ".discarded"))
-    shutil.copytree(latest, partial)
-    if moment == "while it is written":
-        (partial / "manifest.json").unlink()
-    else:
-        latest.rename(old)
-        assert latest_checkpoint(run).folder == old
-    if moment == "at the end":
-        partial.rename(latest)
-        (old / "manifest.json").unlink()
-        assert latest_checkpoint(run).folder == latest
-    resume(run, "--total-steps", str(STEPS))
-    assert_same_training(run, straight)
-    assert [p.name for p in latest.parent.iterdir()] == [str(STEPS)]
+    kept = {best_checkpoint(run).folder.name, latest_checkpoint(run).folder.name}
+    assert {path.name for path in folder.iterdir()} == kept
 
 
 @pytest.mark.slow
 def test_lost_evaluation_is_repeated(tmp_path: Path, straight: Path) -> None:
     # As after a signal at a step where an evaluation was due.
     run = train(tmp_path, STEPS // 2, "--eval-every", str(STEPS))
-    for name in ("latest", "best"):
-        path = run / f"checkpoints/{name}/{STEPS // 2}/run.json"
-        record = json.loads(path.read_text())
-        record["progress"] |= {"best": None, "best_steps": 0, "evaluations": []}
-        path.write_text(json.dumps(record))
-        seal(path.parent)
-    shutil.rmtree(run / "checkpoints/best")
+    (folder,) = (run / "checkpoints").iterdir()
+    record = json.loads((folder / "record/metadata").read_text())
+    record["progress"] |= {"best": None, "best_steps": 0, "evaluations": []}
+    (folder / "record/metadata").write_text(json.dumps(record))
+    (folder / "metrics/metrics").write_text(json.dumps({"score": []}))
+    seal(folder)
     resume(run, "--total-steps", str(STEPS), "--eval-every", str(STEPS // 2))
     assert_same_training(run, straight)
 
@@ -413,12 +367,12 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     def written() -> list[int]:
         """A value that changes whenever something is written to the folder of the latest
         checkpoint."""
-        return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints/latest")]
+        return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints")]
 
     def steps_saved() -> int:
         """Environment steps of the latest complete checkpoint."""
-        folders = log_dir.glob("*/checkpoints/latest")
-        return max((steps for folder in folders for steps in stored_checkpoints(folder)), default=0)
+        stored = (x.steps for run in log_dir.glob("*") for x in stored_checkpoints(run))
+        return max(stored, default=0)
 
     def wait_until(happens: Callable[[], bool]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -426,7 +380,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             assert process.is_alive() and time.monotonic() < deadline
             time.sleep(0.0002)
 
-    for moment in ("start", "any", ".partial", ".discarded", "any"):
+    for moment in ("start", "any", "*orbax-checkpoint-tmp*", "replaced/*", "any"):
         before = written()
         process = processes.Process(target=_train_in_silence, args=(args,))
         process.start()
@@ -437,7 +391,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             time.sleep(random_seconds(0.0, 1.0))
         else:
             wait_until(lambda before=before: written() != before)
-            wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/latest/*{end}")))
+            wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/{end}")))
         process.kill()
         process.join()
         if steps_saved():
@@ -508,20 +462,6 @@ def test_a_training_holds_the_lock_of_its_run(run: Path, monkeypatch) -> None:
     assert not list(run.glob(".*"))
 
 
-def test_the_lock_follows_a_run_whose_folder_is_moved(run: Path, tmp_path: Path) -> None:
-    config = load_run_config(run)
-    writer = CheckpointWriter(run, config)
-    with lock_run(run):
-        run.rename(tmp_path / "moved")
-        writer.save(("latest",), STEPS, {"array": np.zeros(3)})
-        assert writer.problem() is None
-        with pytest.raises(UserError, match="is in use"), lock_run(run):
-            pass
-        writer.close()
-    with lock_run(run):
-        pass
-
-
 # Readers
 
 
@@ -532,19 +472,17 @@ def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: P
     ended = threading.Event()
 
     def save() -> None:
-        writer = CheckpointWriter(run, config)
         for steps in itertools.count(STEPS):
             marked = jax.tree.map(lambda leaf, steps=steps: np.full_like(leaf, steps), policy)
-            writer.save(("latest",), steps, marked)
+            # Each is better than the one before.
+            save_checkpoint(run, config, steps, {"policy": marked}, score=(True, 5, 1.0, steps))
             if ended.wait(0.02):
-                return writer.close()
+                return
 
     saver = threading.Thread(target=save)
     saver.start()
     try:
-        read = [
-            read_actor(find_checkpoint(run / "checkpoints/latest"), config)[:2] for _ in range(10)
-        ]
+        read = [read_actor(find_checkpoint(run), config)[:2] for _ in range(10)]
     finally:
         ended.set()
         saver.join()
@@ -792,14 +730,14 @@ def test_the_time_left(monkeypatch, steps: int, solved: bool, expected: str) -> 
 @pytest.fixture
 def solved(run: Path) -> Path:
     """A run of 128 steps that ended because it met all results."""
-    for path in [run / "results.json", *run.glob("checkpoints/*/128/run.json")]:
+    for path in [run / "results.json", run / "checkpoints/128/record/metadata"]:
         plain = json.loads(path.read_text())
         progress = plain if path.name == "results.json" else plain["progress"]
         progress |= {"solved_steps": 128, "margin_steps": 128}
-        if path.name == "run.json":
+        if path.name == "metadata":
             plain["config"] |= {"stop_when_solved": True, "total_steps": 10**6}
         path.write_text(json.dumps(plain))
-        seal(path.parent)
+    seal(run / "checkpoints/128")
     config = load_run_config(run).model_copy(
         update={"stop_when_solved": True, "total_steps": 10**6}
     )
@@ -833,14 +771,13 @@ def test_the_log_holds_every_point_of_a_checkpoint(run: Path, monkeypatch) -> No
     logged = []
     save = CheckpointWriter.save
 
-    def save_and_look(writer, names, steps, *rest, **named):
-        if "latest" in names:
-            log = EventAccumulator(str(run)).Reload()
-            scalars = [log.Scalars(tag) for tag in ("loss/value", "results/mean_length_s")]
-            # The last that an evaluation adds.
-            points = [*scalars, log.Tensors("results/text_summary")]
-            logged.append((steps, *(tag[-1].step for tag in points)))
-        save(writer, names, steps, *rest, **named)
+    def save_and_look(writer, steps, *rest):
+        log = EventAccumulator(str(run)).Reload()
+        scalars = [log.Scalars(tag) for tag in ("loss/value", "results/mean_length_s")]
+        # The last that an evaluation adds.
+        points = [*scalars, log.Tensors("results/text_summary")]
+        logged.append((steps, *(tag[-1].step for tag in points)))
+        save(writer, steps, *rest)
 
     monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
     resume(run, "--total-steps", str(2 * STEPS))
@@ -863,81 +800,60 @@ def tmpfs(folder: Path) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def finish_once_there_is_room(training: Job, make_room: Callable[[], None], reason: str) -> None:
-    training.wait_until_said("training continues")
-    training.wait_until_said("it stays in memory")
-    make_room()
-    assert training.wait() == 0, training.said
-    for sentence in ("training continues", "it stays in memory", "the state is saved again"):
-        assert training.said.count(sentence) == 1
-    assert f"cannot be written ({reason})" in training.said
-    assert "Traceback" not in training.said
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["full", "read-only"])
-def test_full_disk_loses_nothing(tmp_path: Path, straight: Path, what: str) -> None:
+def test_a_training_goes_on_while_it_cannot_save(tmp_path: Path, what: str) -> None:
+    """It saves its newest state once there is room again, and continues exactly."""
     disk, filler = tmp_path / "disk", tmp_path / "disk/filler"
     remount = ["mount", "-o", "remount,size=4m,"]
-    with (
-        tmpfs(disk),
-        job(
-            tmp_path / "log", *TINY, "--total-steps", STEPS, "--log-dir", disk / "runs"
-        ) as training,
-    ):
+    args = [*TINY, "--total-steps", 10**6, "--log-dir", disk / "runs"]
+    with tmpfs(disk), job(tmp_path / "log", *args) as training:
         training.wait_until_said("device:")
         if what == "full":
             with contextlib.suppress(OSError):
                 filler.write_bytes(bytes(2**22))
-            finish_once_there_is_room(training, filler.unlink, "No space left on device")
+            make_room, reason = filler.unlink, "No space left on device"
         else:
             subprocess.run([*remount[:-1], remount[-1] + "ro", str(disk)], check=True)
-            finish_once_there_is_room(
-                training,
-                lambda: subprocess.run([*remount[:-1], remount[-1] + "rw", str(disk)], check=True),
-                "Read-only file system",
-            )
+            writable = [*remount[:-1], remount[-1] + "rw", str(disk)]
+            make_room = functools.partial(subprocess.run, writable, check=True)
+            reason = "Read-only file system"
+        training.wait_until_said("training continues")
+        make_room()
+        training.wait_until_said("the state is saved again")
+        training.process.send_signal(signal.SIGTERM)
+        assert training.wait() == 0, training.said
+        for sentence in ("training continues", "the state is saved again"):
+            assert training.said.count(sentence) == 1
+        assert f"cannot be written ({reason})" in training.said
+        assert "Traceback" not in training.said
         (run,) = (disk / "runs").iterdir()
-        assert_same_training(run, straight)
+        steps = latest_checkpoint(run).steps
+        straight = train(tmp_path / "straight", steps + 64)
+        resume(run, "--total-steps", str(steps + 64))
+        ours, theirs = arrays(latest_checkpoint(run)), arrays(latest_checkpoint(straight))
+        for name in theirs:
+            np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
         # Points may be lost, but the log stays one.
-        log = EventAccumulator(str(run)).Reload()
-        assert {event.step for event in log.Scalars("loss/value")} <= {64, 128, 192, 256}
+        EventAccumulator(str(run)).Reload()
 
 
-@pytest.mark.slow
-def test_file_size_limit_loses_nothing(tmp_path: Path, straight: Path) -> None:
-    with job(
-        tmp_path / "log", *TINY, "--total-steps", STEPS, "--log-dir", tmp_path / "runs"
-    ) as training:
-        training.wait_until_said("device:")
-        process, limit = training.process.pid, resource.RLIMIT_FSIZE
-        old = resource.prlimit(process, limit, (2**14, resource.RLIM_INFINITY))
-        finish_once_there_is_room(
-            training, lambda: resource.prlimit(process, limit, old), "File too large"
-        )
-    (run,) = (tmp_path / "runs").iterdir()
-    assert_same_training(run, straight)
+def test_a_training_that_ends_without_room_says_so(run: Path, monkeypatch, capfd) -> None:
+    """The last good checkpoint stays, and the training resumes from it."""
+    saved = contents(run / "checkpoints")
 
+    def full(*_) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-def test_waiting_for_room_can_be_given_up(tmp_path: Path, monkeypatch) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    monkeypatch.setattr(training_job, "RETRY_SECONDS", 0.0)
-    said = []
-
-    def say(line: str) -> None:
-        said.append(line)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    log = open_log(tmp_path)
-    reporter = Reporter(lambda: [log], Console(file=io.StringIO()), TrainConfig(), 0)
-    monkeypatch.setattr(reporter, "say", say)
-    writer = CheckpointWriter(blocked, TrainConfig())
-    writer.save(["latest"], 64, {"array": np.zeros(3)})
-    with StopRequest() as stop:
-        with pytest.raises(UserError, match=r"Not a directory.*make room, and resume"):
-            training_job._wait_until_saved([writer], reporter, stop)
-    assert len(said) == 1 and "it stays in memory" in said[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(writing, "save_checkpoint", full)
+        with pytest.raises(SystemExit) as exit_info:
+            resume(run, "--total-steps", str(STEPS))
+    assert exit_info.value.code == 2
+    sentence = capfd.readouterr().err
+    assert "(No space left on device), so the end of the training is lost; make room" in sentence
+    assert f"continue with: bounce-mjx train --resume {run}" in sentence
+    assert contents(run / "checkpoints") == saved
 
 
 # Numbers that are not finite

@@ -97,7 +97,7 @@ def test_runs_started_at_once_have_folders_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["[/x]", "exp[lr]", ":smile:", "a [red]b"])
 def test_a_path_is_printed_as_it_is(tmp_path: Path, name: str, capsys) -> None:
     run = tmp_path / name / "2026-01-01"
-    (run / "checkpoints/best/64").mkdir(parents=True)
+    (run / "checkpoints/64").mkdir(parents=True)
     save_config(run, TrainConfig())
     chosen = choose_checkpoint(None, tmp_path / name, Console())
     assert chosen.run == run
@@ -112,7 +112,7 @@ def runs(tmp_path: Path, progress: Progress) -> Path:
         run.mkdir()
         save_config(run, TrainConfig())
         if passed is not None:
-            (run / "checkpoints/best/64").mkdir(parents=True)
+            (run / "checkpoints/64").mkdir(parents=True)
             results = [dataclasses.replace(r, passed=passed) for r in progress.best.results]
             results[3] = dataclasses.replace(results[3], passed=None)
             progress.best = dataclasses.replace(progress.best, results=tuple(results))
@@ -147,7 +147,7 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
     names = ["zebra", "2026-01-01_10-00-00", *stamps, "apple", "2026-01-04_10-00-00 long"]
     times = {"zebra": datetime(2025, 12, 31, tzinfo=UTC), "apple": datetime(2026, 1, 3, tzinfo=UTC)}
     for name in sorted(names):
-        (tmp_path / name / "checkpoints/best/64").mkdir(parents=True)
+        (tmp_path / name / "checkpoints/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
         written = times.get(name, datetime(2030, 1, 1, tzinfo=UTC)).timestamp()
         os.utime(tmp_path / name / "config.yaml", (written, written))
@@ -163,7 +163,7 @@ def test_the_newest_run_is_newest_in_every_time_zone(tmp_path: Path, monkeypatch
             monkeypatch.setenv("TZ", zone)
             time.tzset()
             run = create_run(TrainConfig(log_dir=tmp_path))
-            (run / "checkpoints/best/64").mkdir(parents=True)
+            (run / "checkpoints/64").mkdir(parents=True)
             assert newest_run(tmp_path) == run
     finally:
         monkeypatch.undo()
@@ -179,9 +179,7 @@ def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
 # Runs from someone else
 
 
-@pytest.mark.parametrize(
-    "place", ["checkpoints", "checkpoints/latest", "checkpoints/best/9.partial", "seed_000", "log"]
-)
+@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/9", "seed_000", "log"])
 def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys) -> None:
     """It would write there, and remove the folders that look like checkpoints."""
     run, other = runs / "2026-01-02", runs.parent / f"other {runs.name}"
@@ -206,16 +204,9 @@ def test_links_of_weights_and_biases_do_not_count(runs: Path) -> None:
     check_links(runs / "link")
 
 
-def test_a_name_that_a_terminal_would_obey_is_not_printed(runs: Path, capsys) -> None:
-    bad = runs / "2026-01-04\x1b]0;title\x07"
-    shutil.copytree(runs / "2026-01-02", bad)
-    assert choose_checkpoint(None, runs, Console()).run == runs / "2026-01-02"
-    assert "\x1b" not in capsys.readouterr().out
-    with pytest.raises(UserError, match="has a control character in its name; rename it"):
-        find_checkpoint(bad)
+def test_the_folders_of_seeds_are_no_links(runs: Path) -> None:
     run = runs / "2026-01-03"
-    for name in ("seed_\x1b[31m", "seed_001\n"):
-        shutil.copytree(runs / "2026-01-01", run / name)
+    shutil.copytree(runs / "2026-01-01", run / "seed_001 copy")
     (run / "seed_002").symlink_to(runs / "2026-01-01")
     assert runs_of_seeds(run) == [run]
     shutil.copytree(runs / "2026-01-01", run / "seed_1234")
@@ -454,7 +445,7 @@ def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> Non
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main([str(run)])
     assert exit_info.value.code == 1
-    assert f"checkpoint: {run}/checkpoints/best/" in capsys.readouterr().out
+    assert f"checkpoint: {run}/checkpoints/" in capsys.readouterr().out
 
 
 # Configs
@@ -565,7 +556,7 @@ def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) ->
 @pytest.mark.parametrize("main", [eval_command.main, plot_command.main], ids=["eval", "plot"])
 def test_commands_say_which_results_are_bad(tmp_path: Path, main, capsys) -> None:
     seed = tmp_path / "seed_000"
-    (seed / "checkpoints/best/64").mkdir(parents=True)
+    (seed / "checkpoints/64").mkdir(parents=True)
     save_config(tmp_path, TrainConfig(num_seeds=2))
     save_config(seed, TrainConfig())
     with SummaryWriter(logdir=str(seed)) as log:
@@ -575,13 +566,6 @@ def test_commands_say_which_results_are_bad(tmp_path: Path, main, capsys) -> Non
         main([str(tmp_path)])
     assert exit_info.value.code == 2
     assert capsys.readouterr().err.startswith(f"error: {seed}/results.json is damaged (")
-
-
-def test_many_small_values_take_no_memory(tmp_path: Path, progress: Progress) -> None:
-    plain = results_of(progress) | {"other": [[]] * 1_000_000}
-    (tmp_path / "results.json").write_text(json.dumps(plain))
-    with pytest.raises(UserError, match="results.json holds more than 2,000,000 values"):
-        load_results(tmp_path)
 
 
 BAD_PROGRESS = {

@@ -8,10 +8,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
-import tensorstore
+import orbax.checkpoint as ocp
 
-from bounce_mjx.runs.files import check_integrity
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
 from bounce_mjx.runs.folders import Checkpoint
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
@@ -27,14 +28,11 @@ TIMEOUT = 300.0
 
 def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """Every array of the training state in a checkpoint."""
-    check_integrity(checkpoint.folder)
-    files = {"driver": "file", "path": f"{checkpoint.folder.absolute()}/training/"}
-    database = {"driver": "ocdbt", "base": files}
-    end = "/.zarray"
-    keys = map(bytes.decode, tensorstore.KvStore.open(database).result().list().result())
-    names = [key.removesuffix(end) for key in keys if key.endswith(end)]
-    specs = {n: {"driver": "zarr", "kvstore": database | {"path": f"{n}/"}} for n in names}
-    return {n: tensorstore.open(x).result().read().result() for n, x in specs.items()}
+    if (checkpoint.folder / MANIFEST_FILE).exists():
+        check_integrity(checkpoint.folder)
+    stored = ocp.StandardCheckpointer().restore(checkpoint.folder.absolute() / "training")
+    leaves = jax.tree_util.tree_leaves_with_path(stored)
+    return {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in leaves}
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

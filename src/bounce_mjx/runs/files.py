@@ -12,12 +12,9 @@ import pydantic
 from pydantic_core import to_jsonable_python
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.files import new_file, read_regular
+from bounce_mjx.files import new_file
 
-PARTIAL = ".partial"
 MANIFEST_FILE = "manifest.json"
-_MAX_JSON_BYTES = 64 * 2**20
-_MAX_JSON_VALUES = 2_000_000
 
 ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
@@ -29,24 +26,23 @@ class Manifest(pydantic.BaseModel):
     files: dict[str, dict[str, int | str]]
 
 
-def to_json(plain: Any) -> str:
-    """Plain data as JSON. Non-finite numbers, which JSON cannot express, become null."""
+def to_plain(data: Any) -> Any:
+    """Data as what JSON can express; non-finite numbers become null."""
     # `pydantic_core.to_json` fails for paths that are not UTF-8.
-    return json.dumps(to_jsonable_python(plain, inf_nan_mode="null"), indent=2) + "\n"
+    return to_jsonable_python(data, inf_nan_mode="null")
+
+
+def to_json(data: Any) -> str:
+    """Data as JSON, see `to_plain`."""
+    return json.dumps(to_plain(data), indent=2) + "\n"
 
 
 def read_json(path: Path, model: type[ModelT]) -> ModelT:
     """Reads and validates a JSON file; raises OSError or ValueError if it does not fit `model`."""
-    text = read_regular(path, _MAX_JSON_BYTES).decode("utf-8")
-    # In memory, a small value takes many times its place in the file.
-    if sum(map(text.count, ",[{")) > _MAX_JSON_VALUES:
-        raise ValueError(f"{path.name} holds more than {_MAX_JSON_VALUES:,} values")
     try:
-        return model.model_validate(json.loads(text))
+        return model.model_validate_json(path.read_bytes())
     except pydantic.ValidationError as error:
         raise ValueError(f"{path.name}: {first_mistake(error)}") from error
-    except RecursionError as error:
-        raise ValueError(f"{path.name} is nested too deeply") from error
 
 
 def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
@@ -75,9 +71,10 @@ def first_mistake(error: pydantic.ValidationError) -> str:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes a file; readers see either the complete old content or the complete new one. Nothing
     is written through a link (`new_file`)."""
-    with new_file(path) as new:
-        new.write_bytes(content.encode() if isinstance(content, str) else content)
-        sync(new)
+    with new_file(path) as new, new.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_output(path: Path, content: str | bytes) -> None:
@@ -125,19 +122,6 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
         raise UserError(f"{flag} {path} is a folder; give a file")
     if not os.access(path if os.path.exists(path) else folder, os.W_OK):
         raise UserError(f"{flag} {path} may not be written; give another file")
-
-
-def sync(path: Path) -> None:
-    """Flushes a file, or the entries of a folder, to the disk."""
-    if os.name == "nt" and path.is_dir():
-        # Windows opens no folder.
-        return
-    # Windows flushes only what may be written.
-    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def seal(folder: Path) -> None:

@@ -6,15 +6,16 @@
         task/                           a copy of the task's file (`runs.task`)
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
-        checkpoints/latest/<steps>/     the newest state
-        checkpoints/best/<steps>/       the state with the best evaluation
-            policy/                     the policy's arrays (zarr in OCDBT)
+        checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
+            policy/                     the policy's arrays
             training/                   the training state's arrays; optional
-            run.json                    the steps, the config, the evaluations so far
+            networks/                   both networks, for another training; optional
+            record/                     the steps, the config, the evaluations so far
+            metrics/                    the score of the evaluation
             manifest.json               size and SHA-256 of every other file
 
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
-one seed; the run's own checkpoints/latest/ holds the state of all seeds.
+one seed; the run's own checkpoints/ holds the state of all seeds.
 
 Functions that search raise a `UserError` if they find nothing.
 """
@@ -27,8 +28,9 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+import pydantic
 from rich.console import Console
 
 import bounce_mjx
@@ -36,23 +38,27 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.files import check_name
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
+from bounce_mjx.runs import old
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
-from bounce_mjx.runs.files import write_atomically
+from bounce_mjx.runs.files import read_json, write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.task import copy_task
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
-CheckpointName = Literal["latest", "best"]
 POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
 """The policy that comes with the package for a task."""
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
-REPLACED = ".discarded"
-# A terminal obeys these characters.
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 _STAMP = "%Y-%m-%d_%H-%M-%S"
+
+
+class Metrics(pydantic.BaseModel):
+    """What orbax keeps of an evaluation."""
+
+    score: list[float]
+    """See `evaluation.results.Report.score`; empty for a policy that was not evaluated."""
 
 
 class Checkpoint(NamedTuple):
@@ -63,7 +69,8 @@ class Checkpoint(NamedTuple):
     folder: Path
     """The checkpoint's own folder."""
     steps: int
-    """Environment steps trained."""
+    """Its number: the environment steps trained, or one more where a checkpoint without an
+    evaluation had that number."""
 
 
 MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
@@ -156,8 +163,6 @@ def find_run(path: Path) -> Path:
         )
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
-            if _CONTROL.search(str(folder)):
-                raise UserError(f"{folder} has a control character in its name; rename it")
             check_name(folder.absolute())
             return folder
     raise UserError(
@@ -187,7 +192,7 @@ def named_run(path: Path | None, log_dir: Path) -> Path:
 
 def runs_in(folder: Path) -> list[Path]:
     """Runs with a checkpoint in a folder, such as those of several seeds, the oldest first."""
-    return sorted(filter(_has_checkpoint, _runs(folder)), key=_started)
+    return sorted(filter(stored_checkpoints, _runs(folder)), key=_started)
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -201,20 +206,18 @@ def find_checkpoint(path: Path) -> Checkpoint:
     if place == Path(os.path.abspath(run)):
         run = _best_seed(run)
         place = Path(os.path.abspath(run))
-    elif place in (siblings := stored_checkpoints(place.parent)).values():
-        return Checkpoint(run, place, next(n for n, p in siblings.items() if p == place))
-    inner = (place / CHECKPOINTS / name for name in ("best", "latest"))
-    return _checkpoint_in(run, path, place, *inner)
+    inside = [x for x in stored_checkpoints(run) if x.folder.absolute().is_relative_to(place)]
+    return _first_of(_by_quality(inside), path)
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """Newest checkpoint of a run, from which its training resumes."""
-    return _checkpoint_in(run, run, run / CHECKPOINTS / "latest")
+    return _first_of(sorted(stored_checkpoints(run), key=lambda x: -x.steps), run)
 
 
 def best_checkpoint(run: Path) -> Checkpoint:
-    """Checkpoint of a run with the best evaluation."""
-    return _checkpoint_in(run, run, run / CHECKPOINTS / "best")
+    """Checkpoint of a run with the best evaluation; without one, the newest."""
+    return _first_of(_by_quality(stored_checkpoints(run)), run)
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -259,7 +262,7 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
         for other in sorted(_runs(log_dir), key=_started, reverse=True):
             # A damaged file of another run is no reason to stop.
             with contextlib.suppress(UserError):
-                found = load_results(_best_seed(other)) if _has_checkpoint(other) else None
+                found = load_results(_best_seed(other)) if stored_checkpoints(other) else None
                 if found is not None and found.best.passed:
                     yield f"an older run met all its results: {other}"
                     break
@@ -268,25 +271,50 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
         yield f"a newer run has no checkpoint yet: {newest}"
 
 
-def stored_checkpoints(folder: Path) -> dict[int, Path]:
-    """Checkpoints in a folder by their steps."""
-    paths = []
+def stored_checkpoints(run: Path) -> list[Checkpoint]:
+    """Checkpoints of a run."""
+    folder, paths = run / CHECKPOINTS, []
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        # One look, as a training may rename them meanwhile.
-        paths = [folder / entry.name for entry in entries if entry.is_dir()]
-    # A checkpoint marked as replaced counts until its successor is in place.
-    for suffix in ("", REPLACED):
-        fitting = [path for path in paths if path.suffix == suffix]
-        if found := {int(p.stem): p for p in fitting if p.stem.isdecimal()}:
-            return found
-    return {}
+        # One look, as a training may remove them meanwhile.
+        paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
+    paths = paths or [path for name in ("best", "latest") for path in old.stored(folder, name)]
+    return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
-def replacement(folder: Path) -> Path | None:
-    """The checkpoint that a training has put in the place of another one; None if there is none, or
-    the other one is still there."""
-    stored = stored_checkpoints(folder.parent) if folder.stem.isdecimal() else {}
-    return None if folder in stored.values() or not stored else stored[max(stored)]
+def _first_of(checkpoints: list[Checkpoint], named: Path) -> Checkpoint:
+    """
+    Args:
+      named: what the user named, for the error.
+    """
+    if not checkpoints:
+        raise UserError(
+            f"{named} has no checkpoint, because the first one follows the first evaluation; train "
+            "longer or give another run's folder"
+        )
+    return checkpoints[0]
+
+
+def _by_quality(checkpoints: list[Checkpoint]) -> list[Checkpoint]:
+    """Checkpoints, the best one first; among equals, the newest."""
+    return sorted(checkpoints, key=lambda x: (_score(x.folder), x.steps), reverse=True)
+
+
+def _score(folder: Path) -> tuple[float, ...]:
+    """Quality of a checkpoint, greater than () if it was evaluated."""
+    if folder.parent.name == "best":
+        return (0.0,)
+    with contextlib.suppress(OSError, ValueError):
+        return tuple(read_json(folder / "metrics/metrics", Metrics).score)
+    return ()
+
+
+def replacement(folder: Path) -> Checkpoint | None:
+    """The best checkpoint of the run, if a training has removed this one meanwhile."""
+    if folder.exists() or folder.parent.name != CHECKPOINTS:
+        return None
+    with contextlib.suppress(UserError):
+        return best_checkpoint(folder.parent.parent)
+    return None
 
 
 def _best_seed(run: Path) -> Path:
@@ -297,9 +325,8 @@ def _best_seed(run: Path) -> Path:
 
 
 def _runs(log_dir: Path) -> list[Path]:
-    """Folders of runs, with and without a checkpoint, whose names can be printed."""
-    configs = filter(os.path.isfile, log_dir.glob(f"*/{CONFIG_FILE}"))
-    return [path.parent for path in configs if not _CONTROL.search(path.parent.name)]
+    """Folders of runs, with and without a checkpoint."""
+    return [path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}") if path.is_file()]
 
 
 def _started(run: Path) -> tuple[float, int, str]:
@@ -311,22 +338,3 @@ def _started(run: Path) -> tuple[float, int, str]:
             time = datetime.datetime.strptime(found[1], _STAMP).replace(tzinfo=datetime.UTC)
             return time.timestamp(), int(found[2] or 1), run.name
     return os.path.getmtime(run / CONFIG_FILE), 1, run.name
-
-
-def _has_checkpoint(run: Path) -> bool:
-    return any(stored_checkpoints(folder) for folder in (run / CHECKPOINTS).glob("*"))
-
-
-def _checkpoint_in(run: Path, named: Path, *folders: Path) -> Checkpoint:
-    """The newest checkpoint in the first of the folders that has one.
-
-    Args:
-      named: what the user named, for the error.
-    """
-    for folder in folders:
-        if stored := stored_checkpoints(folder.absolute()):
-            return Checkpoint(run, stored[max(stored)], max(stored))
-    raise UserError(
-        f"{named} has no checkpoint, because the first one follows the first evaluation; train "
-        "longer or give another run's folder"
-    )

@@ -1,25 +1,23 @@
-"""Reading of checkpoints; one sentence refuses a damaged or malicious checkpoint.
+"""Reading of checkpoints with orbax; one sentence refuses a damaged one.
 
 Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpoint is executable.
-Every function raises a `UserError` if the checkpoint is damaged or its config differs from the
-run's.
+Every function raises a `UserError` if the checkpoint is damaged or its config differs
+from the run's.
 """
 
-import os
+import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 import pydantic
-import tensorstore
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.learning.policy import (
     Actor,
     Policy,
@@ -27,19 +25,19 @@ from bounce_mjx.learning.policy import (
     networks_of,
     untrained_policy,
 )
-from bounce_mjx.learning.ppo import Params, TrainingState, names_of_critic_metrics
+from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
+from bounce_mjx.runs import old
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.files import check_integrity, first_mistake, read_json
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, replacement
 from bounce_mjx.tasks.registry import is_file
 
 Result = TypeVar("Result")
 
-RECORD_FILE = "run.json"
-NETWORKS = "networks"
-"""Item of a checkpoint that comes with the package: the part of a training state from which another
-training can start."""
+POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
+"""Items of a checkpoint: what acts; what a training continues from; both networks, with which
+another training can start; steps, config and evaluations."""
 
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
@@ -52,7 +50,7 @@ _MJCF_KEY = "env.mjcf"
 
 
 class Record(pydantic.BaseModel):
-    """Content of run.json."""
+    """The plain data of a checkpoint."""
 
     steps: int
     config: dict[str, Any]
@@ -62,7 +60,7 @@ class Record(pydantic.BaseModel):
 def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     read_record(checkpoint)
-    policy = _read_arrays(checkpoint, "policy", policy_shapes(config))
+    policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
         if not np.all(np.isfinite(array)):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -70,7 +68,7 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
                 f"the policy of the checkpoint {checkpoint.folder} holds a number that is not "
                 f"finite, in {name}; give another checkpoint"
             )
-    return policy
+    return jax.tree.map(jax.numpy.asarray, policy)
 
 
 def read_newest(
@@ -82,10 +80,10 @@ def read_newest(
         try:
             return checkpoint, read(checkpoint)
         except UserError:
-            newest = replacement(checkpoint.folder)
-            if newest is None:
+            newer = replacement(checkpoint.folder)
+            if newer is None:
                 raise
-            checkpoint = Checkpoint(checkpoint.run, newest, int(newest.stem))
+            checkpoint = newer
 
 
 def read_actor(
@@ -106,21 +104,19 @@ def policy_shapes(config: TrainConfig) -> Policy:
     return jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
 
 
-def load_training_state(
-    checkpoint: Checkpoint, template: TrainingState
-) -> tuple[TrainingState, dict[str, Any]]:
-    """Restores the whole training state of a checkpoint, and the evaluations so far.
+def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
+    """Restores the whole training state of a checkpoint as NumPy arrays, and its record.
 
     Args:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
-    if not (checkpoint.folder / "training").is_dir():
+    if not (checkpoint.folder / TRAINING).is_dir() or old.is_old(checkpoint.folder):
         raise UserError(
-            f"the checkpoint {checkpoint.folder} holds no training state to continue from, only a "
-            "policy; give a run that bounce-mjx train made"
+            f"the checkpoint {checkpoint.folder} holds no training state of this version to "
+            "continue from; start a new run with --warm-start"
         )
     record = read_record(checkpoint)
-    return _read_arrays(checkpoint, "training", template), record.progress
+    return _read_arrays(checkpoint, TRAINING, template), record
 
 
 def read_networks(
@@ -128,7 +124,8 @@ def read_networks(
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
-    items = [item for item in (NETWORKS, "training") if (checkpoint.folder / item).is_dir()]
+    read_record(checkpoint)
+    items = [item for item in (NETWORKS, TRAINING) if (checkpoint.folder / item).is_dir()]
     if not items:
         raise UserError(
             f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
@@ -147,12 +144,15 @@ def read_networks(
 
 def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
-    run_config = load_run_config(checkpoint.run)
+    run_config, folder = load_run_config(checkpoint.run), checkpoint.folder
     try:
-        check_integrity(checkpoint.folder)
-        record = read_json(checkpoint.folder / RECORD_FILE, Record)
-        if record.steps != checkpoint.steps:
-            raise ValueError(f"it was written after {record.steps} steps")
+        if (folder / MANIFEST_FILE).exists():
+            check_integrity(folder)
+        else:
+            # Its training was killed before it wrote the manifest.
+            print(f"warning: {folder} has no {MANIFEST_FILE} to find damage by", file=sys.stderr)
+        name = old.RECORD_FILE if old.is_old(folder) else f"{RECORD}/metadata"
+        record = read_json(folder / name, Record)
         is_copy = is_file(run_config.task) and is_file(str(record.config.get("task")))
         its_task = {"task": run_config.task} if is_copy else {}
         config = type(run_config).model_validate(record.config | its_task)
@@ -163,7 +163,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     differing = differing_keys(run_config, config) - RESUMABLE_KEYS - {_MJCF_KEY}
     if differing:
         raise UserError(
-            f"the checkpoint {checkpoint.folder} has a different config from "
+            f"the checkpoint {folder} has a different config from "
             f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
             "restore that file or give another checkpoint"
         )
@@ -172,51 +172,37 @@ def read_record(checkpoint: Checkpoint) -> Record:
 
 def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
-    leaves, tree = jax.tree_util.tree_flatten_with_path(template)
-    # JAX's own error, not a damaged file's.
-    jax.devices()
+    folder = (checkpoint.folder / item).absolute()
     try:
-        folder = checkpoint.folder / item
-        opening = [open_array(folder, path, leaf, open=True, read=True) for path, leaf in leaves]
-        reading = [array.result().read() for array in opening]
-        arrays = [jax.numpy.asarray(array.result()) for array in reading]
+        if old.is_old(checkpoint.folder):
+            return old.read_arrays(folder, template)
+        # Imported here, as the import takes half a second.
+        import orbax.checkpoint as ocp
+
+        handler = ocp.PyTreeCheckpointHandler()
+        expected, found = _forms(template), _forms(handler.metadata(folder).tree)
+        for name in sorted(expected.keys() | found.keys()):
+            given, wanted = (x.get(name, "missing") for x in (found, expected))
+            if given != wanted:
+                raise ValueError(f"{item}.{name} is {given}, and should be {wanted}")
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
+        arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
+        return handler.restore(folder, args=arguments)
     # Damaged files raise exceptions of many types.
     except Exception as error:
         raise _damaged(checkpoint, error) from error
-    return jax.tree_util.tree_unflatten(tree, arrays)
 
 
-def open_array(
-    folder: Path, path: tuple, leaf: jax.ShapeDtypeStruct, **options: Any
-) -> tensorstore.Future:
-    """Opens an array of a checkpoint: one chunk, compressed with zstd, as orbax wrote them too.
-
-    A crafted file cannot take more memory than the array: the expected shape fixes the size of the
-    chunk, and the zstd reader stops there. (The blosc reader allocates the size that the file
-    states.)
-
-    Args:
-      folder: of all arrays of an item.
-      path: the array's path in its pytree.
-      leaf: its shape and type.
-      options: of `tensorstore.open`.
-    """
-    name = jax.tree_util.keystr(path, simple=True, separator=".")
-    files = {"driver": "file", "path": f"{os.path.abspath(folder)}/"}
-    metadata = {
-        "shape": leaf.shape,
-        "chunks": leaf.shape,
-        "dtype": leaf.dtype.str,
-        "compressor": {"id": "zstd", "level": 1},
+def _forms(tree: Any) -> dict[str, str]:
+    """The dtype and the shape of each array, by its path."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): f"{leaf.dtype}{list(leaf.shape)}"
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
-    database = {"driver": "ocdbt", "base": files, "path": f"{name}/"}
-    spec = {"driver": "zarr", "kvstore": database, "metadata": metadata}
-    return tensorstore.open(spec, **options)
 
 
 def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:
-    reason = (str(error).strip().splitlines() or [repr(error)])[0].split(" [tensorstore_spec")[0]
     return UserError(
-        f"the checkpoint {checkpoint.folder} is damaged or of another version ({reason[:200]}); "
-        "give another checkpoint"
+        f"the checkpoint {checkpoint.folder} is damaged or of another version "
+        f"({shorten(reason_of(error), 200)}); give another checkpoint"
     )

@@ -1,90 +1,73 @@
-"""Writing of checkpoints. A checkpoint is written under a temporary name and flushed to the disk
-before it replaces the older one, so a killed process always leaves one complete checkpoint."""
+"""Writing of checkpoints with orbax, in a background thread."""
 
 import concurrent.futures
 import contextlib
+import logging
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import tensorstore
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import Params, TrainingState
-from bounce_mjx.learning.statistics import RunningStatistics
-from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
-from bounce_mjx.runs.files import PARTIAL, seal, sync, to_json, write_atomically
-from bounce_mjx.runs.lock import lock_run
+from bounce_mjx.runs.files import seal, to_json, to_plain, writable, write_atomically
+from bounce_mjx.runs.folders import CHECKPOINTS, create_run, save_config
 from bounce_mjx.runs.progress import RESULTS_FILE
-from bounce_mjx.runs.reading import NETWORKS, RECORD_FILE, open_array
+from bounce_mjx.runs.reading import POLICY, RECORD
+
+# Where orbax moves the checkpoints that are not kept any more.
+_REPLACED = "replaced"
 
 
 class CheckpointWriter:
-    """Saves a run's latest checkpoint, best checkpoint and results in a background thread.
+    """Saves a run's checkpoints and results in the background. What could not be saved is lost: the
+    next save has newer data."""
 
-    Each checkpoint replaces its predecessor. Data whose saving failed stays in memory until a retry
-    succeeds or newer data replaces it.
-    """
-
-    def __init__(self, run: Path, config: TrainConfig):
-        self._run, self._run_config = run, config
-        self._config = config.model_dump(mode="json")
-        # Pending writes by name, the oldest first. A checkpoint on the disk thus never refers to
-        # a best checkpoint that is not there yet, unless it holds the best state itself.
-        self._pending: dict[str, Callable[[], None]] = {}
-        self._pool = concurrent.futures.ThreadPoolExecutor(1)
+    def __init__(self, run: Path, config: TrainConfig, pool: concurrent.futures.Executor):
+        """
+        Args:
+          pool: the thread that writes.
+        """
+        self._run, self._config, self._pool = run, config, pool
         self._writing: concurrent.futures.Future | None = None
         self._problem: str | None = None
-        self._locks = contextlib.ExitStack()
 
     def save(
         self,
-        names: Sequence[folders.CheckpointName],
         steps: int,
-        policy: Policy,
-        training: TrainingState | None = None,
-        progress: dict[str, Any] | None = None,
+        items: dict[str, Any],
+        progress: dict[str, Any],
+        score: Sequence[float] = (),
         results: dict[str, Any] | None = None,
-        networks: tuple[Params, RunningStatistics] | None = None,
     ) -> None:
         """Starts a save after waiting for the previous save.
 
         Args:
-          names: the checkpoints to write, "latest" before "best".
           steps: environment steps trained.
-          training: None for a checkpoint that cannot be resumed.
+          items: pytrees of arrays by their names.
           progress: the evaluations so far, plain data.
+          score: quality of the policy; empty if it was not evaluated.
           results: the run's results, plain data.
-          networks: without `training`, the part of it with which another training can start.
         """
-        items = {"policy": policy} | ({} if training is None else {"training": training})
-        if networks is not None:
-            items[NETWORKS] = dict(zip(("params", "statistics"), networks, strict=True))
         # A copy, because the training reuses its buffers while the writer is still busy.
         items = jax.tree.map(np.array, items)
-        record = to_json({"steps": steps, "config": self._config, "progress": progress or {}})
         self.problem()
-        new = {}
-        for name in names:
-            folder = self._run / folders.CHECKPOINTS / name / str(steps)
-            new[name] = partial(_write_checkpoint, folder, items, record)
-        if results is not None:
-            path = self._run / RESULTS_FILE
-            new[RESULTS_FILE] = partial(write_atomically, path, to_json(results))
-        self._pending = {k: v for k, v in self._pending.items() if k not in new} | new
-        self.retry()
+        arguments = self._run, self._config, steps, items, progress, score
+        self._start(partial(save_checkpoint, *arguments), results)
 
-    def retry(self) -> None:
-        """Starts to save again after a failed save."""
-        self._writing = self._pool.submit(self._write)
+    def save_results(self, results: dict[str, Any] | None) -> None:
+        """Starts to write the run's results alone."""
+        self.problem()
+        self._start(lambda: None, results)
 
     def problem(self, wait: bool = True) -> str | None:
         """Reason for the last save's failure, as part of a sentence; None if it succeeded.
@@ -100,36 +83,25 @@ class CheckpointWriter:
                 self._problem = f"{self._run} cannot be written ({error.strerror})"
         return self._problem
 
-    def close(self) -> None:
-        """Waits until the save in progress has ended."""
-        self._pool.shutdown()
-        self._locks.close()
+    def _start(self, save: Callable[[], None], results: dict[str, Any] | None) -> None:
+        text = None if results is None else to_json(results)
 
-    def _write(self) -> None:
-        for name, write in list(self._pending.items()):
-            self._restore_folder()
-            write()
-            del self._pending[name]
-        # Also if it was moved meanwhile: tensorstore makes the folders that it writes to.
-        self._restore_folder()
+        def write() -> None:
+            # The user may have moved or removed the folder.
+            if not (self._run / CONFIG_FILE).exists():
+                self._run.mkdir(parents=True, exist_ok=True)
+                # The only copy of the robot may have been in the folder.
+                with contextlib.suppress(UserError):
+                    save_config(self._run, self._config)
+            save()
+            if text is not None:
+                write_atomically(self._run / RESULTS_FILE, text)
 
-    def _restore_folder(self) -> None:
-        """Makes the run's folder again if the user has moved or removed it, so that the new state
-        is kept, and can be resumed."""
-        if not (self._run / CONFIG_FILE).exists():
-            if not self._run.exists():
-                self._run.mkdir(parents=True)
-            # The training's own lock is that of the folder that was moved; if only the config is
-            # missing, it still holds.
-            with contextlib.suppress(UserError):
-                self._locks.enter_context(lock_run(self._run))
-            # The only copy of the robot may have been in the folder.
-            with contextlib.suppress(UserError):
-                folders.save_config(self._run, self._run_config)
+        self._writing = self._pool.submit(write)
 
 
 def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
-    """Writes a new run whose best checkpoint holds only a policy; its folder.
+    """Writes a new run whose checkpoint holds only a policy; its folder.
 
     Args:
       steps: environment steps trained.
@@ -137,68 +109,97 @@ def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
     Raises:
       UserError: the folder cannot be written.
     """
-    run = folders.create_run(config)
-    writer = CheckpointWriter(run, config)
-    writer.save(("best",), steps, policy)
-    problem = writer.problem()
-    writer.close()
-    if problem is not None:
-        raise UserError(f"{problem}; choose another folder")
+    run = create_run(config)
+    with writable(run, "choose another folder"):
+        save_checkpoint(run, config, steps, {POLICY: policy})
     return run
 
 
-def _write_checkpoint(folder: Path, items: dict[str, Any], record: str) -> None:
-    """Writes a checkpoint and replaces all others in its parent folder.
+def save_checkpoint(
+    run: Path,
+    config: TrainConfig,
+    steps: int,
+    items: dict[str, Any],
+    progress: dict[str, Any] | None = None,
+    score: Sequence[float] = (),
+) -> None:
+    """Writes a checkpoint; of the others, orbax keeps the best one. A process that is killed at any
+    moment leaves the others as they were.
+
+    Its number is that of its steps, or the next one if it was saved before without an evaluation.
 
     Args:
-      items: pytrees of numpy arrays by name.
-      record: text of run.json.
+      run: the run's folder.
+      config: the run's config.
+      steps: environment steps trained.
+      items: pytrees of arrays by the names in `runs.reading`.
+      progress: the evaluations so far, plain data.
+      score: quality of the policy (`Report.score`); empty if it was not evaluated.
 
     Raises:
-      OSError: the checkpoint could not be written; the folder is unchanged.
+      OSError: the checkpoint could not be written.
     """
-    unfinished = folder.with_name(folder.name + PARTIAL)
-    _remove_leftovers(folder.parent)
+    import orbax.checkpoint as ocp
+    from orbax.checkpoint.checkpoint_managers import preservation_policy as keep
+
+    folder = (run / CHECKPOINTS).absolute()
+    folder.mkdir(exist_ok=True)
+    alone = {jax.process_index()}
+    options = ocp.CheckpointManagerOptions(
+        # Without it, orbax writes no metrics.
+        best_fn=_score_in,
+        preservation_policy=keep.AnyPreservationPolicy(
+            [
+                keep.LatestN(1),
+                keep.BestN(get_metric_fn=_score_in, n=1, keep_checkpoints_without_metrics=False),
+            ]
+        ),
+        create=False,
+        cleanup_tmp_directories=True,
+        enable_async_checkpointing=False,
+        todelete_subdir=_REPLACED,
+        multiprocessing_options=ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(), active_processes=alone, barrier_sync_key_prefix="run"
+        ),
+    )
+    items = jax.tree.map(np.asarray, items)
+    given = {name: tree for name, tree in items.items() if jax.tree.leaves(tree)}
+    arguments = {name: ocp.args.StandardSave(tree) for name, tree in given.items()}
+    record = {"steps": steps, "config": config.model_dump(mode="json"), "progress": progress or {}}
+    arguments[RECORD] = ocp.args.JsonSave(to_plain(record))
     try:
-        unfinished.mkdir(parents=True)
-        for name, tree in items.items():
-            _save_arrays(unfinished / name, tree)
-        (unfinished / RECORD_FILE).write_text(record, encoding="utf-8")
-        # By name: tensorstore may have written the arrays of an item elsewhere.
-        for path in (*(unfinished / name for name in items), *unfinished.rglob("*")):
-            sync(path)
-        seal(unfinished)
-        sync(unfinished)
+        # A new manager each time: one that failed would take the checkpoint for written.
+        with _without_tracebacks(), ocp.CheckpointManager(folder, options=options) as manager:
+            latest = manager.latest_step()
+            number = steps if latest is None else max(steps, latest + 1)
+            metrics = {"score": list(score)}
+            manager.save(number, args=ocp.args.Composite(**arguments), metrics=metrics)
+        seal(folder / str(number))
     except Exception as error:
-        shutil.rmtree(unfinished, ignore_errors=True)
         # tensorstore reports a full disk as a ValueError.
-        number = re.search(r"os_error_code='(\d+)'", str(error))
-        if number is None:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
             raise
-        raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
-    for steps, other in folders.stored_checkpoints(folder.parent).items():
-        other.rename(folder.with_name(f"{steps}{folders.REPLACED}"))
-    unfinished.rename(folder)
-    sync(folder.parent)
-    _remove_leftovers(folder.parent)
+        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
+    finally:
+        shutil.rmtree(folder / _REPLACED, ignore_errors=True)
 
 
-def _save_arrays(folder: Path, tree: Any) -> None:
-    """Writes a pytree of arrays as `reading.open_array` opens them, all in one go."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    with tensorstore.Transaction() as together:
-        # With separate contexts, each array would be written, and flushed, by itself.
-        shared = dict(context=tensorstore.Context(), transaction=together)
-        options = shared | dict(create=True, write=True)
-        opening = [open_array(folder, path, leaf, **options) for path, leaf in leaves]
-        writing = [x.result().write(leaf) for x, (_, leaf) in zip(opening, leaves, strict=True)]
-        for each in writing:
-            each.result()
+@contextlib.contextmanager
+def _without_tracebacks() -> Iterator[None]:
+    """Around a save: after an error, orbax logs a traceback, and arrays that are still written find
+    its event loop closed."""
+    log, report = logging.getLogger("absl"), sys.unraisablehook
+    log.disabled = True
+    sys.unraisablehook = lambda lost: None if lost.exc_type is RuntimeError else report(lost)
+    try:
+        yield
+    except Exception:
+        time.sleep(0.2)
+        raise
+    finally:
+        log.disabled, sys.unraisablehook = False, report
 
 
-def _remove_leftovers(folder: Path) -> None:
-    """Removes incomplete and replaced checkpoints from a folder."""
-    counting = folders.stored_checkpoints(folder).values()
-    for path in folder.glob("*"):
-        if path.suffix in (PARTIAL, folders.REPLACED) and path not in counting:
-            shutil.rmtree(path, ignore_errors=True)
+def _score_in(metrics: dict[str, Any]) -> tuple[float, ...]:
+    return tuple(metrics["score"])

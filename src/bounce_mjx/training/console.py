@@ -108,16 +108,14 @@ class Reporter:
         for log in self._logs():
             log.flush()
 
-    def saving_problem(
-        self,
-        problem: str | None,
-        meanwhile: str = "training continues, and saves at its next evaluation",
-    ) -> None:
+    def saving_problem(self, problem: str | None) -> None:
         """Prints once why saving fails, and once when it works again."""
-        sentence = problem and f"the state is not saved, as {problem}; make room: {meanwhile}"
-        if sentence != self._saving_problem:
-            self.say(sentence or "the state is saved again")
-        self._saving_problem = sentence
+        if problem is not None and self._saving_problem is None:
+            meanwhile = "training continues, and saves at its next evaluation"
+            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
+        elif problem is None and self._saving_problem is not None:
+            self.say("the state is saved again")
+        self._saving_problem = problem
 
     def evaluation(
         self, steps: int, reports: Sequence[Report], healthy: Sequence[bool] = (True,)

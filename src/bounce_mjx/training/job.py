@@ -10,7 +10,7 @@ import importlib
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -30,7 +30,14 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.runs.reading import load_training_state, read_policy, read_record
+from bounce_mjx.runs.reading import (
+    NETWORKS,
+    POLICY,
+    TRAINING,
+    read_policy,
+    read_record,
+    read_training,
+)
 from bounce_mjx.runs.writing import CheckpointWriter
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import PROG, Options, named_task
@@ -49,11 +56,8 @@ from bounce_mjx.training.warm_start import present_start, read_start
 
 Tree = TypeVar("Tree")
 
-# Time between two attempts to save to a full disk after the end of the training, s.
-RETRY_SECONDS = 2.0
-
-# Imported by name during the compilation, because this import takes half a second.
-REPORT_MODULE = "bounce_mjx.reports.page"
+# Imported by name during the compilation, because these imports take half a second each.
+CHECKPOINT_MODULE, REPORT_MODULE = "orbax.checkpoint", "bounce_mjx.reports.page"
 
 
 @dataclasses.dataclass
@@ -71,6 +75,8 @@ class SeedRun:
     """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
     final: Report | None = None
     """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
+    saved: tuple[Report | None, int, Policy | None] = (None, 0, None)
+    """Report, steps and policy of the best checkpoint on the disk."""
 
     @property
     def report(self) -> Report | None:
@@ -90,6 +96,7 @@ def train(
     options: Options,
     watcher: Watcher | None = None,
     prog: str = PROG,
+    make_evaluators: Callable[..., Evaluators] = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
 
@@ -97,6 +104,7 @@ def train(
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
       watcher: receives the progress of the first seed.
       prog: the user's command, to which `--resume` may be added.
+      make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
 
     Raises:
       UserError: the run's folder, the model, the devices or the resumed checkpoint are not usable,
@@ -110,7 +118,9 @@ def train(
     hosts.agree(config, options.resume)
     config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:
-        job = _Job(config, console, make_trainer, options, stack, watcher, prog)
+        job = _Job(config, console, make_trainer, make_evaluators, options, stack, watcher, prog)
+        job.open()
+        job.announce()
         try:
             job.compile()
             job.train()
@@ -133,19 +143,20 @@ class _Job:
         config: TrainConfig,
         console: Console,
         make_trainer: Callable[[TrainConfig, Env], Trainer],
+        make_evaluators: Callable[..., Evaluators],
         options: Options,
         stack: contextlib.ExitStack,
         watcher: Watcher | None = None,
         prog: str = PROG,
     ):
+        """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.options, self.stack = config, console, options, stack
-        self.watcher, self.prog = watcher, prog
+        self.make_evaluators, self.watcher, self.prog = make_evaluators, watcher, prog
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.resumed = options.resume is not None
         self.clock = Clock()
         self.env = Env(config.env)
-        # A mistake in the config must be found before a folder is made.
         self.trainer = make_trainer(config, self.env)
         warm = config.warm_start is not None and not self.resumed
         self.first = read_start(config, self.env) if warm else None
@@ -154,30 +165,38 @@ class _Job:
         self.state: Any = None
         self.steps = 0
         self.writers: list[CheckpointWriter] = []
+        self.seed_writers: list[CheckpointWriter] = []
+
+    def open(self) -> None:
+        """Makes the folder of a new run, or reads the resumed one."""
         # Before, a signal ends the process by its default action.
-        self.stop = stack.enter_context(StopRequest())
-        self.run = folders.find_run(options.resume) if self.resumed else self._create()
-        self.started = False
-        stack.push(self._remove_unstarted)
+        self.stop = self.stack.enter_context(StopRequest())
+        self.run = folders.find_run(self.options.resume) if self.resumed else self._create()
+        self.keeps_folder = self.resumed
+        self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
-            stack.enter_context(lock_run(self.run))
+            self.stack.enter_context(lock_run(self.run))
         self.members = self._seed_runs()
         if self.resumed:
             self._resume()
         if hosts.is_leader():
             self._write_configs()
-        mesh = self.trainer.mesh
+
+    def announce(self) -> None:
+        """Says what is trained, where and for how long."""
+        config, mesh = self.config, self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
-        say(console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        say(self.console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
         for warning in self.env.engine.warnings:
-            say(console, f"warning: {warning}")
+            say(self.console, f"warning: {warning}")
         for term in config.env.unseen_noise:
-            say(console, f"warning: the policy does not see what {term} changes")
-        say(console, f"device: {self.device}  run: {self.run}")
+            say(self.console, f"warning: the policy does not see what {term} changes")
+        say(self.console, f"device: {self.device}  run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
-        say(console, f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
+        blocks = f"in blocks of {self.block_steps:,}"
+        say(self.console, f"steps: {bound}{config.total_steps:,}, {blocks}")
         self.clock.lap("setup")
 
     @property
@@ -187,8 +206,7 @@ class _Job:
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
-        for writer in self.writers:
-            writer.problem()
+        self._problem()
         reason = shorten(reason_of(error), 200)
         if reason.startswith("RESOURCE_EXHAUSTED"):
             envs = f"{self.config.ppo.num_envs:,} environments"
@@ -216,8 +234,8 @@ class _Job:
         return Path(hosts.text_from_leader(run))
 
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
-        """Removes the folder of a new run whose training did not start."""
-        if error is not None and not (self.started or self.resumed) and hosts.is_leader():
+        """Removes the folder of a new run without a checkpoint or a block that can be trained."""
+        if error is not None and not self.keeps_folder and hosts.is_leader():
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _seed_runs(self) -> list[SeedRun]:
@@ -247,11 +265,13 @@ class _Job:
             for path in self.run.rglob(f"{UNFINISHED}*"):
                 path.unlink(missing_ok=True)
         latest = folders.latest_checkpoint(self.run)
-        self.state, plain = load_training_state(latest, self.trainer.state_template())
-        self.steps = latest.steps
-        seed_records = [plain] if self.config.num_seeds == 1 else plain["seeds"]
-        for member, record in zip(self.members, seed_records, strict=True):
-            member.progress = _resumed_progress(member.run, record, latest)
+        self.state, record = read_training(latest, self.trainer.state_template())
+        self.steps = record.steps
+        for member, plain in zip(
+            self.members, record.progress.get("seeds", [record.progress]), strict=True
+        ):
+            member.progress = _resumed_progress(member.run, plain, latest)
+            member.saved = (member.progress.best, member.progress.best_steps, None)
         self._say_how_far()
 
     def _say_how_far(self) -> None:
@@ -286,18 +306,18 @@ class _Job:
         if self.first is not None:
             self.trainer.warm_start(*self.first)
         if hosts.is_leader():
-            self.writers = [CheckpointWriter(*folder) for folder in self._configs().items()]
-        for writer in self.writers:
-            self.stack.callback(writer.close)
+            # One thread, so that the saves keep their order.
+            saving = self.stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
+            configs = self._configs().items()
+            self.writers = [CheckpointWriter(run, config, saving) for run, config in configs]
+            self.seed_writers = self.writers[-len(self.members) :]
         self.reporter = self.stack.enter_context(
             Reporter(opening.result, self.console, self.config, self.steps, self.watcher)
         )
-        self.started = True
         self.clock.lap("compile")
 
     def _leave_untrained(self) -> NoReturn:
         """Ends the process as Ctrl-C would, without the folder of a new run."""
-        self.started = False
         self._remove_unstarted(KeyboardInterrupt)
         leave()
 
@@ -305,10 +325,10 @@ class _Job:
         """Returns once the training can start, with the future of its logs. The longest program is
         traced first: Python traces one program at a time while XLA compiles others."""
         compiling = self.trainer.compile(self.pool)
-        self.evaluators = Evaluators(self.config, self.env, self.trainer.mesh, self.pool)
+        self.evaluators = self.make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
         opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
-        if self.options.report:
-            opening.add_done_callback(lambda _: importlib.import_module(REPORT_MODULE))
+        for module in [CHECKPOINT_MODULE, *([REPORT_MODULE] if self.options.report else [])]:
+            opening.add_done_callback(lambda _, module=module: importlib.import_module(module))
         compiling.result()
         return opening
 
@@ -319,15 +339,6 @@ class _Job:
 
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
-        for i, member in enumerate(self.members):
-            best = member.run / folders.CHECKPOINTS / "best"
-            stored = self.steps in folders.stored_checkpoints(best)
-            progress = member.progress
-            missing = progress.best is not None and progress.best_steps == self.steps and not stored
-            if self.resumed and missing:
-                # The process was killed after saving the latest checkpoint and before saving the
-                # best one.
-                self._save(best=[i])
         while not self._stopping():
             if self._is_due() and not self._evaluate():
                 break
@@ -347,7 +358,7 @@ class _Job:
             jax.distributed.shutdown()
             self._leave_untrained()
         if stopping and not self._evaluated():
-            self._save(best=[])
+            self._save(self.trainer.snapshot())
         self._wait_until_saved()
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
@@ -386,13 +397,26 @@ class _Job:
         if self.watcher is not None:
             policy = self._of_seed(snapshot.policy, 0)
             self.watcher.evaluation(self.steps, reports[0], policy)
-        best, seconds = [], sum(self.clock.seconds.values())
+        self._settle()
+        seconds, scores = sum(self.clock.seconds.values()), {}
         for i, member in enumerate(self.members):
             if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
                 member.best_policy = self._of_seed(snapshot.policy, i)
-                best.append(i)
-        self._save(best, snapshot)
+                scores[i] = reports[i].score
+            elif self.config.num_seeds == 1:
+                scores[i] = reports[i].score
+        self._save(snapshot, scores)
         return True
+
+    def _settle(self) -> None:
+        """Waits for the last save: a policy that could not be saved is not the best one."""
+        lost = hosts.any_of(self._problem() is not None)
+        for member in self.members:
+            progress = member.progress
+            if lost:
+                progress.best, progress.best_steps, member.best_policy = member.saved
+            else:
+                member.saved = progress.best, progress.best_steps, member.best_policy
 
     def _evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
@@ -412,13 +436,20 @@ class _Job:
             return False
         for member, report in zip(self.members, reports, strict=True):
             member.final = None if member.progress.best is None else report
-        for writer, member in zip(self.writers[-len(self.members) :], self.members, strict=False):
-            writer.save((), self.steps, member.best_policy, results=self._results(member))
+        for writer, member in zip(self.seed_writers, self.members, strict=False):
+            writer.save_results(self._results(member))
         self._wait_until_saved()
         return True
 
     def _wait_until_saved(self) -> None:
-        _wait_until_saved(self.writers, self.reporter, self.stop)
+        """
+        Raises:
+          UserError: the end of the training could not be saved.
+        """
+        if problem := self._problem():
+            raise UserError(
+                f"{problem}, so the end of the training is lost; make room, and {self._advice()}"
+            )
         self.clock.lap("save")
 
     def _wait_for_reports(
@@ -451,23 +482,21 @@ class _Job:
         metrics = block.result()
         seconds = time.perf_counter() - started
         if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
-            if hosts.is_leader() and self._latest() is None:
-                shutil.rmtree(self.run, ignore_errors=True)
             raise UserError(f"these settings cannot be trained: {wrong}")
+        self.keeps_folder = True
         faults = metrics.pop("fault")
         done = faults.shape[1] * self.config.ppo.batch_steps
         self.steps += done
         rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         self.reporter.block(self.steps, seconds, metrics)
-        self._report_saving(wait=False)
+        self.reporter.saving_problem(self._problem(wait=False))
         self._check_faults(faults)
         self.clock.lap("train")
 
-    def _report_saving(self, wait: bool) -> None:
-        """Says whether the last save failed; `wait` is that of `CheckpointWriter.problem`."""
-        problems = [writer.problem(wait) for writer in self.writers]
-        self.reporter.saving_problem(next(filter(None, problems), None))
+    def _problem(self, wait: bool = True) -> str | None:
+        """Why the last save failed; see `CheckpointWriter.problem`."""
+        return next(filter(None, [writer.problem(wait) for writer in self.writers]), None)
 
     def _check_faults(self, faults: np.ndarray) -> None:
         """Ends a run that diverged, because its state is useless; with several seeds, the
@@ -489,8 +518,7 @@ class _Job:
                 self.reporter.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
-        for writer in self.writers:
-            writer.problem()
+        self._problem()
         latest = self._latest()
         kept = "no checkpoint had been saved yet"
         if latest is not None:
@@ -500,34 +528,36 @@ class _Job:
             "start a new run with a lower learning rate or other rewards"
         )
 
-    def _save(self, best: list[int], snapshot: Snapshot | None = None) -> None:
-        """Starts to save the latest state, and for the seeds in `best` their best checkpoint.
+    def _save(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]] | None = None) -> None:
+        """Starts to save the state, and with several seeds the policies of some of them.
 
         Args:
-          snapshot: the latest state, if it is already available.
+          scores: quality of the policies that were evaluated, by number of the seed; with several
+            seeds, of those that are the best of their seed.
         """
-        policy, state = snapshot or self.trainer.snapshot()
         # A second signal may end the process at any time, so the log must already hold every step
         # of the checkpoint.
         self.reporter.flush()
         # Each save waits for the one before.
-        self._report_saving(wait=True)
-        several = self.config.num_seeds > 1
+        self.reporter.saving_problem(self._problem())
+        self.keeps_folder = True
+        scores = scores or {}
         plain = [member.progress.model_dump() for member in self.members]
-        if several and self.writers:
-            self.writers[0].save(("latest",), self.steps, policy, state, {"seeds": plain})
-        for i, writer in enumerate(self.writers[-len(self.members) :]):
-            names = ("best",) if i in best else ()
+        several = len(self.members) > 1
+        for i, writer in enumerate(self.seed_writers):
+            results = self._results(self.members[i])
+            if several and i not in scores:
+                writer.save_results(results)
+                continue
+            items = {POLICY: self._of_seed(snapshot.policy, i)}
+            items[NETWORKS] = self._of_seed(snapshot.networks, i)
             if not several:
-                names = ("latest", *names)
-            writer.save(
-                names,
-                self.steps,
-                self._of_seed(policy, i),
-                self._of_seed(state, i),
-                plain[i],
-                self._results(self.members[i]),
-            )
+                items[TRAINING] = snapshot.state
+            writer.save(self.steps, items, plain[i], scores.get(i, ()), results)
+        if several and self.writers:
+            # Last, as it refers to the best policies of the seeds.
+            items = {POLICY: snapshot.policy, TRAINING: snapshot.state}
+            self.writers[0].save(self.steps, items, {"seeds": plain})
         self.clock.lap("save")
 
     def _of_seed(self, tree: Tree, index: int) -> Tree:
@@ -548,32 +578,11 @@ class _Job:
         )
 
 
-def _wait_until_saved(
-    writers: Sequence[CheckpointWriter], reporter: Reporter, stop: StopRequest
-) -> None:
-    """Keeps the process alive, and with it the training's state, until the state is on the disk."""
-    stopping = stop.requested
-    for writer in writers:
-        while (problem := writer.problem()) is not None:
-            if stop.requested and not stopping:
-                raise UserError(
-                    f"{problem}, so the end of the training is lost; make room, and resume"
-                )
-            reporter.saving_problem(
-                problem, "it stays in memory, and is saved as soon as there is room"
-            )
-            time.sleep(RETRY_SECONDS)
-            writer.retry()
-    reporter.saving_problem(None)
-
-
 def _resumed_progress(run: Path, plain: dict[str, Any], latest: folders.Checkpoint) -> Progress:
-    """The evaluations of a seed before it is resumed."""
+    """The evaluations of a seed before it is resumed. The best checkpoint's own record says which
+    one is the best: with several seeds, the process may have been killed between its save and that
+    of the latest one."""
     progress = Progress.from_dict(plain, latest.folder)
-    if progress.best is not None and progress.best_steps == latest.steps:
-        return progress
-    # The best checkpoint's own record counts: if the process was killed between the two saves, it
-    # may be older or newer than the record in the latest checkpoint.
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = folders.best_checkpoint(run)

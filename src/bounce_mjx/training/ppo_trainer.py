@@ -112,7 +112,8 @@ class PPOTrainer:
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
-        return Snapshot(policy_of(state, self._observation_size), state)
+        networks = {"params": state.params, "statistics": state.statistics}
+        return Snapshot(policy_of(state, self._observation_size), state, networks)
 
 
 def _iterations_at_once(config: TrainConfig, env: Env) -> int:

@@ -9,8 +9,10 @@ from pathlib import Path
 import jax
 
 from bounce_mjx.files import private_folder
-from bounce_mjx.training.loop_fusion import join_loops
 from bounce_mjx.world.config import WorldConfig
+
+LOOPS = "--xla_backend_extra_options"
+JOINED_LOOPS = f"{LOOPS}=xla_cpu_use_multi_output_fusion"
 
 
 def set_up_jax(*configs: WorldConfig) -> None:
@@ -118,3 +120,31 @@ def compiler_options(
         "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION",
         "xla_cpu_prefer_vector_width": 512,
     }
+
+
+def join_loops(*configs: WorldConfig) -> None:
+    """Joins loops on a CPU if all these environments have the fused physics.
+
+    XLA emits one loop for each result by default, and repeats the intermediate values that results
+    share. With its option for multi-output fusion, one loop computes several results: the programs
+    compile in about half the time, and the physics runs several times as fast (figures in
+    benchmarks/notes.md). XLA aborts the process on a few programs with it, such as MJX's step. XLA
+    reads the option when JAX starts its devices. It is added to the user's `XLA_FLAGS`, unless
+    these are empty or name it.
+
+    Raises:
+      UserError: an MJCF file does not fit the task.
+    """
+    from bounce_mjx.physics.engine import is_fused
+    from bounce_mjx.robot.model import load_model
+
+    flags = os.environ.get("XLA_FLAGS")
+    # Without a dash, it is empty on purpose or the name of a file with flags.
+    if flags is not None and (LOOPS in flags or "--" not in flags):
+        return
+    models = {(c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls) for c in configs}
+    if all(
+        is_fused(load_model(mjcf, dt, robot=robot, num_balls=balls), choice)
+        for choice, mjcf, dt, robot, balls in models
+    ):
+        os.environ["XLA_FLAGS"] = JOINED_LOOPS if flags is None else f"{flags} {JOINED_LOOPS}"

@@ -22,6 +22,8 @@ class Snapshot(NamedTuple):
     policy: Policy
     state: Any
     """Everything that is needed to continue the training; numbers of at most 32 bits."""
+    networks: dict[str, Any] | None = None
+    """What another training can start with: "params" and "statistics" of both networks."""
 
 
 def iterations_per_block(config: TrainConfig) -> int:

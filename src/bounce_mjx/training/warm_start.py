@@ -59,7 +59,7 @@ def present_start(config: TrainConfig) -> TrainConfig:
     """The config with the checkpoint that another training has put in the place of `warm_start`
     since the command line was read."""
     newer = config.warm_start and replacement(config.warm_start)
-    return config.model_copy(update={"warm_start": newer}) if newer else config
+    return config.model_copy(update={"warm_start": newer.folder}) if newer else config
 
 
 def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
