@@ -140,7 +140,7 @@ class Visits(task.Task):
         )
         return memory, {"top_speed": speed[None], "visits": measured["ball_position"][:2]}
 
-    def next_quantities(self, memory, seen, measured):
+    def next_quantities(self, memory, histories, measured):
         inside = measured["ball_position"][2] < measured["ceiling"][0]
         enters = inside & ~memory.inside[0]
         count = memory.count + jnp.where(enters, 1, 0)
@@ -148,8 +148,8 @@ class Visits(task.Task):
         change = measured["action"] - memory.inside[1]
         place = jnp.stack([count.astype(speed.dtype), change @ jnp.arange(6.0)])
         own = {
-            "top_speed": jnp.concatenate([speed[None, None], seen["top_speed"][:-1]]),
-            "visits": task.latest(seen["visits"], enters, enters | (speed > 2.0), place),
+            "top_speed": jnp.concatenate([speed[None, None], histories["top_speed"][:-1]]),
+            "visits": task.latest(histories["visits"], place, enters, enters | (speed > 2.0)),
         }
         return Memory(count, (inside, measured["action"]), {"top": speed}), own
 """

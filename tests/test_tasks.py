@@ -297,7 +297,7 @@ def test_another_class_of_the_same_file_is_another_task(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with mine.open("a") as file:
-        file.write("\n\nclass Other(Dribble):\n    pass\n")
+        file.write("\n\nclass Other(Dribble):\n    class Config(Config):\n        pass\n")
     config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
     load_run_config(create_run(config), f"{mine}:Other")
     assert "Other differs from the task that" in capsys.readouterr().err
@@ -376,6 +376,9 @@ def test_a_robot_serves_another_task() -> None:
 
 class _Thrown(rest_task.Rest):
     """The ball is thrown, and the commanded height rises."""
+
+    class Config(rest_task.Rest.Config):
+        pass
 
     num_draws = 2
 

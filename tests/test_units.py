@@ -197,7 +197,7 @@ class Mistyped(task.Task):
             return {}
         if self.wrong == "key given":
             return command | {"hieght": command["height"]}
-        return command | {"height": command["hieght" if self.wrong == "key read" else "height"]}
+        return command
 
     def step(self, state: tuple[()], step: task.Step) -> task.TaskStep:
         low, slow = step.truth.ball_position[2], step.truth.ball_velocity[2]
@@ -211,7 +211,6 @@ class Mistyped(task.Task):
     "wrong, reason",
     {
         "curve": "the curve task/error names a metric that there is not, eror; there are: error",
-        "key read": "next_command of the task Mistyped names a command that there is not, hieght",
         "key given": "next_command of the task Mistyped names a command that there is not, hieght",
         "key left out": "Mistyped lacks the command height; there are: height",
         "term": "names a term of the reward that there is not, slwo; there are: low, slow",
@@ -224,6 +223,11 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
     monkeypatch.setattr(Mistyped, "wrong", wrong)
     with pytest.raises(UserError, match=reason):
         jax.eval_shape(env.reset, jax.random.key(0))
+
+
+def test_a_task_has_its_own_config() -> None:
+    with pytest.raises(UserError, match="the task Other has no Config of its own"):
+        type("Other", (Mistyped,), {})
 
 
 # The first block

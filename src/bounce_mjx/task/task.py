@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
@@ -108,10 +109,10 @@ class Task:
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "Config" not in cls.__dict__:
-            # A config has one task, so a task that extends another one needs its own class.
-            base = cls.__base__.Config
-            doc = {"__doc__": base.__doc__, "__module__": cls.__module__}
-            cls.Config = type(f"{cls.__name__}Config", (base,), doc)
+            raise UserError(
+                f"the task {cls.__name__} has no Config of its own, and settings belong to one "
+                f"task; write a class that extends that of {cls.__base__.__name__}"
+            )
         cls.Config.task = cls
 
     def __init__(self, config: WorldConfig):
@@ -159,17 +160,17 @@ class Task:
         return (), {}
 
     def next_quantities(
-        self, memory: State, seen: Values, measured: Values
+        self, memory: State, histories: Values, measured: Values
     ) -> tuple[State, Values]:
         """What the task remembers after the measurements of a control step, and the histories of
         its own quantities.
 
         Args:
           memory: what it remembered before.
-          seen: histories [H, size] of its own quantities that the policy sees, the newest first.
+          histories: [H, size] of its own quantities that the policy sees, the newest first.
           measured: value [size] of each quantity of the world and of each command.
         """
-        return memory, seen
+        return memory, histories
 
     def tally(self, moment: Moment) -> Tally:
         """What a control step adds to the figures of its episode."""
@@ -221,14 +222,19 @@ class Task:
         return x, y, z - 0.4
 
 
-def latest(past: jax.Array, starts: jax.Array, changes: jax.Array, value: jax.Array) -> jax.Array:
-    """A history [H, size], the newest first, that moves on only where an event starts.
+def latest(
+    history: jax.Array,
+    value: jax.Array,
+    is_new: jax.Array | bool = True,
+    changes: jax.Array | bool = True,
+) -> jax.Array:
+    """A history [H, size] of one of the task's own quantities, the newest first, with its newest
+    value [size].
 
     Args:
-      starts: whether a new event starts [], bool: the older values move on by one.
-      changes: whether the newest value changes [], bool.
-      value: the newest value then [size].
+      is_new: whether the value is a new one [], bool, for which the older ones move on by one.
+      changes: whether the newest value changes at all [], bool.
     """
-    shifted = jnp.where(starts, jnp.concatenate([past[:1], past[:-1]]), past)
+    shifted = jnp.where(is_new, jnp.concatenate([history[:1], history[:-1]]), history)
     newest = jnp.where(changes, value, shifted[0])
     return jnp.concatenate([newest[None], shifted[1:]])

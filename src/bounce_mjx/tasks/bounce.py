@@ -11,6 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import pydantic
 from pydantic import Field
 
+from bounce_mjx import task
 from bounce_mjx.config.settings import (
     Ascending,
     Coordinate,
@@ -20,33 +21,6 @@ from bounce_mjx.config.settings import (
     Positive,
 )
 from bounce_mjx.lazy import jax, jnp, np
-from bounce_mjx.task import (
-    Command,
-    Curve,
-    Episodes,
-    Figure,
-    Histogram,
-    History,
-    Hits,
-    Marker,
-    Moment,
-    ObservationConfig,
-    Quantity,
-    Recording,
-    Result,
-    Start,
-    Step,
-    Tally,
-    Task,
-    TaskStep,
-    WorldConfig,
-    latest,
-    mean_and_margin,
-    mean_of_events,
-    share_of_episodes,
-    share_of_events,
-    weighted_terms,
-)
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 
 SETTLING_SECONDS = 2.0
@@ -78,26 +52,26 @@ HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
 
 
-class BounceObservation(ObservationConfig):
+class BounceObservation(task.ObservationConfig):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
-    target_height: Annotated[History, Quantity(1, "m", "command")] = 1
+    target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     """Target height."""
-    apex_error: Annotated[History, Quantity(1, "m")] = 0
+    apex_error: Annotated[task.History, task.Quantity(1, "m")] = 0
     """Highest measured ball position minus the target height, of the flights before the last
     bounces."""
-    bounce_position: Annotated[History, Quantity(2, "m")] = 0
+    bounce_position: Annotated[task.History, task.Quantity(2, "m")] = 0
     """Measured horizontal position of the ball at the lowest point of the last bounces."""
-    bounce_interval: Annotated[History, Quantity(1, "s")] = 0
+    bounce_interval: Annotated[task.History, task.Quantity(1, "s")] = 0
     """Time between the last bounces."""
-    bounce_joint_angles: Annotated[History, Quantity(None, "rad")] = 0
+    bounce_joint_angles: Annotated[task.History, task.Quantity(None, "rad")] = 0
     """Measured joint angles at the lowest points of the last bounces."""
-    bounce_joint_velocities: Annotated[History, Quantity(None, "rad/s")] = 0
+    bounce_joint_velocities: Annotated[task.History, task.Quantity(None, "rad/s")] = 0
     """Measured joint velocities at the lowest points of the last bounces."""
 
 
-class BounceConfig(WorldConfig):
+class BounceConfig(task.WorldConfig):
     """The world, and the task of bouncing: target heights, bounces, ends and reward."""
 
     target_height_range: Annotated[tuple[Length, Length], Ascending] = (0.4, 0.6)
@@ -170,10 +144,12 @@ class BounceConfig(WorldConfig):
         return math.hypot(aside, aside, top), 2.0 * math.sqrt(2.0 * 9.81 * top)
 
     @property
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, task.Command]:
         """The target height."""
         return {
-            "target_height": Command(*self.target_height_range, "m", least=1e-3, span=(0.3, 0.8))
+            "target_height": task.Command(
+                *self.target_height_range, "m", least=1e-3, span=(0.3, 0.8)
+            )
         }
 
 
@@ -201,27 +177,27 @@ class MeasuredFlight(NamedTuple):
     """Time since the first measurement near the paddle in the last bounce [], s."""
 
 
-class Bounce(Task):
+class Bounce(task.Task):
     """The ball bounces on the paddle at the commanded height."""
 
     Config = BounceConfig
     config: BounceConfig
     folder = "bounce_ball"
     curves = (
-        Curve("episode/bounces", "n_bounces", "episodes", "bounces in a row at its end"),
-        Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
-        Curve("task/ball_xy_error", "ball_xy_error"),
-        Curve("task/n_bounces", "n_bounces"),
+        task.Curve("episode/bounces", "n_bounces", "episodes", "bounces in a row at its end"),
+        task.Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
+        task.Curve("task/ball_xy_error", "ball_xy_error"),
+        task.Curve("task/n_bounces", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)
     hits = "hits"
 
-    def reset(self, start: Start) -> BounceState:
+    def reset(self, start: task.Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
         height = start.truth.ball_position[2]
         return BounceState(jnp.zeros((), bool), jnp.zeros_like(height), apex=height)
 
-    def step(self, state: BounceState, step: Step) -> TaskStep:
+    def step(self, state: BounceState, step: task.Step) -> task.TaskStep:
         """A bounce or none, the specification's reward, and whether the ball is lost."""
         target, truth, reward = step.command["target_height"], step.truth, self.config.reward
         after, bounced = self.detect(
@@ -239,9 +215,9 @@ class Bounce(Task):
             joint_velocity=truth.joint_velocities,
             home=reward,
         )
-        return TaskStep(
+        return task.TaskStep(
             state=after,
-            reward=weighted_terms(reward, inputs),
+            reward=task.weighted_terms(reward, inputs),
             ended=self.is_lost(truth.ball_position, target),
             metrics={
                 "bounced": bounced,
@@ -311,7 +287,7 @@ class Bounce(Task):
     def next_quantities(
         self,
         memory: MeasuredFlight,
-        seen: dict[str, jax.Array],
+        histories: dict[str, jax.Array],
         measured: dict[str, jax.Array],
     ) -> tuple[MeasuredFlight, dict[str, jax.Array]]:
         """A measured bounce starts when the ball is first measured near the paddle. Its position
@@ -322,11 +298,11 @@ class Bounce(Task):
         at_lowest = starts | (is_low & (height < memory.lowest))
         time = memory.time + self.config.control_dt
         new = {
-            "apex_error": (starts, memory.apex - measured["target_height"]),
-            "bounce_interval": (starts, time[None]),
-            "bounce_position": (at_lowest, measured["ball_picture"][:2]),
-            "bounce_joint_angles": (at_lowest, measured["joint_angles"]),
-            "bounce_joint_velocities": (at_lowest, measured["joint_velocities"]),
+            "apex_error": (memory.apex - measured["target_height"], starts),
+            "bounce_interval": (time[None], starts),
+            "bounce_position": (measured["ball_picture"][:2], at_lowest),
+            "bounce_joint_angles": (measured["joint_angles"], at_lowest),
+            "bounce_joint_velocities": (measured["joint_velocities"], at_lowest),
         }
         flight = MeasuredFlight(
             apex=jnp.where(is_low, height, jnp.maximum(memory.apex, height)),
@@ -334,9 +310,13 @@ class Bounce(Task):
             lowest=jnp.where(at_lowest, height, memory.lowest),
             time=jnp.where(starts, 0.0, time),
         )
-        return flight, {name: latest(past, starts, *new[name]) for name, past in seen.items()}
+        return flight, {
+            name: task.latest(history, value, is_new=starts, changes=changes)
+            for name, history in histories.items()
+            for value, changes in [new[name]]
+        }
 
-    def tally(self, moment: Moment) -> Tally:
+    def tally(self, moment: task.Moment) -> task.Tally:
         """Bounces, centred steps, apexes and the speed of the rising ball."""
         metrics = moment.metrics
         bounced = metrics["bounced"] > 0
@@ -346,7 +326,7 @@ class Bounce(Task):
         judged = bounced & (moment.command_seconds > settling)
         centred = jnp.abs(x - self.config.reward.target_x) <= MAX_X_ERROR
         accurate = metrics["apex_error"] <= MAX_APEX_ERROR
-        return Tally(
+        return task.Tally(
             sums={
                 "settled_steps": settled,
                 "centred_steps": settled & centred,
@@ -362,7 +342,7 @@ class Bounce(Task):
             maxima={"n_bounces": metrics["n_bounces"]},
         )
 
-    def results(self, episodes: Episodes) -> tuple[Result, ...]:
+    def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         """The five results of the specification."""
         sums, heights = episodes.sums, episodes.commands["target_height"]
         # Rounded, as a config has the heights of another arm with four digits.
@@ -370,27 +350,27 @@ class Bounce(Task):
         lowest, highest = (round(height + rise, 4) for height in UPWARD_SPEED_TARGETS)
         is_judged = lowest <= heights[0] and heights[1] <= highest
         return (
-            share_of_episodes(
+            task.share_of_episodes(
                 "consecutive bounces",
                 f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
                 episodes.maxima["n_bounces"] >= MIN_CONSECUTIVE_BOUNCES,
                 MIN_EPISODE_SHARE,
             ),
-            share_of_events(
+            task.share_of_events(
                 "horizontal position",
                 f"steps with |x error| <= {MAX_X_ERROR} m",
                 sums["centred_steps"],
                 sums["settled_steps"],
                 MIN_STEP_SHARE,
             ),
-            share_of_events(
+            task.share_of_events(
                 "height",
                 f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
                 sums["accurate_bounces"],
                 sums["settled_bounces"],
                 MIN_STEP_SHARE,
             ),
-            mean_of_events(
+            task.mean_of_events(
                 "upward speed",
                 "mean velocity of the rising ball, m/s",
                 sums["rising_speed"],
@@ -398,7 +378,7 @@ class Bounce(Task):
                 UPWARD_SPEED_RANGE,
                 "" if is_judged else f"targets {lowest} to {highest} only",
             ),
-            share_of_episodes(
+            task.share_of_episodes(
                 "stable",
                 f"episodes that last the full {self.config.episode_seconds:g} s",
                 episodes.lasted,
@@ -406,60 +386,49 @@ class Bounce(Task):
             ),
         )
 
-    def details(self, episodes: Episodes) -> dict[str, Figure]:
+    def details(self, episodes: task.Episodes) -> dict[str, task.Figure]:
         """The mean bounce count and apex error."""
-        error, _ = mean_and_margin(episodes.sums["apex_error"], episodes.sums["settled_bounces"])
+        error, _ = task.mean_and_margin(
+            episodes.sums["apex_error"], episodes.sums["settled_bounces"]
+        )
         return {
             "mean_consecutive_bounces": float(episodes.maxima["n_bounces"].mean()),
             "mean_apex_error_m": error,
         }
 
-    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
+    def ranking(self, episodes: task.Episodes) -> dict[str, task.Figure]:
         """The root mean square and the mean of apex minus target height."""
-        sums = {name: float(each.sum()) for name, each in episodes.sums.items()}
-        if not (count := sums["settled_bounces"]):
+        sums, bounces = episodes.sums, episodes.sums["settled_bounces"]
+        square, _ = task.mean_and_margin(sums["apex_error^2"], bounces)
+        bias, _ = task.mean_and_margin(sums["apex_offset"], bounces)
+        if square is None:
             return {"apex RMS, cm": None, "apex bias, cm": None}
-        return {
-            "apex RMS, cm": 100.0 * math.sqrt(sums["apex_error^2"] / count),
-            "apex bias, cm": 100.0 * sums["apex_offset"] / count,
-        }
+        return {"apex RMS, cm": 100.0 * math.sqrt(square), "apex bias, cm": 100.0 * bias}
 
-    def recorded(self, moment: Moment) -> dict[str, jax.Array]:
+    def recorded(self, moment: task.Moment) -> dict[str, jax.Array]:
         """Bounces, and the apex so far."""
         return {"bounced": moment.metrics["bounced"], "apex": moment.state.apex}
 
-    def plots(self, recording: Recording) -> tuple[Histogram | Hits, ...]:
+    def plots(self, recording: task.Recording) -> tuple[task.Histogram | task.Hits, ...]:
         """Apex errors, and where the ball hits the paddle."""
         apex = np.roll(recording.task["apex"], 1, axis=0)
         bounces = (recording.task["bounced"] > 0) & recording.running
         bounces[: max(1, round(SETTLING_SECONDS / self.config.control_dt))] = False
         errors = (apex - recording.command["target_height"])[bounces]
         return (
-            Histogram(
+            task.Histogram(
                 "apex minus target height, cm", "bounces", 100.0 * errors, 100.0 * MAX_APEX_ERROR
             ),
-            Hits("hits on the paddle, cm", bounces),
+            task.Hits("hits on the paddle, cm", bounces),
         )
 
-    def markers(self, command: dict[str, float], metrics: Any) -> tuple[Marker, ...]:
+    def markers(self, command: dict[str, float], metrics: Any) -> tuple[task.Marker, ...]:
         """A disc at the target height, and the outline of the paddle's home."""
-        reward = self.config.reward
-        x, y = reward.target_x, reward.target_y
+        target = (*self.focus()[:2], command["target_height"])
+        green, blue = (0.15, 0.9, 0.3, 0.4), (0.15, 0.45, 1.0, 0.9)
         return (
-            Marker(
-                "target_height",
-                (x, y, command["target_height"]),
-                (0.05, 0.001, 0.0),
-                (0.15, 0.9, 0.3, 0.4),
-                "cylinder",
-            ),
-            Marker(
-                "paddle_home",
-                (x, y, reward.paddle_home_height),
-                (0.05, 0.065, 0.001),
-                (0.15, 0.45, 1.0, 0.9),
-                "frame",
-            ),
+            task.Marker("target_height", target, (0.05, 0.001, 0.0), green, "cylinder"),
+            task.Marker("paddle_home", self.focus(), (0.05, 0.065, 0.001), blue, "frame"),
         )
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:

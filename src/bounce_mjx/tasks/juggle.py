@@ -164,9 +164,11 @@ class Juggle(task.Task):
         )
         return (), {"next_ball": _next(jnp.concatenate(parts, axis=1), fall)}
 
-    def next_quantities(self, memory: Any, seen: Any, measured: Any) -> tuple[Any, task.Values]:
+    def next_quantities(
+        self, memory: Any, histories: Any, measured: Any
+    ) -> tuple[Any, task.Values]:
         newest = self.first_quantities(measured)[1]
-        return (), {n: task.latest(h, True, True, newest[n]) for n, h in seen.items()}
+        return (), {name: task.latest(h, newest[name]) for name, h in histories.items()}
 
     def tally(self, moment: task.Moment) -> task.Tally:
         metrics, settled = moment.metrics, moment.command_seconds > SETTLING

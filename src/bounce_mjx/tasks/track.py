@@ -11,7 +11,6 @@ from bounce_mjx import task
 from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks import paths
-from bounce_mjx.world.config import ActionConfig
 
 REST = 0.0225
 """Height of the ball's centre over the paddle's while they touch, m."""
@@ -69,7 +68,7 @@ class Config(task.WorldConfig):
     """Radius of the circle, half the length of the line and of the figure of eight, m."""
     max_distance: Length = 0.7
     """The episode ends when the ball is this far from the point, or lower than home, m."""
-    action: ActionConfig = ActionConfig(base="target")
+    action: task.ActionConfig = task.ActionConfig(base="target")
     observation: Observation = Observation()
     """The quantities that the policy sees."""
     reward: Rewards = Rewards()
@@ -148,10 +147,10 @@ class Track(task.Task):
 
     def first_quantities(self, measured: dict[str, jax.Array]) -> Any:
         memory = paths.point(measured)[:2, 0], jnp.zeros_like(measured["ball_position"][:2])
-        memory, seen = self.next_quantities(memory, {"aim": memory[1][None]}, measured)
-        return memory, {"aim": seen["aim"][0]}
+        memory, histories = self.next_quantities(memory, {"aim": memory[1][None]}, measured)
+        return memory, {"aim": histories["aim"][0]}
 
-    def next_quantities(self, memory: Any, seen: Any, measured: dict[str, jax.Array]) -> Any:
+    def next_quantities(self, memory: Any, histories: Any, measured: dict[str, jax.Array]) -> Any:
         """It remembers the point [2] and its velocity [2]."""
 
         def rate(change: jax.Array, limit: float) -> jax.Array:
@@ -164,8 +163,8 @@ class Track(task.Task):
         velocity = rate(target[:2] - memory[0], JUMP_SPEED)
         acceleration = rate(velocity - memory[1], JUMP_ACCELERATION)
         then = target[:2] + time * velocity + 0.5 * jnp.square(time) * acceleration
-        aims = {n: task.latest(h, True, True, then - flight.end[:2]) for n, h in seen.items()}
-        return (target[:2], velocity), aims
+        aim = then - flight.end[:2]
+        return (target[:2], velocity), {n: task.latest(h, aim) for n, h in histories.items()}
 
     def tally(self, moment: task.Moment) -> task.Tally:
         error, command = moment.metrics["error"], moment.command
