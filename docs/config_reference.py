@@ -84,7 +84,7 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         kind = "" if "enum" in plain else _type(plain)
         is_list = "array" in {option.get("type") for option in plain.get("anyOf", [plain])}
         terms = [mark for mark in field.metadata if isinstance(mark, Term)]
-        span = "each {:g} to {:g}".format(*terms[0].limits) if terms else _range(plain)
+        span = "each {:g} to {:g}".format(*terms[0].bounds) if terms else _range(plain)
         value = (", " if is_list else " ").join(part for part in (kind, span) if part)
         value += f" ({unit})" if unit else ""
         cells = f"`{name}`", value, _default(plain.get("default")), text

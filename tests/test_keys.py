@@ -104,7 +104,7 @@ def other(key: str) -> Any:
     if key in VALUES:
         return VALUES[key]
     for term in (mark for mark in field.metadata if isinstance(mark, Term)):
-        low, high = max(term.limits[0], -0.1), min(term.limits[1], 0.9)
+        low, high = max(term.bounds[0], -0.1), min(term.bounds[1], 0.9)
         return [0.5 * (low + high), high]
     if isinstance(value, bool):
         return not value

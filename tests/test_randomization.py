@@ -45,8 +45,8 @@ from test_ppo import TwoStates, two_state_config
 # Draws
 
 
-HIGH = {name: min(term.limits[1], 0.9) for name, term in TERMS.items()}
-RANGES = {name: (max(TERMS[name].limits[0], high - 0.1), high) for name, high in HIGH.items()}
+HIGH = {name: min(term.bounds[1], 0.9) for name, term in TERMS.items()}
+RANGES = {name: (max(TERMS[name].bounds[0], high - 0.1), high) for name, high in HIGH.items()}
 RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
 RANGES |= {"restitution_slope": (0.02, 0.05)}
 

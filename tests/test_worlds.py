@@ -187,8 +187,8 @@ def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:
             zip(nominal.ranges[term], condition.ranges[term], strict=True)
         ):
             expected = min(
-                max(model + 2 * (before.flat[0] - model), TERMS[term].limits[0]),
-                TERMS[term].limits[1],
+                max(model + 2 * (before.flat[0] - model), TERMS[term].bounds[0]),
+                TERMS[term].bounds[1],
             )
             assert after.flat[0] == pytest.approx(expected), (key, end)
         unchanged = condition.ranges.keys() - {term}

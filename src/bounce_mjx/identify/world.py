@@ -101,7 +101,7 @@ def _range(name: str, entries: Sequence[Estimate]) -> list[Any]:
 
 def _clipped(name: str, ends: Any) -> list[Any]:
     """A range [2], or [2, entries], within the term's limits, for YAML."""
-    least, greatest = TERMS[name].limits
+    least, greatest = TERMS[name].bounds
     ends = np.clip(ends, max(least, -1e6), min(greatest, 1e6))
     return np.vectorize(lambda x: float(f"{x:.4g}"))(ends).tolist()
 

@@ -33,7 +33,8 @@ class Impact(NamedTuple):
 
 
 def first_impact(world: World, mj_model: mujoco.MjModel) -> Impact | None:
-    """The impact of a reset; None if the drawn restitution does not depend on the speed."""
+    """What the damping depends on after a reset; None if the drawn restitution is the same at all
+    speeds."""
     if "restitution_slope" not in world:
         return None
     stiffness, _ = direct_solref(mj_model)
@@ -50,7 +51,7 @@ def next_impact(
     qpos: jax.Array,
     truth: Kinematics,
 ) -> Impact:
-    """The impact after a control step, or after a reset, which ended at qpos [nq]."""
+    """What the damping depends on after a control step or a reset that ended at qpos [nq]."""
     addresses = find_addresses(mj_model)
     moving = [jnp.zeros_like(qpos[0])] * mj_model.nq
     for i, address in enumerate(addresses.arm_qpos):

@@ -148,7 +148,7 @@ def _doubled(key: str, value: Any) -> Any:
     group, _, name = key.rpartition(".")
     factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
     if group == "randomization":
-        nominal, (least, most) = TERMS[name].nominal, TERMS[name].limits
+        nominal, (least, most) = TERMS[name].nominal, TERMS[name].bounds
         factor, centre = (0.5, 0.0) if nominal is None else (2.0, nominal)
     elif group == "robot.limits":
         factor = 0.5

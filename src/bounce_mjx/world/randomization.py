@@ -97,7 +97,7 @@ class Term(NamedTuple):
     nominal: float | None
     """Value without randomisation, from which the range grows during the warm-up; None for a range
     that does not grow."""
-    limits: tuple[float, float]
+    bounds: tuple[float, float]
     """Smallest and largest sensible value."""
     parameter: str | None = None
     """The field of `PhysicsParameters` that it changes."""

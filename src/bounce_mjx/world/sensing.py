@@ -29,7 +29,7 @@ _TERMS = frozenset(
 _PADDLE_TERMS = frozenset("encoder_bias joint_angle_noise paddle_offset paddle_tilt".split())
 """Terms that make the forward kinematics of the measured joint angles differ from the truth."""
 
-# Age, s, and number of pictures, of one that no control step can have.
+# No picture of an episode is as old as this, s, or has a number as low as its negative.
 _LONG_AGO = 1e6
 
 

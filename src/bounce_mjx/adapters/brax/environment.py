@@ -19,7 +19,6 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
@@ -135,11 +134,10 @@ class BraxBounceBall(brax.envs.Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
-        task_state = state.pipeline_state.task
-        if task_state.parameters is None:
-            # TorchRL drops the parts of a state that hold no arrays.
-            task_state = task_state._replace(parameters=PhysicsParameters())
-        plain = state.replace(pipeline_state=task_state)
+        now = state.pipeline_state.task
+        # TorchRL drops the parts of a state that hold no arrays.
+        empty = {n: x for n, x in EnvState._field_defaults.items() if getattr(now, n) is None}
+        plain = state.replace(pipeline_state=now._replace(**empty))
         return self._to_brax(self.task.step(plain, action))
 
     def _to_brax(self, state: State) -> State:
