@@ -1,5 +1,5 @@
-"""Files and folders in which someone else may have had a hand: they are read with a limit, and
-nothing is written through a link."""
+"""Files and folders that other people may have changed: reading has a limit, and nothing is written
+through a link."""
 
 import contextlib
 import errno

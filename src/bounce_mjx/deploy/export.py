@@ -99,7 +99,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
         servo, or a command has the name of a measurement.
     """
-    env = config.env
+    env, limits = config.env, config.env.robot.limits
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
             f"the command {min(taken)} has the name of a measurement; give it another name in "
@@ -122,10 +122,12 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         velocity=env.observation.velocity,
         estimator=None,
         control_dt=env.control_dt,
-        action=_ACTION if env.robot.limits.velocity is None else _ACTION + _LIMITED,
+        action=_ACTION if limits.velocity is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
-        limits=_limits(env),
+        limits=None
+        if limits.velocity is None
+        else CommandLimits(limits.velocity, limits.acceleration, limits.jerk),
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
@@ -151,14 +153,6 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
     )
-
-
-def _limits(env: WorldConfig) -> CommandLimits | None:
-    """The limits of the commands, None without."""
-    limits = env.robot.limits
-    if limits.velocity is None:
-        return None
-    return CommandLimits(limits.velocity, limits.acceleration, limits.jerk)
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
@@ -217,10 +211,6 @@ def _network(config: TrainConfig, policy: Policy) -> Callable[[dict[str, jax.Arr
     )
 
 
-def _histories(env: WorldConfig) -> dict[str, jax.ShapeDtypeStruct]:
-    return {part.name: _floats(part.history, part.size) for part in _inputs(env)}
-
-
 def _floats(*shape: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.float32)
 
@@ -231,8 +221,9 @@ def _control_step(
     """A control step as a function of named arrays, and their shapes: the action, and what the task
     remembers of the measurements, as the environment computes it."""
     task, own = env.task(env), env.observation.lengths("task")
+    inputs = {part.name: _floats(part.history, part.size) for part in _inputs(env)}
     if not own:
-        return lambda given: {"action": network(given)}, _histories(env)
+        return lambda given: {"action": network(given)}, inputs
     rows = (env.num_balls,) if env.num_balls > 1 else ()
     measured = {
         name: _floats(*(rows if quantity.per_ball else ()), quantity.entries(env.num_joints, 1))
@@ -262,5 +253,5 @@ def _control_step(
         action = {"action": network(given | seen)}
         return action | {f"{NEXT}{name}": value for name, value in kept.items()}
 
-    inputs = _histories(env) | {f"{MEASURED}{n}": _floats(x.size) for n, x in measured.items()}
+    inputs |= {f"{MEASURED}{n}": _floats(x.size) for n, x in measured.items()}
     return control_step, inputs | memory | {IS_FIRST: jax.ShapeDtypeStruct((), bool)}

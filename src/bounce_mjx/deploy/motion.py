@@ -61,7 +61,7 @@ class Motion:
         return not (np.any(self._end.velocity) or np.any(self._end.acceleration))
 
     def aim(self, target: np.ndarray) -> None:
-        """Wishes the joints at a target [J] at the end of the control step."""
+        """Moves the joints toward a target [J], to be there at the end of the control step."""
         # An arm beyond its range comes back by its own speed.
         low, high = np.minimum(self._low, self.position), np.maximum(self._high, self.position)
         target = np.clip(target, low, high)

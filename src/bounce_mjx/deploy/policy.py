@@ -231,7 +231,7 @@ class DeployedPolicy:
         return Supervisor(self, rate, **settings)
 
     def _act(self, action: np.ndarray) -> None:
-        """Aims the commands of the control step where an action [J] wishes."""
+        """Aims the commands of the control step at the targets of an action [J]."""
         base, lead = self._measured["joint_angles"], self.metadata.max_lead
         if lead is not None:
             base = np.clip(self._motion.position, base - lead, base + lead)
