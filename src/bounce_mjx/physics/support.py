@@ -18,7 +18,7 @@ Feature = tuple[str, str, bool]
 """The engines that lack a feature, its name, and whether a model has it."""
 
 _FUSED, _MJX, _BOTH = "fused", "mjx", "fused mjx"
-_INTEGRATORS = {"fused": ("implicitfast", "euler"), "mjx": ("euler", "rk4", "implicitfast")}
+_INTEGRATORS = {"fused": ("implicitfast", "Euler"), "mjx": ("Euler", "RK4", "implicitfast")}
 # MJCF flags that `fused.read_model` obeys, or without effect on the supported models.
 _HARMLESS_DISABLED = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
@@ -59,7 +59,8 @@ def _options(m: mujoco.MjModel) -> Iterator[Feature]:
     integrator = mujoco.mjtIntegrator(m.opt.integrator).name.removeprefix("mjINT_").lower()
     for engine, known in _INTEGRATORS.items():
         only = f"only {', '.join(known[:-1])} and {known[-1]}"
-        yield engine, f"the integrator {integrator} ({only})", integrator not in known
+        lacking = integrator not in [name.lower() for name in known]
+        yield engine, f"the integrator {integrator} ({only})", lacking
     disabled = _flags(m.opt.disableflags, mujoco.mjtDisableBit) - _HARMLESS_DISABLED
     enabled = _flags(m.opt.enableflags, mujoco.mjtEnableBit)
     ignored = enabled - _HARMLESS_ENABLED
