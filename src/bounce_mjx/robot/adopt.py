@@ -17,7 +17,7 @@ from bounce_mjx.robot.arm import (
     locate,
 )
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.model import find_addresses, named
+from bounce_mjx.robot.model import find_addresses, name_file
 from bounce_mjx.robot.pose import Mount, PaddlePose, find_pose, mounts
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
@@ -80,7 +80,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
         return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
     except UserError as error:
-        raise named(path, error) from error
+        raise name_file(path, error) from error
 
 
 def _servos(
@@ -105,7 +105,7 @@ def _servos(
             and np.all(stiffness * scale >= _LEAST_HOLD * np.abs(pose.holding))
         )
         if suits:
-            return tuple(own), _rounded(scale), True
+            return tuple(own), _four_digits(scale), True
     # Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes
     # to rest, and physics steps of a fifth of it are stable.
     frequency = 1.0 / control_dt
@@ -114,8 +114,8 @@ def _servos(
     stiffness = damping * speed / scale
     limits = arm.force_limits
     made = zip(stiffness, damping, limits, strict=True)
-    servos = tuple(ServoSettings(_rounded(k), _rounded(d), limit) for k, d, limit in made)
-    return servos, _rounded(scale), False
+    servos = tuple(ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made)
+    return servos, _four_digits(scale), False
 
 
 def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
@@ -143,6 +143,6 @@ def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
             )
 
 
-def _rounded(value: float) -> float:
+def _four_digits(value: float) -> float:
     """The value with four digits."""
     return float(f"{value:.4g}")

@@ -144,7 +144,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
       UserError: the file is no MJCF.
     """
     try:
-        with _silent():
+        with _silence():
             return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise _not_compiled(path, error) from error
@@ -157,7 +157,7 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
       UserError: the file does not compile.
     """
     try:
-        with _silent():
+        with _silence():
             return spec.compile()
     except ValueError as error:
         raise _not_compiled(path, error) from error
@@ -188,7 +188,7 @@ def _other_sites(model: mujoco.MjModel) -> str:
     names += [model.body(i).name for i in range(1, model.nbody) if is_led(i)]
     if not any(names):
         return f"give an arm with a named site or body beyond at least {MIN_JOINTS} joints"
-    return f"give --site one of the sites and bodies {_listed(names, 80)}"
+    return f"give --site one of the sites and bodies {_list(names, 80)}"
 
 
 class _Builder:
@@ -239,11 +239,11 @@ class _Builder:
             if name not in names:
                 raise UserError(
                     f"no joint {shorten(name)} on the way to {site}; the joints there are "
-                    f"{_listed(names)}"
+                    f"{_list(names)}"
                 )
         acting = [j for name, j in names.items() if given is None or name in given]
         if len(acting) < MIN_JOINTS:
-            have = _listed(joint_name(model, j) for j in acting) if acting else "none"
+            have = _list(joint_name(model, j) for j in acting) if acting else "none"
             remedy = _other_sites(model) if given is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
@@ -264,7 +264,7 @@ class _Builder:
         idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator on {_listed(idle)}; add one, or name the acting joints with --joints"
+                f"no actuator on {_list(idle)}; add one, or name the acting joints with --joints"
             )
         return actuators
 
@@ -291,8 +291,8 @@ class _Builder:
         ]
         if beside:
             raise UserError(
-                f"{len(beside)} driven joints ({_listed(beside)}) in addition to the arm "
-                f"{_listed(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
+                f"{len(beside)} driven joints ({_list(beside)}) in addition to the arm "
+                f"{_list(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
                 "one arm on a fixed base"
             )
         return [b for b in branches if any(is_below(model, body, [b]) for body in bodies)]
@@ -379,9 +379,7 @@ class _Builder:
                 control = model.actuator_ctrladr[a]
                 drive.inheritrange, drive.ctrlrange = 0.0, model.actuator_ctrlrange[control]
         if narrowed:
-            self._changes.append(
-                f"narrowed the ranges to what the servos reach: {_listed(narrowed)}"
-            )
+            self._changes.append(f"narrowed the ranges to what the servos reach: {_list(narrowed)}")
 
     def _strip(
         self,
@@ -413,7 +411,7 @@ class _Builder:
             ("removed the loose objects ", objects),
         ):
             if removed:
-                names = _listed(model.body(b).name or f"body {b}" for b in removed)
+                names = _list(model.body(b).name or f"body {b}" for b in removed)
                 self._changes.append(words + names)
         fixed = [
             j
@@ -421,7 +419,7 @@ class _Builder:
             if j not in joints and not is_below(model, int(body), gripper + objects)
         ]
         if fixed:
-            names = _listed(joint_name(model, j) for j in fixed)
+            names = _list(joint_name(model, j) for j in fixed)
             self._changes.append(f"fixed the joints that do not act: {names}")
         for element in [parts[j] for j in fixed] + [bodies[b] for b in gripper + objects]:
             arm.delete(element)
@@ -432,7 +430,7 @@ class _Builder:
         for element in elements:
             self._arm.delete(element)
         if elements:
-            named = f": {_listed(names)}" if any(names) else ""
+            named = f": {_list(names)}" if any(names) else ""
             self._changes.append(f"removed the {nouns} ({len(elements)}{named})")
 
     def _disable_contacts_and_limits(self, joints: list[int]) -> None:
@@ -451,29 +449,22 @@ class _Builder:
             self._changes.append("made the joint limits act by clipping the servo targets")
 
     def _attach(self, holder: str, position: np.ndarray, quaternion: np.ndarray) -> mujoco.MjSpec:
-        """The scene with the arm, the paddle on the body `holder`, and their contact pair."""
+        """The scene with the arm, and the paddle on the body `holder`."""
         config, arm = self._config, self._arm
         scene = read_spec(resource_path("mjcf/scene.xml"))
-        differing = _differing_options(self._model.opt, scene.option)
+        differing = _option_differences(self._model.opt, scene.option)
         if differing:
             names = ", ".join(differing)
             self._changes.append(f"replaced the physics options with the task's ({names})")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
         arm.option = scene.option
-        with _silent():
+        with _silence():
             scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
         paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config, scene.default)
         ball = scene.geom("ball")
         ball.size[0], ball.mass = config.ball.radius, config.ball.mass
-        scene.add_pair(
-            geomname1=PADDLE_GEOM_NAME,
-            geomname2="ball",
-            condim=1,
-            solref=[-98696, -31.4],
-            solimp=[0.95, 0.99, 0.001, 0.5, 2],
-        )
         size = " x ".join(f"{200 * h:.3g}" for h in config.paddle.half_size)
         self._changes.append(
             f"added a paddle of {size} cm and {config.paddle.mass:g} kg at {config.site}, and a "
@@ -488,7 +479,7 @@ class _Builder:
             return
         if len(config.servo_stiffness) != len(names):
             raise UserError(
-                f"{len(names)} acting joints ({_listed(names)}), but servo_stiffness has "
+                f"{len(names)} acting joints ({_list(names)}), but servo_stiffness has "
                 f"{len(config.servo_stiffness)} numbers; give one for each joint"
             )
         for actuator in list(scene.actuators):
@@ -673,7 +664,7 @@ def raise_solver_limits(option: mujoco.MjOption) -> None:
     option.ls_iterations = max(option.ls_iterations, default.ls_iterations)
 
 
-def _differing_options(given: mujoco.MjOption, task: mujoco.MjOption) -> list[str]:
+def _option_differences(given: mujoco.MjOption, task: mujoco.MjOption) -> list[str]:
     """Names of the options of a file that differ from the task's."""
     names = [name for name in dir(task) if not name.startswith("_")]
     return [n for n in names if not np.array_equal(getattr(given, n), getattr(task, n))]
@@ -684,7 +675,7 @@ def joint_name(model: mujoco.MjModel, joint: int) -> str:
     return model.joint(joint).name or f"joint{joint}"
 
 
-def _listed(names: Iterable[str], most: int = 8) -> str:
+def _list(names: Iterable[str], most: int = 8) -> str:
     """Names with commas; a long list is cut."""
     names = [name for name in names if name]
     more = f" and {len(names) - most} more" if len(names) > most else ""
@@ -697,7 +688,7 @@ def _not_compiled(path: Path, error: ValueError) -> UserError:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def _silence() -> Iterator[None]:
     """Without MuJoCo's warnings, which it also writes to a file: of the empty prefix of an attached
     arm, and of meshes."""
     with warnings.catch_warnings():

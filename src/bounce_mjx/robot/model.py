@@ -98,10 +98,10 @@ def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Pa
     try:
         return build_arm(path, robot).spec, path
     except UserError as error:
-        raise named(path, error) from error
+        raise name_file(path, error) from error
 
 
-def named(path: Path, error: UserError) -> UserError:
+def name_file(path: Path, error: UserError) -> UserError:
     """The error with the file's name, if it is missing."""
     return error if str(path) in str(error) else UserError(f"the MJCF file {path} has {error}")
 
@@ -141,7 +141,7 @@ def load_model(
         _check_balls(len(addresses.balls), num_balls)
         _limit_torques(mj_model, addresses, robot or RobotConfig())
     except UserError as error:
-        raise named(path, error) from error
+        raise name_file(path, error) from error
     mj_model.opt.timestep = physics_dt
     _check_step(mj_model)
     return mj_model

@@ -132,7 +132,7 @@ class _Search:
             self._mount(choice)
             for angles in self._level_poses(reach):
                 level += 1
-                pose = self._judged(angles, choice, reach)
+                pose = self._rate(angles, choice, reach)
                 if pose is not None:
                     poses.append(pose)
         if not level:
@@ -200,11 +200,11 @@ class _Search:
             for height in heights:
                 goal = np.array([self._base[0] + distance, self._base[1], height])
                 for _ in range(_TRIES):
-                    angles = self._solved(self._rng.uniform(*self._seeds), goal)
+                    angles = self._solve(self._rng.uniform(*self._seeds), goal)
                     if angles is not None:
                         yield angles
 
-    def _solved(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+    def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """The pose near the goal with a level paddle; None if the search finds none."""
 
         def error(angles: np.ndarray, rows: slice) -> np.ndarray:
@@ -240,7 +240,7 @@ class _Search:
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
         return angles if in_front and paddle[2] > 0.03 else None
 
-    def _judged(self, angles: np.ndarray, choice: Mount, reach: float) -> PaddlePose | None:
+    def _rate(self, angles: np.ndarray, choice: Mount, reach: float) -> PaddlePose | None:
         """The pose with its score; None if the arm is in the way of the ball or in the floor."""
         paddle, _ = self._forward(angles)
         if not self._is_clear(paddle):

@@ -78,8 +78,10 @@ def next_setpoint(
     least, most = -limits.velocity, limits.velocity
     if limits.range is not None:
         low, high = limits.range
-        most = xp.minimum(most, _stoppable(high - position, velocity, limits, duration, xp))
-        least = xp.maximum(least, -_stoppable(position - low, -velocity, limits, duration, xp))
+        most = xp.minimum(most, _stopping_velocity(high - position, velocity, limits, duration, xp))
+        least = xp.maximum(
+            least, -_stopping_velocity(position - low, -velocity, limits, duration, xp)
+        )
     change = limits.acceleration * duration
     after = xp.clip(asked, least, most)
     after = xp.clip(after, velocity - change, velocity + change)
@@ -88,7 +90,7 @@ def next_setpoint(
     )
 
 
-def _stoppable(
+def _stopping_velocity(
     room: Number, velocity: Number, limits: JointLimits, duration: float, xp: ModuleType
 ) -> Number:
     """Highest velocity at the end of a step from which a command can stop within the `room` (rad)
