@@ -30,13 +30,13 @@ from bounce_mjx.evaluation.config import (
     on_engine,
 )
 from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
-from bounce_mjx.evaluation.results import episodes_of
 from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_conditions
 from bounce_mjx.evaluation.suite import load_suite, neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.folders import Checkpoint, runs_in, runs_of_seeds
 from bounce_mjx.runs.reading import read_actor
+from bounce_mjx.task.results import Episodes
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -156,7 +156,9 @@ def measure_nominal(
         if not np.any(now.statistics.running & (counted < MOST_HITS)):
             break
     figures = {"hits": float(np.median(counted))} if hits else {}
-    return figures | env.task.ranking(episodes_of(env, statistics, commands))
+    tally, spans = statistics.tally, {n: (c.low, c.high) for n, c in env.config.commands.items()}
+    episodes = Episodes(tally.sums, tally.maxima, statistics.running, spans | commands)
+    return figures | env.task.ranking(episodes)
 
 
 def table(rows: dict[str, list[Figures]]) -> str:

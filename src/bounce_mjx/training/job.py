@@ -95,7 +95,6 @@ def train(
     make_trainer: Callable[[TrainConfig, Env], Trainer],
     options: Options,
     watcher: Watcher | None = None,
-    prog: str = PROG,
     make_evaluators: Callable[..., Evaluators] = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
@@ -103,7 +102,6 @@ def train(
     Args:
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
       watcher: receives the progress of the first seed.
-      prog: the user's command, to which `--resume` may be added.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
 
     Raises:
@@ -118,7 +116,7 @@ def train(
     hosts.agree(config, options.resume)
     config = in_whole_blocks(config)
     with contextlib.ExitStack() as stack:
-        job = _Job(config, console, make_trainer, make_evaluators, options, stack, watcher, prog)
+        job = _Job(config, console, make_trainer, make_evaluators, options, stack, watcher)
         job.open()
         job.announce()
         try:
@@ -147,11 +145,10 @@ class _Job:
         options: Options,
         stack: contextlib.ExitStack,
         watcher: Watcher | None = None,
-        prog: str = PROG,
     ):
         """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.options, self.stack = config, console, options, stack
-        self.make_evaluators, self.watcher, self.prog = make_evaluators, watcher, prog
+        self.make_evaluators, self.watcher = make_evaluators, watcher
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.resumed = options.resume is not None
@@ -202,7 +199,7 @@ class _Job:
     @property
     def _go_on(self) -> str:
         flags = [*named_task(self.config), "--resume", str(self.run)]
-        return f"continue with: {self.prog} {shlex.join(flags)}"
+        return f"continue with: {PROG} {shlex.join(flags)}"
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
