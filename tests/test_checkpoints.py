@@ -147,6 +147,19 @@ def test_orbax_alone_reads_a_policy_of_the_package(name: str) -> None:
     assert_read_by_orbax(checkpoint.folder, policy)
 
 
+def test_a_policy_of_an_older_version_is_written_anew(tmp_path: Path, monkeypatch) -> None:
+    tests = Path(__file__).parent
+    monkeypatch.syspath_prepend(str(tests.parent / "benchmarks"))
+    from rewrite_policies import rewrite
+
+    run = shutil.copytree(tests / "releases/0.1.0", tmp_path / "run")
+    assert is_old(find_checkpoint(run).folder)
+    policy = read_policy(find_checkpoint(run), load_run_config(run))
+    rewrite(run)
+    assert_identical(read_policy(find_checkpoint(run), load_run_config(run)), policy)
+    assert_read_by_orbax(find_checkpoint(run).folder, policy)
+
+
 def test_the_latest_and_the_best_checkpoint_are_kept(tmp_path: Path, state) -> None:
     """Each save opens the folder anew, as after a restart."""
     run, items = create_run(CONFIG.model_copy(update={"log_dir": tmp_path})), items_of(state)
