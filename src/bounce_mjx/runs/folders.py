@@ -206,7 +206,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
     if place == Path(os.path.abspath(run)):
         run = _best_seed(run)
         place = Path(os.path.abspath(run))
-    inside = [x for x in stored_checkpoints(run) if x.folder.absolute().is_relative_to(place)]
+    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
     return _first_of(_by_quality(inside), path)
 
 
@@ -273,7 +273,7 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
 
 def stored_checkpoints(run: Path) -> list[Checkpoint]:
     """Checkpoints of a run."""
-    folder, paths = run / CHECKPOINTS, []
+    folder, paths = (run / CHECKPOINTS).absolute(), []
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
