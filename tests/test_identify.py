@@ -12,13 +12,13 @@ from scipy.signal import lfilter
 from bounce_mjx.commands.main import main
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log, read_csv
-from bounce_mjx.identify.simulation import Predicted, _Targets
+from bounce_mjx.identify.simulation import Predicted, make_targets
 from bounce_mjx.identify.stages import (
     Identified,
-    _beside,
+    _align_frame,
     _Search,
     identify,
-    joined,
+    join,
     sensor_noise,
 )
 from bounce_mjx.identify.unknowns import Layout, make_layout
@@ -123,7 +123,7 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     log = flight_log(1.0)
     log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
     w = windows_of(log)
-    found = _Targets(log, w, 0.001)(latency, lag)
+    found = make_targets(log, w, 0.001)(latency, lag)
     fine = np.arange(0.0, 0.5, 1e-5) + 0.5e-5
     index = np.searchsorted(log.target_times, fine - latency, side="right") - 1
     late = log.servo_targets[np.maximum(index, 0)]
@@ -136,7 +136,7 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
 
 
 @pytest.mark.parametrize("latency, lag", [(0.03, 0.0), (0.012, 0.0007), (0.0, 0.02)])
-def test_entries_of_latency_and_lag_are_the_delay_and_its_variance(latency, lag) -> None:
+def test_the_vector_has_the_delay_of_latency_and_lag_and_its_variance(latency, lag) -> None:
     """Against the moments of the filter's answer to an impulse."""
     layout, dt = make_layout(6, True, 0.001), 0.001
     vector = layout.vector({"action_latency": latency, "servo_lag": lag})
@@ -145,9 +145,9 @@ def test_entries_of_latency_and_lag_are_the_delay_and_its_variance(latency, lag)
     answer = share * (1.0 - share) ** np.arange(2000)
     mean = answer @ times
     places = layout.slices()
-    np.testing.assert_allclose(vector[places["action_latency"]], latency + mean, atol=1e-9)
+    np.testing.assert_allclose(vector[places["delay"]], latency + mean, atol=1e-9)
     variance = answer @ (times - mean) ** 2
-    np.testing.assert_allclose(vector[places["servo_lag"]], variance, atol=1e-11)
+    np.testing.assert_allclose(vector[places["delay_variance"]], variance, atol=1e-11)
     world = layout.world(vector)
     assert abs(world["action_latency"] - latency) < 1e-6
     assert abs(world["servo_lag"] - lag) < 6e-5
@@ -161,7 +161,7 @@ def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
     s = int(np.flatnonzero(w.has_ball)[0])
     eye = np.zeros((3 * count, *weights.shape))
     eye[np.arange(3 * count), s, -3 * count + np.arange(3 * count)] = 1.0
-    whitening = problem.whitened(eye, weights)[:, s, -3 * count :].T
+    whitening = problem.whiten(eye, weights)[:, s, -3 * count :].T
     after = np.maximum(w.picture_times[s] - w.bounces[s], 0.0) * w.picture_weights[s]
     covariance = np.diag(np.repeat(w.picture_weights[s], 3))
     for axis, deviation in enumerate((0.02, 0.02, 0.1)):
@@ -174,14 +174,14 @@ def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
 
 def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     """Windows in which the angles follow the start, and by random shapes two unknowns: that of
-    action_latency in all joints, and of servo_gain each in its own."""
+    delay in all joints, and of servo_gain each in its own."""
     w, layout = windows_of(log), make_layout(6, True, 0.001)
     places, shape = layout.slices(), w.angles.shape
     late, gain = random.normal(size=(2, *shape))
     ramp = w.angle_times[:, :, None]
 
     def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
-        by_late = 0.1 * vectors[:, places["action_latency"]][:, :, None, None] * late * ramp
+        by_late = 0.1 * vectors[:, places["delay"]][:, :, None, None] * late * ramp
         by_gain = 1e-2 * vectors[:, None, None, places["servo_gain"]] * gain * ramp
         balls = np.broadcast_to(w.balls, (len(vectors), *w.balls.shape))
         return Predicted(starts[:, :, None, :6] + by_late + by_gain, balls)
@@ -197,9 +197,11 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     problem = linear_problem(flight_log(20.0), random)
     layout, w = problem.layout, problem.windows
     truth, weights = layout.mean, problem.weights(pictures=0.0)
-    free, place = layout.free(["arm"]), layout.slices()["action_latency"].start
-    clean = problem.at(truth, w.starts).angles
-    along = problem.at(truth + 0.02 * (np.arange(len(truth)) == place), w.starts).angles - clean
+    free, place = layout.free(["arm"]), layout.slices()["delay"].start
+    clean = problem.predict(truth, w.starts).angles
+    along = (
+        problem.predict(truth + 0.02 * (np.arange(len(truth)) == place), w.starts).angles - clean
+    )
     estimates, deviations, independent = [], [], []
     for _ in range(40):
         common = random.normal(size=(len(w.first), 1, 1))
@@ -228,9 +230,9 @@ def test_noise_of_derivatives_is_no_information() -> None:
             angles=clean.angles + 1.5e-5 * changed * random.normal(size=clean.angles.shape)
         )
 
-    weights, clean = problem.weights(pictures=0.0), problem.at(layout.mean, w.starts).angles
+    weights, clean = problem.weights(pictures=0.0), problem.predict(layout.mean, w.starts).angles
     measured = w._replace(angles=clean + 1e-3 * random.normal(size=clean.shape))
-    at_fit = problem.at(layout.mean, w.starts)
+    at_fit = problem.predict(layout.mean, w.starts)
     fit = Fit(layout.mean, w.starts, np.zeros(0), at_fit, weights, 0.0)
     known = certainty(problem._replace(simulate=scattered, windows=measured), fit)
     deviations = np.sqrt(np.diag(known.covariance))
@@ -245,7 +247,7 @@ def test_a_log_shows_that_an_arm_is_never_late() -> None:
     log = flight_log(12.0, (0.0, 12.0))
     log = log._replace(servo_targets=0.2 * np.sin(np.outer(log.times, np.arange(2.0, 14.0, 2.0))))
     w, layout = windows_of(log), make_layout(6, True, 0.001)
-    sent = _Targets(log, w, 0.001)
+    sent = make_targets(log, w, 0.001)
     at = w.first[:, None] + np.round(w.angle_times / 0.001).astype(int)
 
     def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
@@ -257,7 +259,7 @@ def test_a_log_shows_that_an_arm_is_never_late() -> None:
     noise = Noise(np.full(6, 1e-4), np.full(3, 2e-3))
     problem = Problem(simulate, w, layout, noise)
     vector = layout.vector({"action_latency": 0.0, "servo_lag": 0.0})
-    shown = problem.at(vector, w.starts)
+    shown = problem.predict(vector, w.starts)
     problem = problem._replace(windows=w._replace(angles=shown.angles))
     fit = Fit(vector, w.starts, np.zeros(0), shown, problem.weights(pictures=0.0), 0.0)
     spread = certainty(problem, fit).covariance
@@ -279,7 +281,7 @@ def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:
 
 def test_logs_are_joined_without_a_window_over_both() -> None:
     one, other = flight_log(3.0), flight_log(2.0)
-    log = joined([one, other._replace(times=other.times + 1e6, target_times=other.times + 1e6)])
+    log = join([one, other._replace(times=other.times + 1e6, target_times=other.times + 1e6)])
     assert np.all(np.diff(log.times) > 0.0) and len(log.times) == 500
     w = windows_of(log)
     ends = w.origin + 0.001 * w.first + np.max(w.angle_times, axis=1)
@@ -357,7 +359,7 @@ def test_a_frame_beside_the_paddle_is_found(shift) -> None:
     w, layout = windows_of(log), make_layout(6, True, 0.001)
     problem = Problem(None, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
     first = Fit(layout.mean, w.starts, *3 * (np.zeros(0),), 0.0)
-    search, fit = _beside(_Search(problem, lambda line: None), first, model)
+    search, fit = _align_frame(_Search(problem, lambda line: None), first, model)
     place = layout.slices()["ball_position_bias"]
     off = np.abs(shift) > 0.03
     np.testing.assert_allclose(fit.vector[place], np.where(off, shift, 0.0), atol=0.015)

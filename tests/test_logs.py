@@ -14,7 +14,7 @@ from bounce_mjx.identify.bags import Topics, is_bag, read_bag
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, check, in_one_clock, read_csv, unshown
 from bounce_mjx.identify.reading import read_log
-from bounce_mjx.identify.stages import joined
+from bounce_mjx.identify.stages import join
 from bounce_mjx.identify.world import camera_of
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, load_model
@@ -288,7 +288,7 @@ def test_a_log_without_a_ball_is_read_with_a_warning(tmp_path: Path) -> None:
     moved = other._replace(
         servo_targets=other.servo_targets + 0.1 * np.eye(2)[[0, 1] * (ROWS // 2)]
     )
-    assert not unshown(joined([log, moved]), JOINTS)
+    assert not unshown(join([log, moved]), JOINTS)
 
 
 def test_a_ball_that_is_lost_half_way_is_told(tmp_path: Path) -> None:

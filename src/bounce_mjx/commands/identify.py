@@ -56,7 +56,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.identify.bags import Topics
     from bounce_mjx.identify.log import unshown
     from bounce_mjx.identify.reading import read_log
-    from bounce_mjx.identify.stages import identify, joined
+    from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.words import estimates, sentences
     from bounce_mjx.identify.world import compare, world_of
     from bounce_mjx.reports.identification import identification_page
@@ -80,7 +80,7 @@ def main(args: Sequence[str]) -> None:
     topics = Topics(**command.topics.model_dump())
     console = Console(soft_wrap=True, highlight=False)
     read = [read_log(path, model, topics, command.joint_names) for path in command.logs]
-    log = joined([log for log, _ in read])
+    log = join([log for log, _ in read])
     for warning in [*(said for _, warnings in read for said in warnings), *unshown(log, names)]:
         console.print(f"warning: {warning}", markup=False)
     set_up_jax(config)

@@ -31,12 +31,11 @@ _HUBER = 3.0
 # Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
 _NO_FLIGHT = 25.0
 _WORST = 30.0
-# Largest share of the information along any direction that one window counts for: its own is known
-# up to noise.
-_LARGEST_SHARE = 0.9
-# Share by which two derivatives of a window may differ.
+# Largest leverage of a window, its share of the information along a direction: a window with all of
+# it leaves no residual to correct.
+_LARGEST_LEVERAGE = 0.9
+# |J1 - J2| / |J1 + J2| of a window's two derivatives beyond which it has none.
 _DISAGREEMENT = 0.1
-
 
 # Deviation of a bounce from the model's: of the ball's velocity after it along x, y and z, m/s. A
 # real paddle is not the same everywhere; and a simulated bounce depends by as much on where in a
@@ -79,10 +78,10 @@ class Problem(NamedTuple):
     layout: Layout
     noise: Noise
 
-    def at(self, vector: np.ndarray, starts: np.ndarray) -> Predicted:
+    def predict(self, vector: np.ndarray, starts: np.ndarray) -> Predicted:
         """What the sensors would have measured, in one world."""
-        shown = self.simulate(vector[None], starts[None], np.ones((1, len(starts)), bool))
-        return Predicted(shown.angles[0], shown.balls[0])
+        every = self.simulate(vector[None], starts[None], np.ones((1, len(starts)), bool))
+        return Predicted(every.angles[0], every.balls[0])
 
     def residuals(self, predicted: Predicted) -> np.ndarray:
         """Residuals [C, S, A n + 3 B] in units of the noise."""
@@ -92,22 +91,31 @@ class Problem(NamedTuple):
         shape = count, len(w.first), -1
         return np.concatenate([angles.reshape(shape), balls.reshape(shape)], axis=2)
 
-    def whitened(self, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Residuals [..., S, M] times the roots of their weights, without the common error of those
-        after a bounce: times the inverse root of their covariance, the identity plus that of the
-        bounce's deviation."""
+    def whiten(self, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Residuals [..., S, M] times the roots of their weights, and without the common error of
+        the pictures after a bounce.
+
+        A bounce that deviates from the model moves each picture after it, along each axis, by c =
+        time since the bounce * deviation / noise. The residuals' covariance is then I + c c', and
+        its inverse root is I - c c' (1 - 1 / sqrt(1 + |c|^2)) / |c|^2.
+        """
         root, count = np.sqrt(weights), self.windows.balls.shape[1]
         scaled = residuals * root
-        of_balls = scaled[..., -3 * count :].reshape(*scaled.shape[:-1], count, 3)
+        balls = scaled[..., -3 * count :].reshape(*scaled.shape[:-1], count, 3)
         since = np.nan_to_num(self.windows.picture_times - self.windows.bounces[:, None])
         common = np.maximum(since, 0.0)[:, :, None] * _BOUNCE_DEVIATION / self.noise.balls
         common = common * root[:, -3 * count :].reshape(-1, count, 3)
         squared = np.maximum(np.sum(common**2, axis=1), 1e-12)
         share = (1.0 - 1.0 / np.sqrt(1.0 + squared)) / squared
-        along = np.sum(common * of_balls, axis=-2)
-        white = of_balls - common * (share * along)[..., None, :]
+        along = np.sum(common * balls, axis=-2)
+        white = balls - common * (share * along)[..., None, :]
         scaled[..., -3 * count :] = white.reshape(*scaled.shape[:-1], -1)
         return scaled
+
+    def whiten_fit(self, predicted: Predicted, weights: np.ndarray) -> np.ndarray:
+        """White residuals [S, M] of what one world predicts."""
+        one = Predicted(predicted.angles[None], predicted.balls[None])
+        return self.whiten(self.residuals(one), weights)[0]
 
     def weights(self, with_angles: bool = True, pictures: np.ndarray | float = 1.0) -> np.ndarray:
         """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`."""
@@ -135,60 +143,57 @@ def minimise(
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
-    deviations, _, searched = _per_state(problem.windows)
-    place, now = np.flatnonzero(free), np.inf
-    of_state = np.flatnonzero(searched if free_states is None else searched & free_states)
-    scale, reach = layout.deviation[place], deviations[of_state]
+    deviations, _, searched = _scale_starts(problem.windows)
+    unknowns = np.flatnonzero(free)
+    entries = np.flatnonzero(searched if free_states is None else searched & free_states)
+    scale, reach = layout.deviation[unknowns], deviations[entries]
     # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
-    num_tried = len(_DAMPINGS) * len(_SHARES)
+    num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(starts))
 
-    def costs(predicted: Predicted, states: np.ndarray) -> np.ndarray:
+    def data_costs(predicted: Predicted, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
-        r = problem.whitened(problem.residuals(predicted), weights)
-        of_states = np.sum(((states - guess) / deviations) ** 2, axis=2)
-        return 0.5 * (np.sum(r**2, axis=2) + of_states)
+        r = problem.whiten(problem.residuals(predicted), weights)
+        squares = np.sum(((states - guess) / deviations) ** 2, axis=2)
+        return 0.5 * (np.sum(r**2, axis=2) + squares)
 
-    def of_prior(vectors: np.ndarray) -> np.ndarray:
+    def prior_costs(vectors: np.ndarray) -> np.ndarray:
         return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
     for iteration in range(iterations):
-        line = _linearised(problem, vector, starts, place, of_state, weights)
-        now = float(np.sum(costs(line.predicted, starts[None])) + of_prior(vector))
-        at_guess = (starts - guess)[:, of_state] / reach
+        line = _linearise(problem, vector, starts, unknowns, entries, weights)
+        now = float(np.sum(data_costs(line.predicted, starts[None])) + prior_costs(vector))
+        at_guess = (starts - guess)[:, entries] / reach
         reduced = _eliminate(
             line.residuals, line.by_unknown * scale, line.by_state * reach, at_guess
         )
-        hessian = reduced.information + np.eye(len(place))
-        slope = reduced.gradient + (vector[place] - layout.mean[place]) / scale
-        tried_vectors = np.repeat(vector[None], num_tried, axis=0)
-        tried_states = np.repeat(starts[None], num_tried, axis=0)
+        hessian = reduced.information + np.eye(len(unknowns))
+        slope = reduced.gradient + (vector[unknowns] - layout.mean[unknowns]) / scale
+        vectors = np.repeat(vector[None], num_tried, axis=0)
+        states = np.repeat(starts[None], num_tried, axis=0)
         for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
             change = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-            tried_vectors[i, place] += change * scale
-            tried_vectors[i] = layout.clipped(tried_vectors[i])
-            change = (tried_vectors[i, place] - vector[place]) / scale
-            tried_states[i][:, of_state] += share * reduced.states(change) * reach * used[:, None]
-        outcome = problem.simulate(tried_vectors, tried_states, np.tile(used, (num_tried, 1)))
-        tried = costs(outcome, tried_states)
-        tried = np.where(np.isfinite(tried), tried, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
-        totals = np.sum(np.min(tried, axis=1), axis=1) + of_prior(tried_vectors[:: len(_SHARES)])
+            vectors[i, unknowns] += change * scale
+            vectors[i] = layout.clip(vectors[i])
+            change = (vectors[i, unknowns] - vector[unknowns]) / scale
+            states[i][:, entries] += share * reduced.states(change) * reach * used[:, None]
+        outcome = problem.simulate(vectors, states, np.tile(used, (num_tried, 1)))
+        costs = data_costs(outcome, states)
+        costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
+        totals = np.sum(np.min(costs, axis=1), axis=1) + prior_costs(vectors[:: len(_SHARES)])
         damping = int(np.argmin(totals))
-        best = damping * len(_SHARES) + np.argmin(tried[damping], axis=0)
-        gain = now - totals[damping]
+        best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
         log(f"step {iteration + 1}: {now:.1f} -> {totals[damping]:.1f}")
-        whole = np.zeros((len(vector), len(vector)))
-        whole[np.ix_(place, place)] = reduced.information / np.outer(scale, scale)
-        if not gain > 0.0:
+        if not (gain := now - totals[damping]) > 0.0:
             predicted = Predicted(*(part[0] for part in line.predicted))
-            return Fit(vector, starts, whole, predicted, weights, now)
-        each = np.arange(len(starts))
-        vector, starts = tried_vectors[best[0]], tried_states[best, each]
+            break
+        vector, starts, now = vectors[best[0]], states[best, each], float(totals[damping])
         predicted = Predicted(*(part[best, each] for part in outcome))
-        now = float(totals[damping])
         if gain < _CONVERGED:
             break
-    return Fit(vector, starts, whole, predicted, weights, now)
+    information = np.zeros((len(vector), len(vector)))
+    information[np.ix_(unknowns, unknowns)] = reduced.information / np.outer(scale, scale)
+    return Fit(vector, starts, information, predicted, weights, now)
 
 
 class Certainty(NamedTuple):
@@ -203,62 +208,78 @@ class Certainty(NamedTuple):
 def certainty(problem: Problem, fit: Fit) -> Certainty:
     """Information about the unknowns at a minimum, and their covariance.
 
-    A bounce depends on where in a physics step it begins, which makes derivatives noisy; their
-    square would take the noise for information. The information is therefore the product of two
-    derivatives with independent noise, by central differences of one and of two steps.
+    In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
+    g_s = J_s' r_s, after its start is eliminated (`_eliminate`).
 
-    Each deviation is the larger of two: that of independent residuals of the sensors' noise, and
-    that of the scatter of the windows' gradients, which knows that residuals of one window are
-    correlated (the estimator CR2 of Bell and McCaffrey 2002, "Bias reduction in standard errors for
-    linear regression with multi-stage samples").
+    *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
+    noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
+    of one and of two steps, have independent noise, so that A_s = (J1' J2 + J2' J1) / 2 has the
+    expectation without noise. A = sum_s A_s, with negative eigenvalues set to 0. A window whose J1
+    and J2 differ much has no derivative, and is left out.
+
+    *Covariance.* For independent residuals it is C = (A + I)^-1, where I is the prior's. But the
+    model's errors are correlated within a window. The estimate is a sum over windows, C sum_s g_s,
+    so that its covariance is the sandwich C (sum_s g_s g_s' + I) C (Liang and Zeger 1986),
+    again with J1 in one g_s and J2 in the other. A fit adapts to each window: the residuals have
+    the covariance I - J_s C J_s' in place of I, and are divided by its root (the estimator CR2 of
+    Bell and McCaffrey 2002, "Bias reduction in standard errors for linear regression with
+    multi-stage samples"). With C = R R' and the leverage H_s = R' A_s R, this is R' g_s ->
+    (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
+    where that one is larger.
     """
-    layout, (deviations, _, searched) = problem.layout, _per_state(problem.windows)
-    place, of_state = np.arange(len(fit.vector)), np.flatnonzero(searched)
-    scale, reach, size = layout.deviation, deviations[of_state], len(fit.vector)
+    layout, (deviations, _, searched) = problem.layout, _scale_starts(problem.windows)
+    size, entries = len(fit.vector), np.flatnonzero(searched)
+    scale, reach = layout.deviation, deviations[entries]
     vector = layout.interior(fit.vector, 2.0)
     lines = [
-        _linearised(problem, vector, fit.starts, place, of_state, fit.weights, step)
+        _linearise(problem, vector, fit.starts, np.arange(size), entries, fit.weights, step)
         for step in (1.0, -1.0, 2.0, -2.0)
     ]
-    one, two = (0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:]))
-    by_state = np.mean([line.by_state for line in lines], axis=0) * reach
-    at_guess = (fit.starts - problem.windows.starts)[:, of_state] / reach
-    both = np.concatenate([one, two], axis=2)
-    at_fit = Predicted(fit.predicted.angles[None], fit.predicted.balls[None])
-    residuals = problem.whitened(problem.residuals(at_fit), fit.weights)[0]
-    reduced = _eliminate(residuals, both, by_state, at_guess)
-    of_windows = _symmetric(reduced.informations[:, :size, size:])
-    # A ball that meets the paddle's edge has no derivative. That of a lag near 0 is another matter.
-    others = place != layout.slices()["servo_lag"].start
-    diagonal = np.diagonal(of_windows, axis1=1, axis2=2)
-    squares = np.diagonal(reduced.informations, axis1=1, axis2=2)
-    agreed = 2.0 * np.sum(diagonal[:, others], axis=1)
-    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
-    differs = total - agreed > _DISAGREEMENT**2 * (total + agreed)
-    smooth = ~(differs & problem.windows.has_ball)
-    of_windows = of_windows * smooth[:, None, None]
-    values, vectors = np.linalg.eigh(np.sum(of_windows, axis=0))
+    central = [0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:])]
+    reduced = _eliminate(
+        problem.whiten_fit(fit.predicted, fit.weights),
+        np.concatenate(central, axis=2),
+        np.mean([line.by_state for line in lines], axis=0) * reach,
+        (fit.starts - problem.windows.starts)[:, entries] / reach,
+    )
+    counts = ~(_has_no_derivative(reduced.informations, layout) & problem.windows.has_ball)
+    informations = _symmetrise(reduced.informations[:, :size, size:]) * counts[:, None, None]
+    values, vectors = np.linalg.eigh(np.sum(informations, axis=0))
     values = np.maximum(values, 0.0)
-    # Coordinates in which the covariance of independent residuals is the identity.
     root = vectors / np.sqrt(values + 1.0)
-    share, turned = np.linalg.eigh(root.T @ of_windows @ root)
-    share = np.clip(share, 0.0, _LARGEST_SHARE)
-    gradients = np.stack(np.split(reduced.gradients * smooth[:, None], 2, axis=1)) @ root
-    less = 1.0 / np.sqrt(1.0 - share)
-    gradients = np.einsum("sij,sj,skj,lsk->lsi", turned, less, turned, gradients)
-    of_noise = root @ root.T
-    scatter = _symmetric(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
-    scatter = root @ scatter @ root.T
-    wider = np.sqrt(np.maximum(np.diag(scatter) / np.diag(of_noise), 1.0)) * scale
+    leverage, turn = np.linalg.eigh(root.T @ informations @ root)
+    larger = 1.0 / np.sqrt(1.0 - np.clip(leverage, 0.0, _LARGEST_LEVERAGE))
+    gradients = np.stack(np.split(reduced.gradients * counts[:, None], 2, axis=1)) @ root
+    gradients = np.einsum("sij,sj,skj,lsk->lsi", turn, larger, turn, gradients)
+    independent = root @ root.T
+    scatter = _symmetrise(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
+    sandwich = root @ scatter @ root.T
+    wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(independent), 1.0)) * scale
     information = (vectors * values) @ vectors.T
-    return Certainty(of_noise * np.outer(wider, wider), information / np.outer(scale, scale))
+    return Certainty(independent * np.outer(wider, wider), information / np.outer(scale, scale))
 
 
-def _symmetric(matrices: np.ndarray) -> np.ndarray:
+def _has_no_derivative(informations: np.ndarray, layout: Layout) -> np.ndarray:
+    """In which windows [S] the two derivatives J1 and J2 differ, as where a ball meets the paddle's
+    edge; from the products [S, 2 P, 2 P] of [J1, J2].
+
+    The delay's variance does not count: near 0, its differences are one-sided and depend on their
+    step.
+    """
+    size = informations.shape[1] // 2
+    others = np.arange(size) != layout.slices()["delay_variance"].start
+    cross = np.diagonal(informations[:, :size, size:], axis1=1, axis2=2)
+    squares = np.diagonal(informations, axis1=1, axis2=2)
+    both = 2.0 * np.sum(cross[:, others], axis=1)
+    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
+    return total - both > _DISAGREEMENT**2 * (total + both)
+
+
+def _symmetrise(matrices: np.ndarray) -> np.ndarray:
     return 0.5 * (matrices + np.swapaxes(matrices, -1, -2))
 
 
-class _Linearised(NamedTuple):
+class _Linearisation(NamedTuple):
     """The residuals at a point, and their derivatives by differences."""
 
     predicted: Predicted
@@ -279,93 +300,104 @@ class _Difference(NamedTuple):
     of one joint's angles."""
     steps: np.ndarray
     """Change of each."""
-    of_angles: bool
-    of_pictures: bool
+    angles: bool
+    """Whether it gives the derivatives of the angles."""
+    pictures: bool
+    """Whether it gives those of the pictures."""
 
 
-def _differences(
-    problem: Problem, vector: np.ndarray, place: np.ndarray, of_state: np.ndarray, size: float
+def _list_differences(
+    problem: Problem, vector: np.ndarray, unknowns: np.ndarray, entries: np.ndarray, size: float
 ) -> list[_Difference]:
-    """The simulations for the F unknowns at `place` and the D entries `of_state` of the starts."""
+    """The simulations for the F `unknowns` and the D `entries` of the starts."""
     layout, n = problem.layout, problem.layout.num_joints
 
-    def inside(step: np.ndarray) -> np.ndarray:
-        """Differences that stay within the limits."""
-        ahead = layout.clipped(vector + size * step) - vector
+    def turn_inside(step: np.ndarray) -> np.ndarray:
+        """Differences, with the other sign where they would leave the limits."""
+        ahead = layout.clip(vector + size * step) - vector
         return np.where(np.abs(ahead) < 0.5 * np.abs(size * step), -size, size) * step
 
-    steps, ball_steps = inside(layout.step), inside(layout.ball_step)
-    column = {int(p): np.array([f]) for f, p in enumerate(place)}
+    steps, ball_steps = turn_inside(layout.step), turn_inside(layout.ball_step)
+    column = {int(p): f for f, p in enumerate(unknowns)}
     found = []
-    for name, at in layout.slices().items():
-        unknown, entries = layout.unknowns[name], [p for p in range(at.start, at.stop)]
-        if at.start not in column:
+    for name, place in layout.slices().items():
+        if place.start not in column:
             continue
-        of_angles = name in ARM
+        unknown, places = layout.unknowns[name], range(place.start, place.stop)
         if unknown.own:
-            together = np.concatenate([column[p] for p in entries])
-            found.append(_Difference(together, steps[at], True, False))
-        for p in entries:
-            step, apart = steps[[p]], unknown.ball_step is not None
+            together = np.array([column[p] for p in places])
+            found.append(_Difference(together, steps[place], True, False))
+        for p in places:
+            one, apart = np.array([column[p]]), unknown.ball_step is not None
             if not unknown.own:
-                found.append(_Difference(column[p], step, of_angles, not apart))
+                found.append(_Difference(one, steps[[p]], name in ARM, not apart))
             if unknown.ball_step:
-                found.append(_Difference(column[p], ball_steps[[p]], False, True))
-    own, start = size * _per_state(problem.windows)[1], len(place)
-    arm = np.flatnonzero(of_state < n)
+                found.append(_Difference(one, ball_steps[[p]], False, True))
+    start_steps, first = size * _scale_starts(problem.windows)[1], len(unknowns)
+    arm = np.flatnonzero(entries < n)
     if len(arm):
         # A servo has forgotten its start before the first picture.
-        found.append(_Difference(start + arm, own[of_state[arm]], True, False))
-    for d in np.flatnonzero(of_state >= 2 * n):
-        found.append(_Difference(start + np.array([d]), own[of_state[[d]]], False, True))
+        found.append(_Difference(first + arm, start_steps[entries[arm]], True, False))
+    for d in np.flatnonzero(entries >= 2 * n):
+        found.append(_Difference(first + np.array([d]), start_steps[entries[[d]]], False, True))
     return found
 
 
-def _linearised(
+def _linearise(
     problem: Problem,
     vector: np.ndarray,
     starts: np.ndarray,
-    place: np.ndarray,
-    of_state: np.ndarray,
+    unknowns: np.ndarray,
+    entries: np.ndarray,
     weights: np.ndarray,
     size: float = 1.0,
-) -> _Linearised:
-    """Derivatives by the F unknowns at `place` and the D entries `of_state` of the starts, by
-    differences of `size` times each step."""
-    n, num_free = problem.layout.num_joints, len(place)
+) -> _Linearisation:
+    """Residuals r, and derivatives (r(x + h e) - r(x)) / h by the F `unknowns` and the D `entries`
+    of the starts, where h is `size` times the step of each.
+
+    The Jacobian is sparse: a joint's start and its servo's gains move, nearly, that joint's angles
+    alone, and a start matters in its own window. Columns that share no row share a simulation
+    (Curtis, Powell and Reid 1974, "On the estimation of sparse Jacobian matrices"): one step of all
+    joints at once gives each joint's column in the rows of its angles, and one step of an entry of
+    all starts gives the column of each window. Where the rows of the angles and of the pictures
+    need different steps (`Unknown.ball_step`), each have their own simulation.
+    """
+    n, num_free = problem.layout.num_joints, len(unknowns)
     num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
     angles, pictures = (
         np.any(part > 0.0, axis=1) for part in np.split(weights, [num_angles], axis=1)
     )
-    tried = [
+    differences = [
         d
-        for d in _differences(problem, vector, place, of_state, size)
-        if (d.of_angles and np.any(angles)) or (d.of_pictures and np.any(pictures))
+        for d in _list_differences(problem, vector, unknowns, entries, size)
+        if (d.angles and np.any(angles)) or (d.pictures and np.any(pictures))
     ]
-    vectors = np.repeat(vector[None], 1 + len(tried), axis=0)
+    vectors = np.repeat(vector[None], 1 + len(differences), axis=0)
     states = np.repeat(starts[None], len(vectors), axis=0)
     used = np.tile(angles | pictures, (len(vectors), 1))
-    for i, difference in enumerate(tried, 1):
+    for i, difference in enumerate(differences, 1):
         for column, step in zip(difference.columns, difference.steps, strict=True):
             if column < num_free:
-                vectors[i, place[column]] += step
+                vectors[i, unknowns[column]] += step
             else:
-                states[i, :, of_state[column - num_free]] += step
-        used[i] = (difference.of_angles & angles) | (difference.of_pictures & pictures)
+                states[i, :, entries[column - num_free]] += step
+        used[i] = (difference.angles & angles) | (difference.pictures & pictures)
     predicted = problem.simulate(vectors, states, used)
-    r = problem.whitened(problem.residuals(predicted), weights)
-    by = np.zeros((*r.shape[1:], num_free + len(of_state)))
-    for i, difference in enumerate(tried, 1):
-        change = r[i] - r[0]
+    r = problem.whiten(problem.residuals(predicted), weights)
+    jacobian = np.zeros((*r.shape[1:], num_free + len(entries)))
+    for i, difference in enumerate(differences, 1):
+        change, alone = r[i] - r[0], len(difference.columns) == 1
         for j, (column, step) in enumerate(zip(difference.columns, difference.steps, strict=True)):
-            if difference.of_angles:
-                stride = n if len(difference.columns) > 1 else 1
-                first = j if stride > 1 else 0
-                by[:, first:num_angles:stride, column] = change[:, first:num_angles:stride] / step
-            if difference.of_pictures:
-                by[:, num_angles:, column] = change[:, num_angles:] / step
-    return _Linearised(
-        Predicted(*(part[:1] for part in predicted)), r[0], by[..., :num_free], by[..., num_free:]
+            if difference.angles:
+                rows = slice(num_angles) if alone else slice(j, num_angles, n)
+                jacobian[:, rows, column] = change[:, rows] / step
+            if difference.pictures:
+                jacobian[:, num_angles:, column] = change[:, num_angles:] / step
+    return _Linearisation(
+        Predicted(*(part[:1] for part in predicted)),
+        r[0],
+        jacobian[..., :num_free],
+        jacobian[..., num_free:],
     )
 
 
@@ -408,11 +440,11 @@ def _eliminate(
     """
     num_free, num_states = by_unknown.shape[2], at_guess.shape[1]
     columns = np.concatenate([by_unknown, residuals[:, :, None], by_state], axis=2)
-    normal = _squared(columns)
+    normal = _multiply(columns)
     kept, starts = normal[:, : num_free + 1, : num_free + 1], normal[:, num_free + 1 :]
-    across, of_starts = starts[:, :, : num_free + 1], starts[:, :, num_free + 1 :]
+    across, among = starts[:, :, : num_free + 1], starts[:, :, num_free + 1 :]
     across[:, :, num_free] += at_guess
-    change = -np.linalg.solve(of_starts + np.eye(num_states), across)
+    change = -np.linalg.solve(among + np.eye(num_states), across)
     reduced = kept + np.swapaxes(across, 1, 2) @ change
     return _Reduced(
         reduced[:, :num_free, :num_free],
@@ -422,7 +454,7 @@ def _eliminate(
     )
 
 
-def _squared(columns: np.ndarray) -> np.ndarray:
+def _multiply(columns: np.ndarray) -> np.ndarray:
     """Products [S, K, K] of the columns [S, M, K] of each window, in parts that are too small for
     OpenBLAS to start threads: on a busy machine, these wait for one another a hundred times as long
     as they compute."""
@@ -431,19 +463,19 @@ def _squared(columns: np.ndarray) -> np.ndarray:
     return sum(np.swapaxes(part, 1, 2) @ part for part in parts)
 
 
-def _per_state(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scale_starts(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
     n = windows.angles.shape[2]
-    sizes = (n, n, 3, 3, 3)
-    of_all = (_START_DEVIATIONS, _START_STEPS, _SEARCHED)
-    return tuple(np.repeat(values, sizes) for values in of_all)
+    sizes = n, n, 3, 3, 3
+    groups = _START_DEVIATIONS, _START_STEPS, _SEARCHED
+    return tuple(np.repeat(values, sizes) for values in groups)
 
 
 def picture_weights(problem: Problem, predicted: Predicted) -> np.ndarray:
     """Weights [S, B] of the pictures: less for outliers, and 0 for all of a window whose ball was
     not in free flight, such as one in a hand."""
-    w, one = problem.windows, Predicted(predicted.angles[None], predicted.balls[None])
-    white = problem.whitened(problem.residuals(one), problem.weights())[0]
+    w = problem.windows
+    white = problem.whiten_fit(predicted, problem.weights())
     r = white[:, -3 * w.balls.shape[1] :].reshape(w.balls.shape)
     size = np.max(np.abs(r), axis=2)
     count = np.maximum(np.sum(w.picture_weights, axis=1), 1.0)

@@ -3,6 +3,7 @@ training."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -103,7 +104,7 @@ def make_run(config: WorldConfig, num_joints: int) -> Run:
 
 def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simulate:
     """Binds a log and its windows to a simulation."""
-    sent, n = _Targets(log, windows, layout.physics_dt), layout.num_joints
+    send, n = make_targets(log, windows, layout.physics_dt), layout.num_joints
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
     steps = windows.first + np.arange(windows.steps)[:, None]
@@ -111,19 +112,19 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
         times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
     )
 
-    def simulated(
+    def simulate_block(
         vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
     ) -> list[np.ndarray]:
         """Angles and pictures [L, ...] of the windows s [L] in the candidates c [L]."""
         count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
         # Another size would be compiled again.
         c, s = c[fill], s[fill]
-        world = _whole_world(layout.world(vectors[c]), n)
+        world = _fill_world(layout.world(vectors[c]), n)
         targets = np.empty((windows.steps, n, _LANES), np.float32)
         for i in np.unique(c):
             pair = layout.world(vectors[i])
-            of_candidate = sent(float(pair["action_latency"]), float(pair["servo_lag"]))
-            targets[:, :, c == i] = np.moveaxis(of_candidate[steps[:, s[c == i]]], 2, 1)
+            late = send(float(pair["action_latency"]), float(pair["servo_lag"]))
+            targets[:, :, c == i] = np.moveaxis(late[steps[:, s[c == i]]], 2, 1)
         given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
         first = starts[c, s].T.astype(np.float32)
         out = run(
@@ -136,7 +137,9 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
         blocks = [slice(i, i + _LANES) for i in range(0, len(pairs[0]), _LANES)]
         with ThreadPoolExecutor() as pool:
             parts = list(
-                pool.map(lambda b: simulated(vectors, starts, pairs[0][b], pairs[1][b]), blocks)
+                pool.map(
+                    lambda b: simulate_block(vectors, starts, pairs[0][b], pairs[1][b]), blocks
+                )
             )
         results = []
         for k, measured in enumerate((windows.angles, windows.balls)):
@@ -151,7 +154,7 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
     return simulate
 
 
-def _whole_world(world: Mapping[str, np.ndarray], num_joints: int) -> dict[str, np.ndarray]:
+def _fill_world(world: Mapping[str, np.ndarray], num_joints: int) -> dict[str, np.ndarray]:
     """The world of candidates with the terms that a log without a ball lacks."""
     count = len(world["action_latency"])
     absent = {
@@ -164,42 +167,25 @@ def _whole_world(world: Mapping[str, np.ndarray], num_joints: int) -> dict[str, 
     return absent | dict(world)
 
 
-class _Targets:
-    """Servo targets in each physics step, after latency and lag."""
+def make_targets(log: Log, windows: Windows, dt: float) -> Callable[[float, float], np.ndarray]:
+    """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32."""
+    edges = windows.origin + dt * np.arange(int(windows.first.max()) + windows.steps + 1)
+    # The integral of the targets, each held until the next: its difference over a step is the
+    # step's mean target, whatever the latency's share of a step.
+    times = np.minimum(np.append(log.target_times, np.inf), edges[-1] + 1.0)
+    held = np.cumsum(np.diff(times)[:, None] * log.servo_targets, axis=0)
+    integrals = np.concatenate([np.zeros((1, held.shape[1])), held])
 
-    def __init__(self, log: Log, windows: Windows, dt: float):
-        steps = int(windows.first.max()) + windows.steps
-        self._edges = windows.origin + dt * np.arange(steps + 1)
-        self._dt = dt
-        # The integral of the targets, each held until the next: its difference over a step is the
-        # step's mean target, whatever the latency's share of a step.
-        times = np.append(log.target_times, np.inf)
-        held = np.diff(np.minimum(times, self._edges[-1] + 1.0))[:, None] * log.servo_targets
-        self._times = np.minimum(times, self._edges[-1] + 1.0)
-        self._integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
-        self._first = log.servo_targets[0]
-        self._kept: dict[tuple[float, float], np.ndarray] = {}
-
-    def __call__(self, latency: float, lag: float) -> np.ndarray:
-        """Targets [T, n], rad, in float32."""
-        key = latency, lag
-        kept = self._kept
-        if key not in kept:
-            if len(kept) > 64:
-                # A new one, as another thread may read the old.
-                kept = self._kept = {}
-            kept[key] = self._computed(latency, lag)
-        return kept[key]
-
-    def _computed(self, latency: float, lag: float) -> np.ndarray:
-        at, times = self._edges - latency, self._times
+    @lru_cache(64)
+    def delay(latency: float, lag: float) -> np.ndarray:
+        at, columns = edges - latency, []
         early = np.minimum(at - times[0], 0.0)
-        columns = []
-        for integral, first in zip(self._integral.T, self._first, strict=True):
-            total = np.interp(at, times, integral) + early * first
-            mean = np.diff(total) / self._dt
+        for integral, first in zip(integrals.T, log.servo_targets[0], strict=True):
+            mean = np.diff(np.interp(at, times, integral) + early * first) / dt
             if lag > 1e-6:
-                share = -np.expm1(-self._dt / lag)
+                share = -np.expm1(-dt / lag)
                 mean, _ = lfilter([share], [1.0, share - 1.0], mean, zi=[(1.0 - share) * first])
             columns.append(mean)
         return np.stack(columns, axis=1).astype(np.float32)
+
+    return delay

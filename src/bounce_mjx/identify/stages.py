@@ -60,13 +60,13 @@ class Identified(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
 
-def joined(logs: Sequence[Log]) -> Log:
+def join(logs: Sequence[Log]) -> Log:
     """Several logs, one after another; no window spans two of them."""
     parts, start = [], 0.0
-    of_time = "times", "target_times", "picture_times", "arrivals"
+    names = "times", "target_times", "picture_times", "arrivals"
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])
-        parts.append(log._replace(**{name: getattr(log, name) + shift for name in of_time}))
+        parts.append(log._replace(**{name: getattr(log, name) + shift for name in names}))
         start = float(max(parts[-1].times[-1], parts[-1].target_times[-1])) + 1.0
     source = ", ".join(log.source for log in logs)
     arrays = zip(*(part[1:-1] for part in parts), strict=True)
@@ -79,7 +79,7 @@ def sensor_noise(log: Log) -> Noise:
     quarter of the log."""
     weights = np.array([1.0, -3.0, 3.0, -1.0]) / np.sqrt(20.0)
     third = np.stack([np.convolve(a, weights, "valid") for a in log.joint_angles.T], axis=1)
-    angles = _quiet(third)
+    angles = _rms_at_rest(third)
     balls = np.full(3, 0.002)
     if len(log.ball_positions) > 200:
         # Unequal intervals, as pictures are lost: a parabola through five neighbours.
@@ -98,12 +98,12 @@ def sensor_noise(log: Log) -> Noise:
     return Noise(np.maximum(angles, 1e-5), np.maximum(balls, 1e-4))
 
 
-def _regular(log: Log) -> Log:
+def _straighten_times(log: Log) -> Log:
     """The log with each stretch of control steps at regular times: a line through its stamps."""
-    return log._replace(times=_on_a_line(log.times), target_times=_on_a_line(log.target_times))
+    return log._replace(times=_fit_line(log.times), target_times=_fit_line(log.target_times))
 
 
-def _on_a_line(times: np.ndarray) -> np.ndarray:
+def _fit_line(times: np.ndarray) -> np.ndarray:
     steps = np.diff(times)
     typical, lines = float(np.median(steps)), []
     for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
@@ -113,7 +113,7 @@ def _on_a_line(times: np.ndarray) -> np.ndarray:
     return np.concatenate(lines)
 
 
-def _quiet(values: np.ndarray) -> np.ndarray:
+def _rms_at_rest(values: np.ndarray) -> np.ndarray:
     """Root mean square [k] in the quietest quarter of stretches of 200 rows."""
     count = max(len(values) // 200, 1)
     parts = np.array_split(values**2, count)
@@ -150,18 +150,17 @@ def identify(
         simulate = make_simulator(run, layout, log, windows)
         return _Search(Problem(simulate, windows, layout, noise), progress)
 
-    search, fit = _arm(search_in(log), search_in(_regular(log)))
-    stages, states = ["arm"], search.arm_state
-    pictures = np.ones_like(search.problem.windows.picture_weights)
+    search, fit = _fit_arm(search_in(log), search_in(_straighten_times(log)))
+    stages, states, pictures = ["arm"], search.arm_state, 1.0
     if with_ball:
-        search, fit = _beside(search, fit, world_model(config, visual=False))
-        fit, pictures = _ball(search, fit)
+        search, fit = _align_frame(search, fit, world_model(config, visual=False))
+        fit, pictures = _fit_ball(search, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
     fit = search.run(stages, fit, pictures, 3, states)
-    tested = search.tested(fit, pictures, states)
-    fit = search.run(stages, tested, pictures, 3, states, np.ones_like(search.training))
-    found = _identified(search.problem, fit, _errors(search.problem, tested))
+    unseen = search.fit_held_out(fit, pictures, states)
+    fit = search.run(stages, unseen, pictures, 3, states, np.ones_like(search.training))
+    found = _summarise(search.problem, fit, _measure_errors(search.problem, unseen))
     return found._replace(stamp_age=least_age(log))
 
 
@@ -205,15 +204,17 @@ class _Search(NamedTuple):
             self.problem, fit.vector, fit.starts, free, weights, iterations, states, self.progress
         )
 
-    def tested(self, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None) -> Fit:
-        """The fit with the starts of the windows that were held out, and nothing else, searched."""
+    def fit_held_out(
+        self, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None
+    ) -> Fit:
+        """The fit after a search over nothing but the starts of the windows held out."""
         return self.run([], fit, pictures, 3, states, 1.0 - self.training)
 
 
-def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
+def _fit_arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
     """The arm alone, with the log's time stamps or with regular ones, if they explain it better."""
     search.progress("arm")
-    first = _first(search.problem, search.training)
+    first = _pick_first(search.problem, search.training)
     fit = search.run(["arm"], first, 0.0, 2, search.arm_state)
     windows = regular.problem.windows
     if len(windows.first) == len(search.problem.windows.first):
@@ -226,7 +227,7 @@ def _arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
     return search, search.run(["arm"], fit, 0.0, 8, search.arm_state)
 
 
-def _beside(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, Fit]:
+def _align_frame(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, Fit]:
     """The search and the fit with the ball's frame moved to where the bounces are on the paddle, if
     they are beside it: no search would find it, as a ball beside the paddle does not bounce."""
     problem, layout = search.problem, search.problem.layout
@@ -261,7 +262,7 @@ def _beside(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, 
     return search, fit._replace(vector=vector, starts=starts)
 
 
-def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
+def _fit_ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
     windows, ball_state = search.problem.windows, ~search.arm_state
     search.progress("flight")
@@ -270,12 +271,12 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     search.progress("bounce")
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
     tried = [
-        _flown(search.problem, fit, latency, friction)
+        _shift_flights(search.problem, fit, latency, friction)
         for latency, friction in itertools.product(_BALL_LATENCIES, _FRICTIONS)
     ]
     used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
     few = np.zeros_like(search.training)
-    few[_some(used)] = 1.0
+    few[_sample(used)] = 1.0
     for kept, iterations in ((4, 1), (1, 2)):
         found = [
             search.run(["flight", "bounce"], t, 1.0, iterations, ball_state, few) for t in tried
@@ -283,18 +284,18 @@ def _ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
     (fit,) = tried
     fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
-    tested = search.tested(fit, 1.0, ball_state)
-    pictures = picture_weights(search.problem, search.problem.at(tested.vector, tested.starts))
-    return search.run(["flight", "bounce"], tested, pictures, 6, ball_state), pictures
+    fit = search.fit_held_out(fit, 1.0, ball_state)
+    pictures = picture_weights(search.problem, search.problem.predict(fit.vector, fit.starts))
+    return search.run(["flight", "bounce"], fit, pictures, 6, ball_state), pictures
 
 
-def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Identified:
+def _summarise(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Identified:
     layout, windows = problem.layout, problem.windows
-    nominal = {name: TERMS[name].nominal for name in layout.unknowns if name in TERMS}
+    nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
-    before = fit._replace(predicted=problem.at(own, fit.starts))
-    of_balls = fit.weights[:, -3 * windows.balls.shape[1] :]
-    dropped = windows.has_ball & np.all(of_balls == 0.0, axis=1)
+    before = fit._replace(predicted=problem.predict(own, fit.starts))
+    weights = fit.weights[:, -3 * windows.balls.shape[1] :]
+    dropped = windows.has_ball & np.all(weights == 0.0, axis=1)
     known = certainty(problem, fit)
     return Identified(
         layout,
@@ -302,14 +303,14 @@ def _identified(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Ident
         problem.noise,
         fit._replace(information=known.information),
         known.covariance,
-        _errors(problem, before),
-        _errors(problem, fit),
+        _measure_errors(problem, before),
+        _measure_errors(problem, fit),
         held_out,
         int(np.sum(dropped)),
     )
 
 
-def _first(problem: Problem, mask: np.ndarray) -> Fit:
+def _pick_first(problem: Problem, mask: np.ndarray) -> Fit:
     """The best of candidates that differ in latency and lag, which the search could confuse."""
     layout, own = problem.layout, problem.layout.world(problem.layout.mean)
     vectors = np.stack(
@@ -320,14 +321,18 @@ def _first(problem: Problem, mask: np.ndarray) -> Fit:
     )
     weights = problem.weights(pictures=0.0) * mask
     starts = np.repeat(problem.windows.starts[None], len(vectors), axis=0)
-    costs = np.sum(_costs(problem, vectors, starts, weights), axis=1)
+    counts = _sample(np.flatnonzero(np.any(weights > 0.0, axis=1)))
+    used = np.zeros((len(vectors), len(weights)), bool)
+    used[:, counts] = True
+    white = problem.whiten(problem.residuals(problem.simulate(vectors, starts, used)), weights)
+    costs = np.sum(0.5 * np.sum(white**2, axis=2)[:, counts], axis=1)
     best = int(np.nanargmin(costs))
     none = np.zeros((len(layout.mean), len(layout.mean)))
     nothing = Predicted(np.zeros(0), np.zeros(0))
     return Fit(vectors[best], starts[best], none, nothing, weights, float(costs[best]))
 
 
-def _flown(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
+def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
     """The fit with another latency of the ball and friction on the paddle, and flights that explain
     the pictures before the bounces equally well."""
     places, n = problem.layout.slices(), problem.layout.num_joints
@@ -340,27 +345,15 @@ def _flown(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
     return fit._replace(vector=vector, starts=starts)
 
 
-def _some(windows: np.ndarray) -> np.ndarray:
+def _sample(windows: np.ndarray) -> np.ndarray:
     """About `_FEW` of the windows, evenly over the log."""
     return windows[:: max(len(windows) // _FEW, 1)]
 
 
-def _costs(
-    problem: Problem, vectors: np.ndarray, starts: np.ndarray, weights: np.ndarray
-) -> np.ndarray:
-    """Half the sum of squared residuals [C, K] of candidates in some of the windows that count."""
-    counts = _some(np.flatnonzero(np.any(weights > 0.0, axis=1)))
-    used = np.zeros((len(vectors), len(weights)), bool)
-    used[:, counts] = True
-    residuals = problem.residuals(problem.simulate(vectors, starts, used))
-    return 0.5 * np.sum(problem.whitened(residuals, weights) ** 2, axis=2)[:, counts]
-
-
-def _errors(problem: Problem, fit: Fit) -> dict[str, float]:
+def _measure_errors(problem: Problem, fit: Fit) -> dict[str, float]:
     """Root mean square of each sensor's residuals in units of its noise; the estimated starts count
     as degrees of freedom."""
-    one = Predicted(fit.predicted.angles[None], fit.predicted.balls[None])
-    white = problem.whitened(problem.residuals(one), fit.weights)[0]
+    white = problem.whiten_fit(fit.predicted, fit.weights)
     split = fit.weights.shape[1] - 3 * problem.windows.balls.shape[1]
     n, errors = problem.layout.num_joints, {}
     for name, part, states in (

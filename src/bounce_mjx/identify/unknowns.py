@@ -1,15 +1,13 @@
 """The unknown quantities of a robot's world, their prior, and their place in one vector."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.world.randomization import TERMS
-
 
 class Unknown(NamedTuple):
-    """A term of the world that a log can show; `randomization` documents its meaning."""
+    """A quantity that a log can show; `RandomizationConfig` documents the terms."""
 
     mean: float
     """Its value before the log is seen, at which the search starts."""
@@ -18,6 +16,7 @@ class Unknown(NamedTuple):
     step: float
     """Difference at which derivatives are taken."""
     unit: str
+    """Of the term."""
     stage: str
     """First stage of the search that varies it: arm, flight or bounce."""
     size: int | None = 0
@@ -34,9 +33,9 @@ class Unknown(NamedTuple):
 
 _JOINTS = None
 ARM = {
-    # The entries of both are the delay and its variance: see Layout.
-    "action_latency": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
-    "servo_lag": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
+    # Of action_latency and servo_lag together, s and s^2: see Layout.
+    "delay": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
+    "delay_variance": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
     "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, True),
     "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, True),
     "joint_frictionloss": Unknown(
@@ -55,6 +54,7 @@ BALL = {
     "ball_position_bias": Unknown(0.0, 0.012, 2e-3, "m", "bounce", 3),
     "contact_friction": Unknown(0.3, 0.3, 0.05, "", "bounce", limits=(0.0, np.inf)),
 }
+_TERMS = {"delay": "action_latency", "delay_variance": "servo_lag"}
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
@@ -66,9 +66,11 @@ is seen to be off, m."""
 class Layout(NamedTuple):
     """The unknowns in one vector.
 
-    A latency and a short lag delay the angles equally, and differ by the square of the lag. The
-    entry of `action_latency` therefore holds the mean delay of both, s, and that of `servo_lag` the
-    delay's variance, s^2; measured angles are nearly linear in these.
+    A latency and a short lag delay the angles equally, and differ by the square of the lag. In
+    place of `action_latency` and `servo_lag`, the vector therefore has the mean `delay` of both, s,
+    and the `delay_variance`, s^2, in which measured angles are nearly linear. The lag's filter
+    y += (1 - exp(-dt / lag)) (x - y) delays by the mean m = dt / (exp(dt / lag) - 1), with the
+    variance m (m + dt), as its answer to an impulse is a geometric distribution.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -78,103 +80,101 @@ class Layout(NamedTuple):
 
     def slices(self) -> dict[str, slice]:
         """Place of each unknown."""
-        places, start = {}, 0
-        for name, unknown in self.unknowns.items():
-            size = self._size(unknown)
-            places[name] = slice(start, start + size)
-            start += size
-        return places
+        ends = np.cumsum([self._size(unknown) for unknown in self.unknowns.values()]).tolist()
+        return {
+            name: slice(start, end)
+            for name, start, end in zip(self.unknowns, [0, *ends[:-1]], ends, strict=True)
+        }
+
+    def terms(self) -> dict[str, slice]:
+        """Place of each term of the world; those of `action_latency` and `servo_lag` are where the
+        vector has the delay and its variance."""
+        return {_TERMS.get(name, name): place for name, place in self.slices().items()}
 
     def _size(self, unknown: Unknown) -> int:
         return self.num_joints if unknown.size is None else max(unknown.size, 1)
 
-    def _vector(self, field: str) -> np.ndarray:
-        return np.concatenate(
-            [np.full(self._size(u), getattr(u, field), float) for u in self.unknowns.values()]
-        )
+    def _fill(self, value: Callable[[Unknown], Any]) -> np.ndarray:
+        """A value of each unknown in all its entries [P]."""
+        return np.concatenate([np.full(self._size(u), value(u)) for u in self.unknowns.values()])
 
     @property
     def mean(self) -> np.ndarray:
         """Prior mean [P]."""
-        return self._vector("mean")
+        return self._fill(lambda unknown: unknown.mean)
 
     @property
     def deviation(self) -> np.ndarray:
         """Prior standard deviation [P]."""
-        return self._vector("deviation")
+        return self._fill(lambda unknown: unknown.deviation)
 
     @property
     def step(self) -> np.ndarray:
         """Differences [P] for the derivatives."""
-        return self._vector("step")
+        return self._fill(lambda unknown: unknown.step)
 
     @property
     def ball_step(self) -> np.ndarray:
         """Differences [P] for the derivatives of the pictures."""
-        own = [u.step if u.ball_step is None else u.ball_step for u in self.unknowns.values()]
-        return np.repeat(own, [self._size(u) for u in self.unknowns.values()])
+        return self._fill(lambda u: u.step if u.ball_step is None else u.ball_step)
 
-    def clipped(self, vector: np.ndarray) -> np.ndarray:
+    def free(self, stages: Sequence[str]) -> np.ndarray:
+        """Which entries [P] the stages vary."""
+        return self._fill(lambda unknown: unknown.stage in stages)
+
+    def clip(self, vector: np.ndarray) -> np.ndarray:
         """The vector [..., P] within the limits of each unknown."""
-        low, high = (
-            np.concatenate([np.full(self._size(u), u.limits[end]) for u in self.unknowns.values()])
-            for end in (0, 1)
-        )
-        return np.clip(vector, low, high)
+        return np.clip(vector, self._fill(lambda u: u.limits[0]), self._fill(lambda u: u.limits[1]))
 
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
         """The vector [P] with a delay from which the differences of derivatives, `steps` times
         each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
-        at = {name: place.start for name, place in self.slices().items()}
-        delay, variance = at["action_latency"], at["servo_lag"]
+        places = self.slices()
+        delay, variance = places["delay"].start, places["delay_variance"].start
         mean = self._lag_mean(vector[variance] + steps * self.step[variance])
         moved = vector.copy()
         moved[delay] = max(vector[delay], mean + steps * self.step[delay])
         return moved
 
     def _lag_mean(self, variance: np.ndarray) -> np.ndarray:
-        """Mean m of a variance m (m + dt): those of y += (1 - exp(-dt / lag)) (x - y)."""
+        """Mean delay m of a lag with the variance m (m + dt)."""
         dt = self.physics_dt
         return 0.5 * (np.sqrt(dt * dt + 4.0 * variance) - dt)
 
     def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
-        """Each unknown's value [..., size], or [...] of a number."""
+        """Each term's value [..., size], or [...] of a number."""
         world = {
             name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
             for name, place in self.slices().items()
         }
-        dt, mean = self.physics_dt, self._lag_mean(np.maximum(world["servo_lag"], 1e-14))
-        latency = np.maximum(world["action_latency"] - mean, 0.0)
-        return world | {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)}
+        delay, variance = world.pop("delay"), world.pop("delay_variance")
+        dt, mean = self.physics_dt, self._lag_mean(np.maximum(variance, 1e-14))
+        latency = np.maximum(delay - mean, 0.0)
+        return {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)} | world
 
     def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
         """The vector [P] of values by name; a missing one has its prior mean."""
         vector, places = self.mean, self.slices()
-        for name, place in places.items():
-            if name in world:
-                vector[place] = world[name]
+        for name in set(places) & set(world):
+            vector[places[name]] = world[name]
         if {"action_latency", "servo_lag"} <= set(world):
             mean = self.physics_dt / np.expm1(self.physics_dt / max(world["servo_lag"], 2e-5))
-            vector[places["action_latency"]] += mean
-            vector[places["servo_lag"]] = mean * (mean + self.physics_dt)
+            vector[places["delay"]] = world["action_latency"] + mean
+            vector[places["delay_variance"]] = mean * (mean + self.physics_dt)
         return vector
 
-    def free(self, stages: Sequence[str]) -> np.ndarray:
-        """Which entries [P] the stages vary."""
-        return np.concatenate(
-            [np.full(self._size(u), u.stage in stages) for u in self.unknowns.values()]
-        )
+    def units(self) -> list[str]:
+        """Unit of each term's entry."""
+        return self._fill(lambda unknown: unknown.unit).tolist()
 
     def labels(self, joint_names: Sequence[str]) -> list[str]:
         """Name of each entry, for a reader."""
         labels = []
-        for name, unknown in self.unknowns.items():
-            if unknown.size == 0:
-                labels.append(name)
-            elif unknown.size is None:
-                labels += [f"{name} of {joint}" for joint in joint_names]
+        for term, unknown in zip(self.terms(), self.unknowns.values(), strict=True):
+            if unknown.size is None:
+                labels += [f"{term} of {joint}" for joint in joint_names]
             else:
-                labels += [f"{name} {axis}" for axis in "xyz"[: unknown.size]]
+                labels += [f"{term} {axis}" for axis in "xyz"[: unknown.size]] or [term]
         return labels
 
 
@@ -193,5 +193,4 @@ def make_layout(
         unknowns.pop("encoder_bias")
     if with_ball and camera_rotation > 0.0:
         unknowns[CAMERA_ROTATION] = Unknown(0.0, camera_rotation, 3e-3, "rad", "bounce", 3)
-    assert set(unknowns) <= {*TERMS, CAMERA_ROTATION}
     return Layout(unknowns, num_joints, physics_dt)

@@ -48,7 +48,7 @@ _MISTAKES = {
     "paddle_tilt": "the axes of the ball's frame, or how the paddle is mounted",
     "paddle_offset": "the frame of the ball's position, or how the paddle is mounted",
     CAMERA_ROTATION: "the axes of the ball's frame, which swapped columns turn too",
-    "action_latency": "the clock of the servo targets",
+    "delay": "the clock of the servo targets",
     "encoder_bias": "a joint's zero, the unit of the angles, swapped columns, or the ball's frame",
 }
 _OF_JOINTS = "another arm than --robot's, swapped columns of joints, or the frame of the ball"
@@ -74,18 +74,18 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     `ball_latency` is the time from the exposure to the arrival."""
     layout, width = found.layout, _WIDTH * found.deviation * misfit(found)
     world = layout.world(found.fit.vector)
-    values = np.concatenate([np.ravel(world[name]) for name in layout.unknowns])
+    values = np.concatenate([np.ravel(world[name]) for name in layout.terms()])
     low, high = values - width, values + width
     alone = _WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     for name, ends in _delays(found).items():
-        place = layout.slices()[name]
+        place = layout.terms()[name]
         low[place], high[place] = ends
         alone[place] = np.inf
     late = layout.slices().get("ball_latency", slice(0, 0))
     for array in (values, low, high):
         array[late] += found.stamp_age
     seen = found.deviation < _UNSEEN * layout.deviation
-    units = [u.unit for name, u in layout.unknowns.items() for _ in range(_size(found, name))]
+    units = layout.units()
     labels = layout.labels(joint_names)
     return [
         Estimate(label, unit, float(x), float(a), float(b), bool(s), float(w))
@@ -100,7 +100,7 @@ def _delays(found: Identified) -> dict[str, tuple[float, float]]:
     delay less the lag, whose error is not normal near 0: its interval adds the change over the
     variance's interval to the delay's own error at a given variance."""
     layout, vector, places = found.layout, found.fit.vector, found.layout.slices()
-    delay, variance = (places[name].start for name in ("action_latency", "servo_lag"))
+    delay, variance = (places[name].start for name in ("delay", "delay_variance"))
     width = _WIDTH * found.deviation[variance] * misfit(found)
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
     own = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
@@ -122,11 +122,6 @@ def _delays(found: Identified) -> dict[str, tuple[float, float]]:
 def misfit(found: Identified) -> float:
     """Factor by which the residuals exceed the sensors' noise, at least 1."""
     return max(1.0, *found.after.values())
-
-
-def _size(found: Identified, name: str) -> int:
-    place = found.layout.slices()[name]
-    return place.stop - place.start
 
 
 def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
@@ -155,11 +150,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
 def _mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Warnings of estimates that are several deviations of the prior away."""
     layout, listed, said = found.layout, estimates(found, joint_names), []
-    for name, place in layout.slices().items():
-        unknown = (ARM | BALL).get(name, layout.unknowns[name])
+    for (name, own), place in zip(layout.unknowns.items(), layout.slices().values(), strict=True):
+        unknown = (ARM | BALL).get(name, own)
         off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
         at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
-        beside = np.array(layout.unknowns[name].deviation) > unknown.deviation
+        beside = np.array(own.deviation) > unknown.deviation
         for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit | beside):
             entry = listed[place][i]
             said.append(
@@ -174,7 +169,7 @@ def _unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
     units of the prior, with small eigenvalues."""
     layout, labels = found.layout, found.layout.labels(joint_names)
-    owners = [name for name in layout.unknowns for _ in range(_size(found, name))]
+    owners = [n for n, place in layout.terms().items() for _ in range(place.start, place.stop)]
     scaled = found.fit.information * np.outer(layout.deviation, layout.deviation)
     values, vectors = np.linalg.eigh(scaled)
     said: dict[frozenset[str], str] = {}

@@ -31,8 +31,8 @@ def world_of(found: Identified, log: Log, joint_names: Sequence[str], robot: str
       robot: name or file of the robot's config.
     """
     by_term: dict[str, list[Estimate]] = {}
-    places, listed = found.layout.slices(), estimates(found, joint_names)
-    for name, place in places.items():
+    listed = estimates(found, joint_names)
+    for name, place in found.layout.terms().items():
         by_term[name] = listed[place]
     ranges: dict[str, list[Any]] = {}
     sources: dict[str, str] = {}
@@ -75,7 +75,7 @@ def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) ->
     same."""
     given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
     changed = []
-    for name, place in found.layout.slices().items():
+    for name, place in found.layout.terms().items():
         if name not in given:
             continue
         ends = (np.broadcast_to(end, len(listed[place])) for end in given[name])
