@@ -20,7 +20,7 @@ from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.excitation import excite
-from bounce_mjx.identify.log import read_csv
+from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.stages import Identified, identify
 from bounce_mjx.identify.words import estimates
 from bounce_mjx.identify.world import world_of

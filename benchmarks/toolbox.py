@@ -15,7 +15,7 @@ import numpy as np
 from identify import hidden_robot
 from mujoco import sysid
 
-from bounce_mjx.identify.log import read_csv
+from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
 from bounce_mjx.runs.config import load_config

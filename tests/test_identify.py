@@ -11,7 +11,8 @@ from scipy.signal import lfilter
 
 from bounce_mjx.commands.main import main
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
-from bounce_mjx.identify.log import Log, read_csv
+from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import Predicted, make_targets
 from bounce_mjx.identify.stages import (
     Identified,
@@ -499,7 +500,7 @@ def test_a_world_of_another_arm_is_not_compared(tmp_path: Path, capsys) -> None:
     "args, sentence",
     [
         ([], "no log is given"),
-        (["nowhere.csv"], "the log nowhere.csv is not a file"),
+        (["nowhere.csv"], "the log nowhere.csv cannot be read (No such file or directory)"),
         (["x.csv", "--check", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )

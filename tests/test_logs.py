@@ -1,6 +1,5 @@
 """Logs of a robot: what the recorder writes, what the reader refuses, and the excitation."""
 
-import os
 from pathlib import Path
 
 import mujoco
@@ -10,10 +9,9 @@ import pytest
 from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.bags import Topics, is_bag, read_bag
 from bounce_mjx.identify.excitation import excite
-from bounce_mjx.identify.log import Log, check, in_one_clock, read_csv, unshown
-from bounce_mjx.identify.reading import read_log
+from bounce_mjx.identify.log import Log, check, describe_gaps, in_one_clock
+from bounce_mjx.identify.reading import Topics, is_bag, read_bag, read_csv, read_log
 from bounce_mjx.identify.stages import join
 from bounce_mjx.identify.world import camera_of
 from bounce_mjx.resources import resource_path
@@ -264,23 +262,10 @@ def test_stated_units_are_converted(tmp_path: Path) -> None:
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-9)
 
 
-def test_a_huge_log_and_a_missing_one_are_refused_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "huge.csv"
-    with path.open("wb") as file:
-        file.truncate(2 * 2**30)
-    with pytest.raises(UserError, match=r"has 2048 MiB, and at most 256 MiB are read"):
-        read_csv(path, JOINTS)
-    with pytest.raises(UserError, match=r"is not a file"):
-        read_csv(tmp_path / "none.csv", JOINTS)
-    os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(UserError, match=r"is not a file"):
-        read_csv(tmp_path / "pipe.csv", JOINTS)
-
-
 def test_a_log_without_a_ball_is_read_with_a_warning(tmp_path: Path) -> None:
     log = read_csv(recorded(tmp_path / "log.csv", ball=False), JOINTS)
     assert not check(log, JOINTS, RANGES)
-    warnings = unshown(log, JOINTS)
+    warnings = describe_gaps(log, JOINTS)
     assert any("no picture of the ball; only the arm" in warning for warning in warnings)
     assert any("right moves by less than 0.01 rad" in warning for warning in warnings)
     # What another log shows is not missing.
@@ -288,7 +273,7 @@ def test_a_log_without_a_ball_is_read_with_a_warning(tmp_path: Path) -> None:
     moved = other._replace(
         servo_targets=other.servo_targets + 0.1 * np.eye(2)[[0, 1] * (ROWS // 2)]
     )
-    assert not unshown(join([log, moved]), JOINTS)
+    assert not describe_gaps(join([log, moved]), JOINTS)
 
 
 def test_a_ball_that_is_lost_half_way_is_told(tmp_path: Path) -> None:
@@ -475,7 +460,7 @@ def test_a_bag_in_simulated_time_is_in_one_clock(tmp_path: Path) -> None:
     bag.rows = [(t, a, bag.array([0.3, 0.4]) if t == "/targets" else m) for t, a, m in bag.rows]
     log = read_bag(bag.write(tmp_path / "other"), JOINTS, TOPICS)
     with pytest.raises(
-        UserError, match=r"begin at 7 s .+ the servo targets at 1.7e\+09 .+ two clo"
+        UserError, match=r"begin at 7 s .+ the servo targets at 1.7e\+09 .+ stamps of one clock"
     ):
         check(log, JOINTS, 100.0 * np.array([[-1.0, 1.0]] * 2))
 
@@ -491,25 +476,16 @@ def test_a_ball_in_two_frames_is_refused(tmp_path: Path) -> None:
         read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)
 
 
-def test_a_bag_that_cannot_be_read_gets_its_own_hint(tmp_path: Path) -> None:
+def test_a_bag_that_cannot_be_read_is_refused_with_a_hint(tmp_path: Path) -> None:
     folder = Bag().fill().write(tmp_path / "bag")
     (file,) = folder.glob("*.mcap")
     (folder / "metadata.yaml").unlink()
-    cut, packed, loud = (tmp_path / name for name in ("cut.mcap", "a.db3.zstd", "A.MCAP"))
+    cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[:-100])
-    packed.touch()
-    loud.write_bytes(file.read_bytes())
-    for path, hint in (
-        (folder, f"run ros2 bag reindex {folder}, or give the file in it"),
-        (cut, f"run mcap recover {cut}"),
-        (packed, f"unpack it by zstd -d {packed}"),
-        (loud, "a file that ends with .mcap"),
-        (tmp_path / "none.bag", "give the folder of a ROS 2 bag"),
-    ):
+    for path in (folder, cut, tmp_path / "none.bag"):
         assert is_bag(path)
-        with pytest.raises(UserError, match="cannot be read") as refused:
+        with pytest.raises(UserError, match=r"cannot be read .+ ros2 bag reindex or mcap recover"):
             read_bag(path, JOINTS, TOPICS)
-        assert hint in str(refused.value)
 
 
 def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
@@ -589,7 +565,7 @@ def test_excite_command_writes_a_motion_and_its_log(tmp_path: Path, capsys) -> N
     names = [f"Joint{i}" for i in range(1, 7)]
     log = read_csv(simulated, names)
     assert not check(log, names, np.zeros((6, 2)))
-    assert unshown(log, names)[0].endswith("keep their prior ranges")
+    assert describe_gaps(log, names)[0].endswith("keep their prior ranges")
     rows = np.loadtxt(out, delimiter=",", skiprows=1)
     np.testing.assert_allclose(log.servo_targets, rows[:, 1:], atol=1e-6)
     # The servos' own lag of 10 ms is the largest error.

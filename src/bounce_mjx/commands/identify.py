@@ -53,9 +53,8 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.identify.bags import Topics
-    from bounce_mjx.identify.log import unshown
-    from bounce_mjx.identify.reading import read_log
+    from bounce_mjx.identify.log import describe_gaps
+    from bounce_mjx.identify.reading import Topics, read_log
     from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.words import estimates, sentences
     from bounce_mjx.identify.world import compare, world_of
@@ -81,7 +80,10 @@ def main(args: Sequence[str]) -> None:
     console = Console(soft_wrap=True, highlight=False)
     read = [read_log(path, model, topics, command.joint_names) for path in command.logs]
     log = join([log for log, _ in read])
-    for warning in [*(said for _, warnings in read for said in warnings), *unshown(log, names)]:
+    for warning in [
+        *(said for _, warnings in read for said in warnings),
+        *describe_gaps(log, names),
+    ]:
         console.print(f"warning: {warning}", markup=False)
     set_up_jax(config)
     found = identify(

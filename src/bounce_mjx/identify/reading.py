@@ -1,14 +1,42 @@
-"""Reading of a log, whatever its kind."""
+"""Reading of logs: CSV files, as `deploy.recorder.Recorder` writes them, and ROS bags and MCAP
+files, by `rosbags` (the extra `identify`)."""
 
-from collections.abc import Sequence
+import csv
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
+import numpy as np
 
-from bounce_mjx.errors import UserError
-from bounce_mjx.identify.bags import Topics, is_bag, read_bag
-from bounce_mjx.identify.log import Log, check, in_one_clock, read_csv
+from bounce_mjx.errors import UserError, needed, reason_of, shorten
+from bounce_mjx.identify.log import Log, Rows, check, in_one_clock, make_log
 from bounce_mjx.robot.model import find_addresses, joint_names
+
+UNITS = {
+    "rad": {"rad": 1.0, "deg": np.pi / 180.0},
+    "m": {"m": 1.0, "mm": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}
+"""Units that a column may state in place of the one in SI, and their factors."""
+# Time by which stamps and arrivals differ, s, beyond which they are of two clocks.
+_TWO_CLOCKS = 1.0
+
+
+class Topics(NamedTuple):
+    """Topics of a bag."""
+
+    joints: str
+    """sensor_msgs/JointState with the measured joint angles."""
+    targets: str
+    """sensor_msgs/JointState with the servo targets, or std_msgs/Float64MultiArray with those of
+    all joints in the robot's order."""
+    ball: str
+    """geometry_msgs/PointStamped or PoseStamped with the ball's position."""
+
+
+_TYPES = Topics("JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped")
 
 
 def read_log(
@@ -38,3 +66,226 @@ def read_log(
     warnings = check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
     log = in_one_clock(log)
     return log, [*log.notes, *warnings]
+
+
+def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
+    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
+    the last two, a decimal comma is read.
+
+    Args:
+      joint_names: the robot's joints, in the order of the result.
+
+    Raises:
+      UserError: the file cannot be read, a column is missing or states an unknown unit, or as
+        `make_log`.
+    """
+    header, lines, rows = _read_cells(path)
+    found = _find_columns(path, header)
+
+    def column(name: str, unit: str) -> np.ndarray:
+        if name not in found:
+            raise UserError(
+                f"{path} has no column {name} [{unit}]; its columns are "
+                f"{', '.join(map(shorten, list(found)[:30]))}; if the joints have other names, "
+                "give the log's robot with --robot, or the names in this order with --joint-names"
+            )
+        index, given = found[name]
+        if given not in UNITS[unit]:
+            raise UserError(
+                f"{path} has the column {shorten(header[index])}, whose unit must be one of "
+                f"{', '.join(UNITS[unit])}; write {name} [{unit}]"
+            )
+        return np.array([_read_number(row[index]) for row in rows]) * UNITS[unit][given]
+
+    times = column("time", "s")
+
+    def group(what: str, names: Sequence[str], unit: str, stamp: str = "time") -> Rows:
+        """The rows with any cell of a measurement; those that lack another are faulty."""
+        values = np.stack([column(name, unit) for name in names], axis=1)
+        stamps = column(stamp, "s")
+        empty = np.isnan(np.column_stack([values, times, stamps]))
+        why = np.array([f"has no number in the column {x}" for x in (*names, "time", stamp)])
+        faults = np.where(np.any(empty, axis=1), why[np.argmax(empty, axis=1)], "")
+        measured = ~np.all(np.isnan(values), axis=1)
+        return Rows(what, "row {}", lines, stamps, times, values, faults).select(measured)
+
+    angles, targets = (
+        group(what, [f"{what.replace(' ', '_')}.{joint}" for joint in joint_names], "rad")
+        for what in ("joint angles", "servo targets")
+    )
+    what, ball = "pictures of the ball", [f"ball_position.{axis}" for axis in "xyz"]
+    if any(name in found for name in (*ball, "ball_time")):
+        balls = group(what, ball, "m", "ball_time" if "ball_time" in found else "time")
+    else:
+        balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)), np.zeros(0, str))
+    return make_log(str(path), angles, targets, balls)
+
+
+def _read_cells(path: Path) -> tuple[list[str], np.ndarray, Sequence[list[str]]]:
+    """Header, and line number [R] and cells of each row, of a CSV file."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            delimiter = max(",;\t", key=file.readline().count)
+            file.seek(0)
+            reader = csv.reader(file, delimiter=delimiter)
+            header = [name.strip() for name in next(reader, [])]
+            numbered = [(reader.line_num, row) for row in reader if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(
+            f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
+            "UTF-8, or a ROS bag"
+        ) from error
+    if not numbered:
+        raise UserError(f"the log {path} is empty; record with bounce_mjx's Recorder")
+    for line, row in numbered:
+        if len(row) != len(header):
+            raise UserError(
+                f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
+                "give each row a cell for each column"
+            )
+        if delimiter != ",":
+            row[:] = [cell.replace(",", ".") for cell in row]
+    lines, rows = zip(*numbered, strict=True)
+    return header, np.array(lines), rows
+
+
+def _read_number(text: str) -> float:
+    """A cell's number; NaN if it holds none, or one that is not finite."""
+    try:
+        return float(text) if np.isfinite(float(text)) else np.nan
+    except ValueError:
+        return np.nan
+
+
+def _find_columns(path: Path, header: Sequence[str]) -> dict[str, tuple[int, str]]:
+    """Index and stated unit of each column by its name."""
+    found: dict[str, tuple[int, str]] = {}
+    for i, title in enumerate(header):
+        name, unit = re.fullmatch(r"(.*?)\s*(?:\[([^\[\]]*)\])?", title).groups()
+        if name in found:
+            raise UserError(f"{path} has two columns {shorten(name)}; leave one")
+        found[name] = i, (unit or "").strip()
+    return found
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a log is a ROS bag: a folder, or a file of one of their types."""
+    return path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag", ".zstd")
+
+
+def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
+    """Reads a bag. Times are the header's stamps, or the bag's where a topic has none. Messages
+    that hold no measurement are left out and counted.
+
+    Raises:
+      MissingPackage: rosbags is missing.
+      UserError: the bag cannot be read, a topic is missing or of another type, the ball is in two
+        frames, or as `make_log`.
+    """
+    found, num_joints = _read_messages(path, topics), len(joint_names)
+    angles, targets = (
+        _make_rows(
+            f"{name} of {topic}", found[topic], num_joints, lambda m: _read_angles(m, joint_names)
+        )
+        for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets))
+    )
+    balls = _make_rows(
+        f"pictures of the ball of {topics.ball}", found[topics.ball], 3, _read_position
+    )
+    seen = zip(found[topics.ball], balls.faults, strict=True)
+    frames = sorted({message.header.frame_id for (_, message), fault in seen if not fault})
+    if len(frames) > 1:
+        named = ", ".join(shorten(frame) or "none" for frame in frames)
+        raise UserError(
+            f"the messages of {topics.ball} in {path} are in the frames {named}; record the ball "
+            "in one, that of the robot's base"
+        )
+    if len(angles.times) > 1 and abs(np.median(angles.arrivals - angles.times)) > _TWO_CLOCKS:
+        # Such as simulated time: pictures arrived when the angles of the same moment did.
+        arrivals = np.interp(balls.arrivals, angles.arrivals, angles.times)
+        balls = balls._replace(arrivals=arrivals)
+    return make_log(str(path), angles, targets, balls)
+
+
+def _read_messages(path: Path, topics: Topics) -> dict[str, list[tuple[float, Any]]]:
+    """The messages of each topic, each with its time of arrival, s."""
+    with needed("rosbags", "'bounce_mjx[identify]'"):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in topics}
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
+            present = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
+            for topic, types in zip(topics, _TYPES, strict=True):
+                if present.get(topic) in types.split(" or "):
+                    continue
+                # An arm may have been recorded alone.
+                if topic in present or topic != topics.ball:
+                    listed = (f"{name} ({kind})" for name, kind in sorted(present.items()))
+                    raise UserError(
+                        f"the bag {path} has no topic {topic} of {types}; it has "
+                        f"{', '.join(listed) or 'none'}: name the topics by --topics.joints, "
+                        "--topics.targets and --topics.ball"
+                    )
+            wanted = [c for c in bag.connections if c.topic in found]
+            for connection, arrival, raw in bag.messages(connections=wanted):
+                message = bag.deserialize(raw, connection.msgtype)
+                found[connection.topic].append((1e-9 * arrival, message))
+    except UserError:
+        raise
+    # rosbags raises exceptions of many types for a damaged file.
+    except Exception as error:
+        raise UserError(
+            f"the bag {path} cannot be read ({shorten(reason_of(error))}); give the folder of a "
+            "ROS 2 bag, or a file that ends with .mcap, .db3 or .bag; if its recorder was stopped, "
+            "run ros2 bag reindex or mcap recover"
+        ) from error
+    return found
+
+
+def _make_rows(
+    name: str,
+    messages: Sequence[tuple[float, Any]],
+    size: int,
+    read: Callable[[Any], tuple[Any, str]],
+) -> Rows:
+    """The measurements [size] of a topic, or why a message holds none."""
+    arrivals, times = np.array([arrival for arrival, _ in messages]), np.zeros(len(messages))
+    values, faults = np.full((len(messages), size), np.nan), []
+    for i, (_, message) in enumerate(messages):
+        if hasattr(message, "header"):
+            times[i] = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        given, fault = read(message)
+        if not fault:
+            values[i] = given
+            fault = "" if np.all(np.isfinite(values[i])) else f"holds {values[i]}"
+        faults.append(fault)
+    # Drivers that start before the clock, of a simulation say, stamp 0.
+    if np.any(times) and np.median(times) > 0.0:
+        why = np.where(times == 0.0, "has no time stamp", faults)
+    else:
+        times, why = arrivals, np.array(faults, str)
+    return Rows(name, "message {}", 1 + np.arange(len(why)), times, arrivals, values, why)
+
+
+def _read_angles(message: Any, joint_names: Sequence[str]) -> tuple[Any, str]:
+    """Angles in the robot's order, or why there are none."""
+    if hasattr(message, "data"):
+        wrong = len(message.data) != len(joint_names)
+        fault = f"has {len(message.data)} numbers for {len(joint_names)} joints" if wrong else ""
+        return message.data, fault
+    given = dict(zip(message.name, message.position, strict=False))
+    missing = [joint for joint in joint_names if joint not in given]
+    if not missing:
+        return [given[joint] for joint in joint_names], ""
+    return None, (
+        f"has positions of the joints {', '.join(map(shorten, list(given)[:20])) or 'none'}, "
+        f"and {missing[0]} is missing; give a message with all joints, the log's robot with "
+        "--robot, or the driver's names with --joint-names"
+    )
+
+
+def _read_position(message: Any) -> tuple[Any, str]:
+    """Position of the ball; NaN, as trackers publish it, if it was not seen."""
+    point = message.point if hasattr(message, "point") else message.pose.position
+    return [point.x, point.y, point.z], ""
