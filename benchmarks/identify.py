@@ -22,8 +22,7 @@ from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.stages import Identified, identify
-from bounce_mjx.identify.words import estimates
-from bounce_mjx.identify.world import world_of
+from bounce_mjx.identify.world import estimates, to_yaml
 from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -305,7 +304,7 @@ def main() -> None:
         found = identify(config, log)
         seconds = time.perf_counter() - begin
         processor = time.process_time() - begin_processor
-        path.with_suffix(".yaml").write_text(world_of(found, log, names, None))
+        path.with_suffix(".yaml").write_text(to_yaml(found, log, names, None))
         inside = covered(found, hidden)
         rows.append(
             {

@@ -24,8 +24,7 @@ from bounce_mjx.identify.stages import (
 )
 from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
-from bounce_mjx.identify.words import estimates, sentences
-from bounce_mjx.identify.world import compare, world_of
+from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
 from bounce_mjx.reports.identification import identification_page
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs.config import read_preset
@@ -319,7 +318,7 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
         Noise(np.full(6, 1e-3), np.full(3, 2e-3)),
     )
     found = Identified(layout, windows_of(log), noise, fit, spread, {}, {"ball": 1.0}, {}, 0)
-    path.write_text(world_of(found, log, NAMES, None), encoding="utf-8")
+    path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
     config = read_preset(Path("default"), world=path).env
     assert np.shape(config.randomization.restitution) == (2,)
     for name in ("servo_gain", "paddle_tilt"):
@@ -330,7 +329,7 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     assert compare(read_world(path), found, NAMES) == []
     # The latency of the ball is that until its arrival, in what is printed and in the file.
     late = found._replace(stamp_age=0.012)
-    path.write_text(world_of(late, log, NAMES, None), encoding="utf-8")
+    path.write_text(to_yaml(late, log, NAMES, None), encoding="utf-8")
     (printed,) = (e.value for e in estimates(late, NAMES) if e.label == "ball_latency")
     assert printed == pytest.approx(vector[places["ball_latency"]][0] + 0.012)
     range_ = read_world(path).settings["randomization"]["ball_latency"]
@@ -455,7 +454,7 @@ def test_a_frame_that_is_off_is_no_other_robot(hidden) -> None:
 def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     truth, log, found = hidden
     path = tmp_path / "world.yaml"
-    path.write_text(world_of(found, log, NAMES, None), encoding="utf-8")
+    path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
     world = read_world(path)
     ranges = world.settings["randomization"]
     low, high = ranges["action_latency"]
@@ -486,7 +485,7 @@ def test_page_shows_every_estimate(hidden) -> None:
     assert "data:image/svg+xml" in page
 
 
-def test_a_world_of_another_arm_is_not_compared(tmp_path: Path, capsys) -> None:
+def test_a_to_yaml_another_arm_is_not_compared(tmp_path: Path, capsys) -> None:
     world = {"env": {"randomization": {"servo_gain": [[0.9] * 7, [1.1] * 7]}}}
     world["sources"] = {"randomization": "A test."}
     (tmp_path / "world.yaml").write_text(yaml.safe_dump(world), encoding="utf-8")

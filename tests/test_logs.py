@@ -13,7 +13,7 @@ from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, check, describe_gaps, in_one_clock
 from bounce_mjx.identify.reading import Topics, is_bag, read_bag, read_csv, read_log
 from bounce_mjx.identify.stages import join
-from bounce_mjx.identify.world import camera_of
+from bounce_mjx.identify.world import measure_camera
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.runs.config import read_preset
@@ -344,7 +344,7 @@ def test_no_clock_drifts_by_parts_in_a_thousand() -> None:
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_a_picture_that_a_later_one_replaced_is_not_lost(lost: float) -> None:
     """Control steps of 100 Hz see five of six pictures of a camera of 120 Hz."""
-    rate, found = camera_of(camera_log(lost=lost)[0])
+    rate, found = measure_camera(camera_log(lost=lost)[0])
     assert abs(rate - 120.0) < 0.5
     assert found == 0.0 if lost == 0.0 else 0.07 < found < 0.13
 

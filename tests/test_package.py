@@ -142,7 +142,7 @@ except ImportError as error:
 
 
 # Documented, although they begin with a line: of named tuples, and of the module os.
-DOCUMENTED = {"_replace", "_asdict", "_fields", "_exit"}
+DOCUMENTED = {"_replace", "_asdict", "_fields", "_field_defaults", "_exit"}
 
 
 def private_names() -> set[str]:

@@ -56,8 +56,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.identify.log import describe_gaps
     from bounce_mjx.identify.reading import Topics, read_log
     from bounce_mjx.identify.stages import identify, join
-    from bounce_mjx.identify.words import estimates, sentences
-    from bounce_mjx.identify.world import compare, world_of
+    from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
     from bounce_mjx.reports.identification import identification_page
     from bounce_mjx.robot.model import joint_names, load_model
     from bounce_mjx.runs.files import check_output, writable, write_output
@@ -113,7 +112,7 @@ def main(args: Sequence[str]) -> None:
         sys.exit(1 if changed else 0)
     robot = None if command.robot is None else str(command.robot)
     files = {
-        command.out: world_of(found, log, names, robot),
+        command.out: to_yaml(found, log, names, robot),
         page: identification_page(found, log.source, names),
     }
     for path, content in files.items():

@@ -65,10 +65,10 @@ def excite(
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     addresses, n = find_addresses(model), config.num_joints
     home = np.array(config.default_joint_angles)
-    bounds = _Bounds.of(config, max_velocity)
+    bounds = _read_bounds(config, max_velocity)
     ranges = model.jnt_range[list(addresses.arm_joints)]
     limited = ranges[:, 0] < ranges[:, 1]
-    centre = _lifted(model, home)
+    centre = _lift_paddle(model, home)
     room = np.where(limited, np.min(np.abs(ranges - centre[:, None]), axis=1) - 0.02, np.inf)
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
     contacts = ContactChecker(config, MARGIN, table_height)
@@ -89,12 +89,12 @@ def excite(
             f"{seconds:g} s are too short to move {n} joints; give at least "
             f"{2.0 * lifting + 1.0 * n:.0f} s"
         )
-    lift = _smooth(np.minimum(times, times[-1] - times) / lifting)[:, None] * (centre - home)
+    lift = _smooth_step(np.minimum(times, times[-1] - times) / lifting)[:, None] * (centre - home)
     inner = times[(times >= lifting) & (times <= times[-1] - lifting)]
     while True:
         targets = home + lift
         moving = np.isin(times, inner)
-        targets[moving] += _motion(inner - inner[0], amplitudes, bounds)
+        targets[moving] += _plan(inner - inner[0], amplitudes, bounds)
         poses = (
             (t, pair)
             for t in range(0, len(times), every)
@@ -104,7 +104,7 @@ def excite(
         if hit is None:
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
         step, pair = hit
-        moving = _moving(contacts, pair, targets[step], home + lift[step])
+        moving = _find_movers(contacts, pair, targets[step], home + lift[step])
         amplitudes = np.where(moving, 0.5 * amplitudes, amplitudes)
         if not np.any(moving) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
             mover = names[int(np.argmax(moving))] if np.any(moving) else "the lifted arm"
@@ -114,7 +114,7 @@ def excite(
             )
 
 
-def _moving(
+def _find_movers(
     contacts: ContactChecker, pair: tuple[int, int], pose: np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
     """Which joints [n] bring a pair of parts together in a pose [n]: those without whose motion
@@ -131,7 +131,7 @@ def _contact(contacts: ContactChecker, pair: tuple[int, int]) -> str:
     return "a contact of " + " and ".join(map(contacts.name, pair))
 
 
-def _lifted(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
+def _lift_paddle(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
     """Joint angles [n] at which the paddle is higher, by steps of the pseudo-inverse."""
     addresses, data = find_addresses(model), mujoco.MjData(model)
     body = model.geom_bodyid[addresses.paddle_geom]
@@ -158,15 +158,6 @@ class _Bounds(NamedTuple):
     acceleration: np.ndarray
     jerk: np.ndarray
 
-    @classmethod
-    def of(cls, config: WorldConfig, max_velocity: float | Sequence[float]) -> "_Bounds":
-        limits, n = config.robot.limits, config.num_joints
-        velocity, acceleration, jerk = (
-            np.full(n, np.inf) if given is None else _BELOW_LIMIT * np.array(given)
-            for given in (limits.velocity, limits.acceleration, limits.jerk)
-        )
-        return cls(np.minimum(velocity, max_velocity), acceleration, jerk)
-
     def amplitude(self, joint: int, rate: np.ndarray | float) -> np.ndarray:
         """Largest amplitude of a sine with an angular frequency, rad/s."""
         return np.minimum(
@@ -174,7 +165,7 @@ class _Bounds(NamedTuple):
             self.jerk[joint] / rate**3,
         )
 
-    def within(self, joint: int, path: np.ndarray, times: np.ndarray) -> np.ndarray:
+    def shrink(self, joint: int, path: np.ndarray, times: np.ndarray) -> np.ndarray:
         """A path [T], smaller where its ramps exceed the limits of acceleration and jerk."""
         share, dt = 1.0, times[1] - times[0]
         for order, limit in ((2, self.acceleration[joint]), (3, self.jerk[joint])):
@@ -183,19 +174,28 @@ class _Bounds(NamedTuple):
         return share * path
 
     def time_of_step(self, distance: np.ndarray) -> np.ndarray:
-        """Shortest duration [n] of `_smooth` over a distance [n]."""
+        """Shortest duration [n] of `_smooth_step` over a distance [n]."""
         by_jerk = np.cbrt(60.0 * distance / self.jerk)
         by_acceleration = np.sqrt(5.8 * distance / self.acceleration)
         return np.maximum(np.maximum(1.9 * distance / self.velocity, by_acceleration), by_jerk)
 
 
-def _smooth(share: np.ndarray) -> np.ndarray:
+def _read_bounds(config: WorldConfig, max_velocity: float | Sequence[float]) -> _Bounds:
+    limits, n = config.robot.limits, config.num_joints
+    velocity, acceleration, jerk = (
+        np.full(n, np.inf) if given is None else _BELOW_LIMIT * np.array(given)
+        for given in (limits.velocity, limits.acceleration, limits.jerk)
+    )
+    return _Bounds(np.minimum(velocity, max_velocity), acceleration, jerk)
+
+
+def _smooth_step(share: np.ndarray) -> np.ndarray:
     """A step from 0 to 1 without a jump of acceleration, clipped outside."""
     share = np.clip(share, 0.0, 1.0)
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
 
-def _motion(times: np.ndarray, amplitudes: np.ndarray, bounds: _Bounds) -> np.ndarray:
+def _plan(times: np.ndarray, amplitudes: np.ndarray, bounds: _Bounds) -> np.ndarray:
     """Displacements [T, n]: a slot of each joint alone, slow and then fast; then one of all."""
     n, length = len(amplitudes), times[-1] + times[1] - times[0]
     alone = 0.7 * length / n
@@ -204,27 +204,27 @@ def _motion(times: np.ndarray, amplitudes: np.ndarray, bounds: _Bounds) -> np.nd
         t = times - j * alone
         slow = (t >= 0.0) & (t < 0.5 * alone)
         fast = (t >= 0.5 * alone) & (t < alone)
-        by_slow = slow * _slow(t, 0.5 * alone, amplitudes[j], bounds, j)
+        by_slow = slow * _slow_sine(t, 0.5 * alone, amplitudes[j], bounds, j)
         by_fast = fast * _sweep(t - 0.5 * alone, 0.5 * alone, amplitudes[j], bounds, j)
-        moved[:, j] += sum(bounds.within(j, part, times) for part in (by_slow, by_fast))
+        moved[:, j] += sum(bounds.shrink(j, part, times) for part in (by_slow, by_fast))
     t = times - n * alone
-    ramp = _smooth(np.minimum(t, length - n * alone - t) / _RAMP)
+    ramp = _smooth_step(np.minimum(t, length - n * alone - t) / _RAMP)
     for j in range(n):
         rates = 2.0 * np.pi * np.array(_TOGETHER[j % 4 :: 4])
         wave = np.sum(np.sin(rates * t[:, None] + j), axis=1) / len(rates)
         size = 0.5 * min(amplitudes[j], 0.6 * float(bounds.amplitude(j, np.max(rates))))
-        moved[:, j] += bounds.within(j, (t >= 0.0) * ramp * size * wave, times)
+        moved[:, j] += bounds.shrink(j, (t >= 0.0) * ramp * size * wave, times)
     return moved
 
 
-def _slow(
+def _slow_sine(
     t: np.ndarray, length: float, amplitude: float, bounds: _Bounds, joint: int
 ) -> np.ndarray:
     """A sine there and back at a quarter of the speed, which shows dry friction."""
     rate = 2.0 * np.pi / length
     size = min(amplitude, _SLOW * float(bounds.amplitude(joint, rate)))
     # From rest to rest.
-    return size * np.sin(rate * t) * _smooth(np.minimum(t, length - t) / (0.25 * length))
+    return size * np.sin(rate * t) * _smooth_step(np.minimum(t, length - t) / (0.25 * length))
 
 
 def _sweep(
@@ -234,7 +234,7 @@ def _sweep(
     low, high = _FAST
     rate = 2.0 * np.pi * (low + (high - low) * np.clip(t / length, 0.0, 1.0))
     phase = 2.0 * np.pi * (low * t + 0.5 * (high - low) * t * t / length)
-    window = _smooth(np.minimum(t, length - t) / (0.2 * length))
+    window = _smooth_step(np.minimum(t, length - t) / (0.2 * length))
     size = np.minimum(amplitude, 0.7 * bounds.amplitude(joint, rate))
     return size * window * np.sin(phase)
 

@@ -79,8 +79,8 @@ def cut(log: Log, physics_dt: float, min_windows: int = 1) -> Windows:
     Raises:
       UserError: there are fewer.
     """
-    spans = [(b - before, b + after, b) for b, before, after in _bounces(log)]
-    spans += [(start, end, np.nan) for start, end in _rest(log, spans)]
+    spans = [(b - before, b + after, b) for b, before, after in _find_bounces(log)]
+    spans += [(start, end, np.nan) for start, end in _find_rests(log, spans)]
     if len(spans) < min_windows:
         raise UserError(
             f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
@@ -94,46 +94,38 @@ def cut(log: Log, physics_dt: float, min_windows: int = 1) -> Windows:
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
-    of_angles, used, settled = [], -np.inf, _settled(log)
+    angle_rows, used, settled = [], -np.inf, _find_settled(log)
     for (_, end, _), begin in zip(spans, zero, strict=True):
         inside = np.flatnonzero((log.times >= max(begin, used)) & (log.times < end) & settled)
-        of_angles.append(inside)
+        angle_rows.append(inside)
         used = end
-    of_pictures = [
+    picture_rows = [
         np.flatnonzero((log.picture_times >= start) & (log.picture_times <= end))
         if np.isfinite(bounce)
         else np.zeros(0, int)
         for start, end, bounce in spans
     ]
-    angle_times, angle_weights, angles = _padded(of_angles, log.times, zero, log.joint_angles)
-    picture_times, picture_weights, balls = _padded(
-        of_pictures, log.picture_times, zero, log.ball_positions
-    )
     bounces = np.array([bounce for _, _, bounce in spans]) - zero
-    near = np.abs(picture_times - bounces[:, None]) < _AT_BOUNCE
-    picture_weights = np.where(near, 0.0, picture_weights)
     starts = np.stack(
         [
             np.concatenate([_joint_start(log, begin), _ball_start(log, pictures, b, begin)])
-            for begin, pictures, b in zip(zero, of_pictures, bounces, strict=True)
+            for begin, pictures, b in zip(zero, picture_rows, bounces, strict=True)
         ]
     )
-    return Windows(
-        first=first,
-        steps=round(_SECONDS / physics_dt),
-        origin=origin,
-        angle_times=angle_times,
-        angles=angles,
-        angle_weights=angle_weights,
-        picture_times=picture_times,
-        balls=balls,
-        picture_weights=picture_weights,
-        bounces=bounces,
-        starts=starts,
+    windows = Windows(
+        first,
+        round(_SECONDS / physics_dt),
+        origin,
+        *_pad(angle_rows, log.times, zero, log.joint_angles),
+        *_pad(picture_rows, log.picture_times, zero, log.ball_positions),
+        bounces,
+        starts,
     )
+    near = np.abs(windows.picture_times - bounces[:, None]) < _AT_BOUNCE
+    return windows._replace(picture_weights=np.where(near, 0.0, windows.picture_weights))
 
 
-def _bounces(log: Log) -> list[tuple[float, float, float]]:
+def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
     """Time of each bounce in the pictures, and the time before and after it in free flight, s."""
     found = []
     times, balls = log.picture_times, log.ball_positions
@@ -153,15 +145,15 @@ def _bounces(log: Log) -> list[tuple[float, float, float]]:
         for j, i in enumerate(lowest):
             # The first and the last flight of a run belong to one window each, others to two.
             before, after = t[i] - ends[j], ends[j + 2] - t[i]
-            before -= _share(before) if j > 0 else 0.0
-            after = _share(after) if j < len(lowest) - 1 else after
+            before -= _share_flight(before) if j > 0 else 0.0
+            after = _share_flight(after) if j < len(lowest) - 1 else after
             before, after = min(before, _BEFORE), min(after, _AFTER)
             if min(before, after) > 0.5 * _SHORTEST:
                 found.append((float(t[i]), float(before), float(after)))
     return found
 
 
-def _share(flight: float) -> float:
+def _share_flight(flight: float) -> float:
     """Time of a flight that belongs to the bounce at its begin, s: enough for the next window to
     start in the air."""
     return float(np.clip(_AFTER_SHARE * flight, min(1.25 * MAX_DELAY, 0.5 * flight), _AFTER))
@@ -177,7 +169,7 @@ def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
     return slopes
 
 
-def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
+def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
     gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
@@ -194,7 +186,7 @@ def _rest(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float
     return pieces
 
 
-def _settled(log: Log) -> np.ndarray:
+def _find_settled(log: Log) -> np.ndarray:
     """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
     begins = log.times[np.flatnonzero(np.diff(log.times) > _JOINT_GAP) + 1]
     begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
@@ -202,10 +194,10 @@ def _settled(log: Log) -> np.ndarray:
     return log.times - begins[last] >= _SETTLING
 
 
-def _padded(
+def _pad(
     indices: list[np.ndarray], times: np.ndarray, zero: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times since each window's start [S, M], weights [S, M] and values [S, M, k]."""
+    """Times since each window's start [S, M], values [S, M, k] and weights [S, M]."""
     # In steps, so that a simulation that was compiled for one log serves others.
     most = -(-max([len(index) for index in indices] + [1]) // _PADDING) * _PADDING
     padded = np.zeros((len(indices), most))
@@ -214,7 +206,7 @@ def _padded(
         padded[s, : len(index)] = times[index] - zero[s]
         weights[s, : len(index)] = 1.0
         kept[s, : len(index)] = values[index]
-    return padded, weights, kept
+    return padded, kept, weights
 
 
 def _joint_start(log: Log, time: float) -> np.ndarray:

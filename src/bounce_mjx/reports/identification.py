@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.words import estimates, sentences
+from bounce_mjx.identify.world import estimates, sentences
 from bounce_mjx.reports.figures import style
 from bounce_mjx.reports.html_page import page, picture, table
 
